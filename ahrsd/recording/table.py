@@ -277,8 +277,8 @@ class _TableRows:
             return
         if np.mean(gyro == _fresh(np.hstack([self.vectors(MAG), self.vectors(GYRO)]))) > _TOGETHER:
             self.notes.append(
-                f"every reading is in {counted(usual, 'row')}, one after the other: each counts once, "
-                f"{int(np.count_nonzero(gyro))} of {len(gyro)} rows"
+                f"every reading is in {counted(usual, 'row')}, one after the other: each counts "
+                f"once, {int(np.count_nonzero(gyro))} of {len(gyro)} rows"
             )
             self._keep(gyro)
             _check_length(self.path, len(self.numbers))
@@ -406,7 +406,8 @@ class _TableRows:
         raise RecordingError(
             self.path,
             f"column time_s: {counted(len(times), 'different time')} in "
-            f"{counted(len(self.numbers), 'row')} ({shown}): the digits that tell the rows apart were lost when it was written",
+            f"{counted(len(self.numbers), 'row')} ({shown}): the digits that tell the rows apart "
+            "were lost when it was written",
             "write the time again with all its digits, or from 0 on",
         )
 
