@@ -177,7 +177,7 @@ STREAM = (
         0.0,
         Level.CANDIDATE,
         meaning="samples at the end of the sensor's range or unusable",
-        advice="{v:.0f} samples are saturated or unusable: look for a magnet, or move slower",
+        advice="saturated or unusable samples: {v:.0f}; look for a magnet, or move slower",
     ),
     most(
         "stream_health.time",
@@ -773,7 +773,7 @@ STEADY = (
         0.0,
         Level.RAM,
         meaning="numbers of the evidence that could not be measured",
-        advice="{v:.0f} numbers are missing: {e.unmeasured_names}",
+        advice="not measured yet: {e.unmeasured_names}",
     ),
 )
 
