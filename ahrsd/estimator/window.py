@@ -717,21 +717,24 @@ class SearchResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Reached:
-    """Where a descent is. blind: it knows nothing of the others; gain: of log likelihood in the
-    last steps; mirrored: it began at a mirror image; kept: from where it can go on."""
+    """Where a descent is.
+
+    independent: it knows nothing of the others;  gain: of log likelihood in the last steps
+    mirrored: it began at a mirror image;  kept: from where it can go on
+    """
 
     cost: float
     c: Array
     bias: Array
     information: Array | None
     loud: float
-    blind: bool
+    independent: bool
     gain: float
     mirrored: bool
     kept: Snapshot
 
     @property
-    def heard(self) -> float:
+    def unexplained(self) -> float:
         """Residual variance that it leaves, where that is more than chance; else 1."""
         return self.loud if self.loud > _LOUD else 1.0
 
@@ -768,7 +771,7 @@ def search(
     if window.loud > 1.0:
         known = [graph.with_held(c) for c in known]
     bias = graph.nodes[graph.last].bias
-    reached = [_descend(thin, graph.c, bias, None, blind=first_look)]
+    reached = [_descend(thin, graph.c, bias, None, independent=first_look)]
     for c in known:
         if _positive(c):
             reached.append(_descend(thin, c, present_bias, _best(reached)))
@@ -777,10 +780,10 @@ def search(
             break
         reached = _further(thin, reached, fields, present_bias)
     best = _best(reached)
-    temper = graph.temper * best.heard if best.heard > 1.0 else 1.0
+    temper = graph.temper * best.unexplained if best.unexplained > 1.0 else 1.0
     away = _distance(graph.c, best, graph.moments, temper)
-    gain = (reached[0].cost - best.cost) / best.heard
-    return SearchResult(best.c, best.bias, away, gain, _apart(reached, graph), best.heard)
+    gain = (reached[0].cost - best.cost) / best.unexplained
+    return SearchResult(best.c, best.bias, away, gain, _apart(reached, graph), best.unexplained)
 
 
 def _best(reached: Sequence[_Reached]) -> _Reached:
@@ -788,12 +791,12 @@ def _best(reached: Sequence[_Reached]) -> _Reached:
 
 
 def _apart(reached: Sequence[_Reached], graph: Graph) -> float:
-    """Sigmas from the best within which two blind ones are; or to the end of another valley that is
-    nearly as likely."""
+    """Sigmas from the best within which two independent ones are, or, where another valley is
+    nearly as likely, to the end of that."""
     best = _best(reached)
-    temper = graph.temper * best.heard
+    temper = graph.temper * best.unexplained
     away = [(r, _distance(r.c, best, graph.moments, temper)) for r in reached]
-    near = float((*sorted(far for r, far in away if r.blind), np.inf)[1])
+    near = float((*sorted(far for r, far in away if r.independent), np.inf)[1])
     rivals = [
         far
         for r, far in away
@@ -816,8 +819,10 @@ def _further(
         if one.gain > _GAIN * thin.graph.temper:
             out[k] = _gone_on(thin, one)
         elif not there and not one.mirrored:
-            anew = _descend(thin, start.mirrored(one.c, fields), bias, best, blind=one.blind)
-            out[k] = replace(one, blind=False, mirrored=True)  # an end that stays one
+            anew = _descend(
+                thin, start.mirrored(one.c, fields), bias, best, independent=one.independent
+            )
+            out[k] = replace(one, independent=False, mirrored=True)  # an end that stays one
             out.append(replace(anew, mirrored=True))
     return out
 
@@ -827,7 +832,7 @@ def _positive(c: Array) -> bool:
 
 
 def _descend(
-    thin: Window, c: Array, bias: Array, best: _Reached | None, *, blind: bool = True
+    thin: Window, c: Array, bias: Array, best: _Reached | None, *, independent: bool = True
 ) -> _Reached:
     """Downhill from c, until it is clear that this leads to the best so far."""
     thin.restart_at(c, bias)
@@ -835,18 +840,18 @@ def _descend(
     def near(at: Array) -> bool:
         return best is not None and _distance(at, best, thin.graph.moments, 1.0) < _NEAR
 
-    return _reached(thin, thin.optimise(_DESCENT, near), np.inf, blind=blind)
+    return _reached(thin, thin.optimise(_DESCENT, near), np.inf, independent=independent)
 
 
 def _gone_on(thin: Window, before: _Reached) -> _Reached:
     """Further downhill from where it was."""
     thin.restore(before.kept)
     cost = thin.optimise(_DESCENT)
-    found = _reached(thin, cost, before.cost - cost, blind=before.blind)
+    found = _reached(thin, cost, before.cost - cost, independent=before.independent)
     return replace(found, mirrored=before.mirrored)
 
 
-def _reached(thin: Window, cost: float, gain: float, *, blind: bool) -> _Reached:
+def _reached(thin: Window, cost: float, gain: float, *, independent: bool) -> _Reached:
     graph = thin.graph
     try:
         information = np.asarray(np.linalg.inv(graph.covariance()[:9, :9]), dtype=np.float64)
@@ -857,7 +862,7 @@ def _reached(thin: Window, cost: float, gain: float, *, blind: bool) -> _Reached
     bias = graph.nodes[graph.last].bias.copy()
     kept = thin.snapshot()
     return _Reached(
-        cost, graph.c.copy(), bias, information, loud, blind, gain, mirrored=False, kept=kept
+        cost, graph.c.copy(), bias, information, loud, independent, gain, mirrored=False, kept=kept
     )
 
 

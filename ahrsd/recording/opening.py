@@ -192,7 +192,12 @@ def open_recording(
         raise RecordingError(path, found.what, found.remedy)
     named = _SUFFIXES.get(suffix.lower())
     kind = _in_spite_of_its_name(path, start, named) or named or _by_content(path, start)
-    if kind is RecordingKind.TABLE and not columns and b"$VN" in start and _has_lines(path):
+    if (
+        kind is RecordingKind.TABLE
+        and not columns
+        and b"$VN" in start
+        and _keeps_what_was_sent(path)
+    ):
         kind = RecordingKind.BYTES
     unused = (
         ["--columns is not used: it is for tables"]
@@ -268,7 +273,7 @@ def _in_spite_of_its_name(
     return None
 
 
-def _has_lines(path: Path) -> bool:
+def _keeps_what_was_sent(path: Path) -> bool:
     """Whether the rows of a table each hold a time and, in a cell, what a VN-100 sent then.
 
     Then that is the device's own word, with its digits and its checksum. Without field and rate in

@@ -181,28 +181,34 @@ def _register(
     if word == "VNRRG":
         return _read(number, tokens[1:], body)
     passes = policy.passes(number)
-    guarded = number in GUARDED and number != LINE_RATE and not passes
-    refusal = None
-    if guarded:
+    if number in GUARDED and number != LINE_RATE and not passes:
         why = f"register {number} was not written for a client: what calibrates is ahrsd's"
-        refusal = Refusal(UNAUTHORIZED, why)
-    elif not policy.owner and number != LINE_RATE:
-        why = f"writes of register {number} are for the share with owner"
-        refusal = Refusal(UNAUTHORIZED, why)
+        return _unless_held(number, tokens[1:], body, Refusal(UNAUTHORIZED, why))
     if not REGISTERS[number].writable:
-        return refusal if guarded and refusal is not None else Refusal(UNAUTHORIZED)
+        return Refusal(UNAUTHORIZED)
     try:
-        values = parse(number, tokens[1:])
+        command = Write(number, parse(number, tokens[1:]), held=True)
     except RegisterValueError as error:
-        return refusal if guarded and refusal is not None else Refusal(error.code)
-    if refusal is not None:
-        if number in _OF_PORTS:
-            return refusal
-        return ClientCommand(Kind.COMPARE, body, Read(number), (values, refusal))
-    command = Write(number, values, held=True)
+        return Refusal(error.code)
     if number == LINE_RATE:
         return ClientCommand(Kind.RATE, body, command)
+    if not policy.owner:
+        why = f"writes of register {number} are for the share with owner"
+        return _unless_held(number, tokens[1:], body, Refusal(UNAUTHORIZED, why))
     return ClientCommand(Kind.CALIBRATE if passes else Kind.WRITE, body, command)
+
+
+def _unless_held(
+    number: int, tokens: list[str], body: str, refusal: Refusal
+) -> ClientCommand | Refusal:
+    """A write that is refused, but where the register holds these values already."""
+    if number in _OF_PORTS or not REGISTERS[number].writable:
+        return refusal
+    try:
+        values = parse(number, tokens)
+    except RegisterValueError:
+        return refusal
+    return ClientCommand(Kind.COMPARE, body, Read(number), (values, refusal))
 
 
 def _read(number: int, tokens: list[str], body: str) -> ClientCommand | Refusal:
@@ -215,10 +221,12 @@ def _read(number: int, tokens: list[str], body: str) -> ClientCommand | Refusal:
     return ClientCommand(Kind.RATE if number == LINE_RATE else Kind.READ, body, command)
 
 
-def _holds(number: int, wanted: Values, reply: Reply) -> bool:
-    """Whether a device that replied so holds these values."""
+def _holds(reply: Reply, values: Values) -> bool:
+    """Whether a device that replied so holds these values in the register that was read."""
+    if reply.register is None:
+        return False
     try:
-        return same(number, wanted, parse(number, reply.tokens))
+        return same(reply.register, values, parse(reply.register, reply.tokens))
     except RegisterValueError:  # a reply that is damaged says nothing
         return False
 
@@ -373,9 +381,7 @@ class Arbiter:
         if done.asked.unless is not None:
             self._compared(done.client, *done.asked.unless, result)
         elif isinstance(result, Reply):
-            self.counts[done.client, "answered"] += 1
-            number = [] if result.register is None else [f"{result.register:02d}"]
-            self._say(done.client, encode(",".join([result.word, *number, *result.tokens])))
+            self._reply(done.client, result.word, result)
         elif isinstance(error, DeviceRefused):
             self._say(done.client, encode(f"VNERR,{error.code:02X}"))
         else:
@@ -384,12 +390,16 @@ class Arbiter:
 
     def _compared(self, name: str, wanted: Values, refusal: Refusal, result: object) -> None:
         """A write that is not sent: as if it had worked where the register holds that already."""
-        number = result.register if isinstance(result, Reply) else None
-        if isinstance(result, Reply) and number is not None and _holds(number, wanted, result):
-            self.counts[name, "answered"] += 1
-            self._say(name, encode(",".join(["VNWRG", f"{number:02d}", *result.tokens])))
+        if isinstance(result, Reply) and _holds(result, wanted):
+            self._reply(name, "VNWRG", result)
         else:
             self._refuse(name, refusal)
+
+    def _reply(self, name: str, word: str, reply: Reply) -> None:
+        """What the device answered, behind the word of the question."""
+        self.counts[name, "answered"] += 1
+        number = [] if reply.register is None else [f"{reply.register:02d}"]
+        self._say(name, encode(",".join([word, *number, *reply.tokens])))
 
     def again(self) -> None:
         """What is on the wire was not sent after all: it is the first one again."""

@@ -346,6 +346,8 @@ def test_a_definition_is_told_for_and_taken_from_beside_the_recording(tmp_path):
     with pytest.raises(RecordingError, match=r"put Reading\.msg beside it"):
         open_recording(path)
     (path.parent / "Reading.msg").write_text(LAB["lab/msg/Reading"])
+    with pytest.raises(RecordingError, match=r"a part lab/msg/Place.* put Place\.msg beside it"):
+        open_recording(path)
     (path.parent / "msg").mkdir()
     (path.parent / "msg" / "Place.msg").write_text(LAB["lab/msg/Place"])
     for one in (path, path.parent):

@@ -330,17 +330,23 @@ def _define(reader: _Message, path: Path) -> None:
 
     homes = [path, path.parent] if path.is_dir() else [path.parent]
     folders = [folder for home in homes for folder in (home, home / "msg")]
-    wanted = [connection.msgtype for connection in reader.connections]
+    # each with the file whose message it is a part of; a message that nobody defined is no fault
+    wanted: list[tuple[str, Path | None]] = [(one.msgtype, None) for one in reader.connections]
     asked: set[str] = set()
     while wanted:
-        kind = wanted.pop()
+        kind, part_of = wanted.pop()
         if kind in asked or kind in reader.typestore.fielddefs:
             continue
-        asked.add(kind)
         name = f"{kind.rsplit('/', 1)[-1]}.msg"
         file = next((one / name for one in folders if (one / name).is_file()), None)
         if file is None or file.stat().st_size > _DEFINITION_BYTES:
+            if part_of is not None:
+                raise RecordingError(
+                    part_of, f"has a part {printable(kind)}, whose definition is not there",
+                    f"put {printable(name)} beside it",
+                )  # fmt: skip
             continue
+        asked.add(kind)
         try:
             types = get_types_from_msg(file.read_text("utf-8", "replace"), kind)
             reader.typestore.register(types)
@@ -349,7 +355,7 @@ def _define(reader: _Message, path: Path) -> None:
             raise RecordingError(
                 file, f"does not define a message ({words})", "repair it, or take it away"
             ) from error
-        wanted += [part for _, fields in types.values() for part in _parts(fields)]
+        wanted += [(part, file) for _, fields in types.values() for part in _parts(fields)]
 
 
 def _parts(fields: _Message) -> Iterator[str]:
