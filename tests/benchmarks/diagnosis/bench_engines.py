@@ -1,7 +1,7 @@
 """Both engines on the same recordings: real with known truth, real untouched, blind.  One table.
 
     python tests/benchmarks/diagnosis/bench_engines.py --kept ANSWERS.json [--only PART ...]
-        [--seed N --cases RING=N ...] [--again ENGINE] [--listed]
+        [--seed N --cases RING=N ...] [--world NAME] [--again ENGINE] [--listed]
 
 A case is answered once by each engine and kept in the file; `--again one-model` forgets what that
 engine said (of the cases that `--only` leaves).  The blind cases are drawn anew from the seed and
@@ -11,6 +11,8 @@ known:     what was put on or flows is named, at its time; a delay of the magnet
            and an unknown where something stands in the room, are no mistakes
 untouched: nothing named but a delay, and no unknown
 blind:     `nulls`, `singles`, `pairs`, `withheld`, `outside` of the generator of sealed trials
+worlds:    `--world workboat` or `road_and_air`: `null`, `single`, `pair`, `withheld`, `outside` of
+           generators by other authors (tests/tools/generators)
 CPU is that of the diagnosis in one process, without the start of Python.
 """
 
@@ -19,6 +21,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
@@ -33,6 +36,7 @@ from blind_trials.answers import read_answer
 from blind_trials.judge import ORDER, judge
 from blind_trials.making import make
 from blind_trials.sealing import read_object
+from generators.truths import KINDS, WORLDS, made
 
 from ahrsd.diagnosis.engines import ENGINES, diagnosed
 from ahrsd.diagnosis.track import Spec, Track
@@ -113,6 +117,20 @@ def blind_cases(seed: int, drawn: Sequence[str]) -> Iterator[Case]:
                 yield Case(ring, said, track, spec, truth=truth)
 
 
+def world_cases(world: str, seed: int, drawn: Sequence[str]) -> Iterator[Case]:
+    counts = {kind: int(count) for kind, count in (one.split("=") for one in drawn)}
+    if unheard := set(counts) - set(KINDS):
+        sys.exit(f"{world} has no {', '.join(unheard)}; it has {', '.join(KINDS)}")
+    with tempfile.TemporaryDirectory() as scratch:
+        for one in made(world, Path(scratch), seed, counts):
+            spec = Spec() if one.spec is None else load_spec(one.spec)[0]
+            track, _ = load_track(one.table, spec=spec)
+            planted = " ".join(f"{e['effect']} {e['multiple']:.0f}" for e in one.truth["effects"])
+            kind = one.truth["kind"]
+            said = f"{seed} {kind} {one.truth['id']} {planted or one.truth['noise']['law']}"
+            yield Case(f"{world} {kind}", said, track, spec, truth=one.truth)
+
+
 def answered(engine: str, case: Case) -> Json:
     """What an engine says of a case, and its seconds of CPU."""
     begin = time.process_time()
@@ -187,12 +205,18 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=[""], help="parts of 'PART: NAME'")
     parser.add_argument("--seed", type=int, default=1, help="of the blind cases")
     parser.add_argument("--cases", nargs="*", default=[], help="blind cases, as singles=22")
+    parser.add_argument("--world", choices=sorted(WORLDS), help="whose cases; else the trials' own")
     parser.add_argument("--again", choices=ENGINES, help="answer anew by this engine")
     parser.add_argument("--listed", action="store_true", help="list every case")
     given = parser.parse_args()
     known: dict[str, Json] = json.loads(given.kept.read_text()) if given.kept.exists() else {}
     done = []
-    cases = itertools.chain(real_cases(given.only), blind_cases(given.seed, given.cases))
+    drawn = (
+        blind_cases(given.seed, given.cases)
+        if given.world is None
+        else world_cases(given.world, given.seed, given.cases)
+    )
+    cases = itertools.chain(real_cases(given.only), drawn)
     for case in cases:
         title = f"{case.part}: {case.name}"
         if not any(word in title for word in given.only):

@@ -1,0 +1,1 @@
+"""Cars, wheeled robots, multicopters and sensors that are turned by hand."""

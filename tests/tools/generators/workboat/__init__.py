@@ -1,0 +1,1 @@
+"""Work boats, ROVs, AUVs and towed bodies."""
