@@ -23,7 +23,12 @@ _AXES = ("x", "y", "z")
 _STUCK_ROWS, _LONGER = 8, 5.0
 _MOVED = 8.0  # noise levels by which the field must have turned during the repetition
 _STEPS = 3.0  # steps of coarse numbers by which the field must turn to have a new reading
-_HELD_SHARE = 0.4  # of the moving samples that repeat the one before
+_FEWEST_REPEATS = 20
+_MOVING_SHARE = 0.7  # of the share that repeats in all: where the sensor turns, numbers that are
+# coarse change, and a reading that is held does not
+#: s; magnetometers have rates of their own: 202 a second in all recordings of BROAD, rows at 286
+_ORDINARY_PERIOD_S = 0.01
+_CLOCKWORK = 0.3  # variance of the time from one new reading to the next, in that of chance
 _DOUBLED_SHARE = 2e-3
 _TURNING = 5.0  # gyro noise levels
 
@@ -35,7 +40,8 @@ def repeats(track: Track, clipped: NDArray[np.bool] | None = None) -> list[Fact]
         again &= ~clipped
     expected = _expected_change(track)
     stuck, bad = _stuck(track, again)
-    held = _held(track, again & ~bad, expected)
+    alone = again & ~bad & ~_again(track, track.gyro_b_rad_s)  # else the whole sample came twice
+    held = _held(track, alone, expected)
     doubled = [] if held else _doubled(track, again & ~bad)
     return stuck + held + doubled
 
@@ -115,20 +121,25 @@ def _stuck(track: Track, again: NDArray[np.bool]) -> tuple[list[Fact], NDArray[n
 
 
 def _held(track: Track, again: NDArray[np.bool], expected: Array) -> list[Fact]:
+    """A magnetometer that is read more often than it measures, at any ratio of the two rates.
+
+    It repeats while the sensor turns as well, and new readings come as regularly as a clock.
+    """
     moving = expected > max(float(np.quantile(expected, 0.5)), _STEPS * _step(track))
-    count = int(np.count_nonzero(moving))
-    if count < 50 or np.count_nonzero(again & moving) < _HELD_SHARE * count:
-        return []
     fresh = np.flatnonzero(~again)
-    lengths = np.diff(fresh)
-    if len(lengths) < 10:
+    repeated = int(np.count_nonzero(again))
+    if np.count_nonzero(moving) < 50 or len(fresh) < 10 or repeated < _FEWEST_REPEATS:
         return []
-    usual = int(np.median(lengths))
-    if usual < 2 or np.mean(np.abs(lengths - usual) <= 1) < 0.8:
+    usual = len(again) / len(fresh)
+    if usual * track.step_s < _ORDINARY_PERIOD_S:
+        return []
+    if np.mean(again[moving]) < _MOVING_SHARE * repeated / len(again):
+        return []
+    if _irregularity(np.diff(fresh)) > _CLOCKWORK:
         return []
     step = track.step_s
     words = (
-        f"the magnetometer has a new reading only every {usual} samples "
+        f"the magnetometer has a new reading only every {usual:.3g} samples "
         f"({1 / (usual * step):.3g} Hz)"
     )
     return [
@@ -142,6 +153,20 @@ def _held(track: Track, again: NDArray[np.bool], expected: Array) -> list[Fact]:
             again.copy(),
         )
     ]
+
+
+def _irregularity(rows: Array) -> float:
+    """How the rows from one new reading to the next vary, in what they vary by where each row
+    repeats by chance (variances of sums over as many as have a variance of ten then)."""
+    mean = float(np.mean(rows))
+    chance = mean * (mean - 1.0)
+    together = max(1, int(np.ceil(10.0 / chance)))
+    sums = np.add.reduceat(rows, np.arange(0, len(rows) - together + 1, together))[:-1]
+    if len(sums) < 3:
+        return 1.0
+    middle = np.median(sums)  # a gap, or a span without a new reading, is one sum
+    spread = 1.4826 * float(np.median(np.abs(sums - middle)))
+    return max(spread, 0.3) ** 2 / (together * chance)
 
 
 def _doubled(track: Track, again: NDArray[np.bool]) -> list[Fact]:

@@ -210,6 +210,42 @@ def test_a_held_magnetometer(track: Track) -> None:
     assert abs(np.mean(fact.bad) - 0.75) < 0.01
 
 
+@pytest.mark.parametrize("rows", [1.34, 1.21, 2.7, 6.3])
+def test_a_magnetometer_that_is_read_a_little_more_often_than_it_measures(
+    track: Track, rows: float
+) -> None:
+    count = np.arange(len(track))
+    at = np.ceil(np.floor(count / rows + 1e-9) * rows - 1e-9).astype(int)
+    fact = _only(hygiene(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
+    assert fact.effect == "mag_sample_hold"
+    assert abs(fact.setting["hold"] - rows) < 0.01
+    assert f"only every {rows:.3g} samples" in fact.words
+    assert fact.bad is not None
+    assert abs(np.mean(fact.bad) - (1.0 - 1.0 / rows)) < 0.01
+
+
+def test_numbers_that_repeat_by_chance_are_not_held(track: Track) -> None:
+    """As often as of a magnetometer that is held for 1.34 rows."""
+    again = np.random.default_rng(3).random(len(track)) < 0.25
+    at = np.maximum.accumulate(np.where(again, 0, np.arange(len(track))))
+    assert not hygiene(replace(track, mag_b_gauss=track.mag_b_gauss[at]))
+
+
+def test_a_rate_of_its_own_above_100_hz_is_ordinary(track: Track) -> None:
+    """Rows at 400 Hz of a magnetometer that has 200 new readings a second."""
+    time_s = np.arange(len(track)) / 400.0
+    dt_s = np.where(np.isfinite(track.dt_s), 1 / 400.0, np.nan)
+    at = np.arange(len(track)) // 2 * 2
+    fast = replace(
+        track,
+        time_s=time_s,
+        dt_s=dt_s,
+        gyro_b_rad_s=track.gyro_b_rad_s * 400.0 * float(np.nanmedian(track.dt_s)),
+        mag_b_gauss=track.mag_b_gauss[at],
+    )
+    assert [fact.effect for fact in hygiene(fast)] == []
+
+
 def test_doubled_samples(track: Track) -> None:
     order = np.sort(np.r_[np.arange(5900), np.arange(40, 5840, 58)])
     doubled = replace(

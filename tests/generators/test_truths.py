@@ -41,6 +41,11 @@ def said(*names: str, unknown: bool = False) -> dict:
         (told("null", noise="heavy_tailed_gaps"), said("dropped_samples", "noise_burst"), "quiet"),
         (told("single", "mag_time_lag"), said("gyro_time_lag"), "right"),
         (told("single", "mag_time_lag"), said("mag_time_lag", "eddy_current"), "name added"),
+        (
+            told("single", "gyro_scale", noise="red_gaps"),
+            said("dropped_samples", "gyro_scale"),
+            "right",
+        ),
         (told("single", "eddy_current"), said("mag_time_lag"), "wrong name"),
         (told("single", "eddy_current"), said(), "missed"),
         (told("pair", "gyro_scale", "hard_iron_step"), said("clock_rate"), "one of two"),

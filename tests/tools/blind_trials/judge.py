@@ -115,7 +115,8 @@ def _single(case: str, truth: Json, answer: ToolAnswer) -> Verdict:
         return Verdict(
             case, truth, answer, RIGHT, False, _least([effect]), True, True, True, True, False
         )
-    first = answer.names[0] if answer.findings else None
+    asked = [name for name in answer.names if name in right or name not in truth["allowed"]]
+    first = asked[0] if asked else None
     detected = answer.mismatch or bool(answer.findings) or answer.unexplained
     in_set = any(name in right for name in answer.everything)
     others = [n for n in answer.names if n not in right and n not in truth["allowed"]]
