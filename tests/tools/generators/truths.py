@@ -9,10 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from generators.road_and_air import world as road_and_air
 from generators.workboat import world as workboat
 
 Json = dict[str, Any]
+Array = NDArray[np.float64]
 
 WORLDS = {"road_and_air": road_and_air, "workboat": workboat}
 KINDS = ("null", "single", "pair", "withheld", "outside")
@@ -59,12 +63,23 @@ OF_THE_NOISE: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
+class Iron:
+    """The calibration without what is concealed, contract section 1. `field_n_gauss`: (3,) NED."""
+
+    soft_iron: Array
+    hard_iron_gauss: Array
+    gyro_bias_rad_s: Array
+    field_n_gauss: Array
+
+
+@dataclass(frozen=True)
 class Made:
     """One case on the disk. `spec`: None where nothing is known of the sensors."""
 
     table: Path
     spec: Path | None
     truth: Json
+    iron: Iron
 
 
 def made(world: str, folder: Path, seed: int, counts: Mapping[str, int]) -> Iterator[Made]:
@@ -76,7 +91,8 @@ def made(world: str, folder: Path, seed: int, counts: Mapping[str, int]) -> Iter
     for told in json.loads((folder / "truth.json").read_text())["cases"]:
         spec = folder / f"{told['id']}.spec.json"
         known = spec.exists() and bool(json.loads(spec.read_text()))
-        yield Made(folder / f"{told['id']}.csv.gz", spec if known else None, truth_of(told))
+        table = folder / f"{told['id']}.csv.gz"
+        yield Made(table, spec if known else None, truth_of(told), _iron(told))
 
 
 def truth_of(told: Json) -> Json:
@@ -93,6 +109,17 @@ def truth_of(told: Json) -> Json:
         "duration_s": 0.0,
         "oracle_gain_nats_per_sample": None,
     }
+
+
+def _iron(told: Json) -> Iron:
+    said = told.get("calibration", told)
+    field_n_gauss = said.get("field_ned_gauss", said.get("field_north_east_down_gauss"))
+    return Iron(
+        np.array(said["soft_iron"]),
+        np.array(said["hard_iron_gauss"]),
+        np.array(said["gyro_bias_rad_s"]),
+        np.array(field_n_gauss),
+    )
 
 
 def _effect(kind: str, told: Json) -> Json:
