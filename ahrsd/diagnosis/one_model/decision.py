@@ -18,7 +18,7 @@ from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.locate import single_source
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Sized
-from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, STEPS
+from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, delay_of_filter, plain_delay
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
 from ahrsd.diagnosis.one_model.remainder import still_spells
@@ -117,8 +117,9 @@ def _switching(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
 
     Those that are ordinary count as well.
     """
-    kinds = [all_sets.component(key).effect for key in best.names]
-    many = [k for k in STEPS if kinds.count(k) >= priors.CHANGES]
+    members = [all_sets.component(key) for key in best.names]
+    kinds = sorted(one.effect for one in members if one.effect is not None and one.jumps)
+    many = [k for k in dict.fromkeys(kinds) if kinds.count(k) >= priors.CHANGES]
     return sorted(many, key=kinds.count, reverse=True)
 
 
@@ -134,7 +135,7 @@ def _jumping(
     at = np.linspace(time_s[0], time_s[-1], _PIECES)
     levels = np.vstack([np.zeros(3), np.cumsum(changes, axis=0)])
     course = levels[np.searchsorted(onsets, at, side="right")]
-    frame = STEPS[kind]
+    frame = all_sets.component(keys[0]).frame
     nats = sum(odds[key] for key in keys)
     return _described(at, course, frame, nats, ((onsets[0], float(time_s[-1])),))
 
@@ -168,10 +169,11 @@ def _is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
     """Whether a member is no larger than what real recordings ordinarily have of its kind."""
     if key == LAG or not all_sets.is_real(best.names):
         return False
-    kind = all_sets.component(key).effect or key
-    if kind in STEPS and _is_place(all_sets, key):
+    one = all_sets.component(key)
+    if one.jumps and _is_place(all_sets, key):
         return True
-    return size_of(all_sets, best, key) < priors.ORDINARY_EFFECT.get(kind, 0.0)
+    course = priors.ORDINARY_COURSE.get(one.frame, 0.0)
+    return size_of(all_sets, best, key) < (course if one.row is None else one.row.ordinary)
 
 
 def _is_place(all_sets: Hypotheses, key: str) -> bool:
@@ -202,11 +204,11 @@ def _told(
     one = all_sets.component(key)
     value, deviation = coefficients(all_sets, best, key)
     shares = _shares(all_sets, space, best, key)
-    name = _delay_name(all_sets, best, float(value[0])) if key == LAG else one.effect or key
+    effect = library[one.effect or key]
     if key == LAG:
-        shares = {name: 1.0}
-        value = np.abs(value) if name == "gyro_time_lag" else value
-    effect = library[name]
+        effect = _which_delay(all_sets, best, float(value[0]), library)
+        shares, value = {effect.identifier: 1.0}, value * effect.delay
+    name = effect.identifier
     sure = 1.0 / (1.0 + np.exp(-min(odds, _SUREST)))
     others = tuple(
         Share(other, share * sure) for other, share in shares.items()
@@ -291,18 +293,18 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
-def _delay_name(all_sets: Hypotheses, best: Hypothesis, lag_s: float) -> str:
-    """Which delay it is: a low-pass where its form is there in full."""
-    if lag_s < 0.0:
-        return "gyro_time_lag"
-    if LAG_FORM in best.keys:
+def _which_delay(
+    all_sets: Hypotheses, best: Hypothesis, lag_s: float, library: Mapping[str, Effect]
+) -> Effect:
+    """Which delay it is: a filter's where its form is there in full."""
+    if lag_s > 0.0 and LAG_FORM in best.keys:
         value, deviation = coefficients(all_sets, best, LAG_FORM)
         as_filter = -0.5 * ((value[0] - 1.0) / deviation[0]) ** 2
         as_lag = -0.5 * (value[0] / deviation[0]) ** 2
         near = abs(value[0] - 1.0) < max(2.0 * deviation[0], _NEARLY_ALL)
         if near and as_filter - as_lag > priors.ODDS_REAL:
-            return "mag_low_pass"
-    return "mag_time_lag"
+            return delay_of_filter(library)
+    return plain_delay(library, 1.0 if lag_s >= 0.0 else -1.0)
 
 
 def _where(all_sets: Hypotheses, best: Hypothesis, key: str) -> Where:

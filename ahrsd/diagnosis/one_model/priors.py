@@ -61,8 +61,8 @@ SMOOTHED_S, STILL_S, MOST_SPELLS = 0.5, 3.0, 4
 MOVED = 10.0
 #: probability of any one effect of the library;  source: the brief of the engine, 1 in 60
 EFFECT = 1.0 / 60.0
-#: of effects that recordings ordinarily have: a delay of the magnetometer's pipeline
-ORDINARY_EFFECTS: Mapping[str, float] = {"mag_time_lag": 0.5, "gyro_time_lag": 0.1}
+#: of a delay between the sensors, which recordings ordinarily have
+DELAY = 0.5
 #: steps of a kind that are nearer than that are one, s
 TRANSITION_S = 2.0
 #: seconds before and after a step for which whatever makes it may be anywhere: a strong magnet is
@@ -105,22 +105,10 @@ LEVEL_S, LEVELS = 10.0, (0.02, 50.0)
 #: octaves of the noise's spectrum, at most
 BANDS = 7
 
-#: what untouched recordings have of effects, and of courses, that nobody put there: nine in ten
-#: stay below, in units of the effect's usual scale (of a course gauss, rad/s); beside the remainder
-#: it is a finding only where it is larger;  source: the same command
-ORDINARY_EFFECT: Mapping[str, float] = {
-    "field_anomaly": 0.97,
-    "field_step": 0.46,
-    "free sensor": 0.017,
-    "hard_iron_drift": 9.5,
-    "hard_iron_step": 1.3,
-    "hysteresis": 0.4,
-    "mag_cross_axis": 4.5,
-    "mag_gyro_misalignment": 4.7,
-    "onboard_calibration_active": 1.4,
-    "soft_iron_step": 11,
-    "viscous_magnetisation": 7.8,
-}
+#: size of a free course, by frame, that one in ten untouched recordings is beyond beside the
+#: remainder, gauss or rad/s: it is a finding only where it is larger;  source: the same command.
+#: Of effects it is a column of the library, `ordinary`
+ORDINARY_COURSE: Mapping[str, float] = {"sensor": 0.017}
 
 # --- where it is linearised --------------------------------------------------------------------
 #: deviations of calibration and delay to which a point is where its model wants it
