@@ -27,10 +27,8 @@ import numpy as np
 from bench_ordinary import AT_REST, DISTURBED, DOUBTFUL, FOLDERS, RECORDINGS
 from scipy.optimize import minimize
 
-from ahrsd.diagnosis import roles
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.hygiene import hygiene, put_right
 from ahrsd.diagnosis.one_model import priors, rich
 from ahrsd.diagnosis.one_model.decision import size_of
 from ahrsd.diagnosis.one_model.diagnose import begun, diagnose
@@ -38,7 +36,7 @@ from ahrsd.diagnosis.one_model.effect_components import LAG
 from ahrsd.diagnosis.one_model.evidence import evaluated
 from ahrsd.diagnosis.one_model.model_search import beside
 from ahrsd.diagnosis.one_model.search_space import space_at
-from ahrsd.diagnosis.pauses import without_jumps
+from ahrsd.diagnosis.prepared import prepared
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import RecordingError
 from ahrsd.offline.diagnose import load_track
@@ -58,9 +56,8 @@ def untouched(words: list[str]) -> Iterator[tuple[str, Path]]:
 
 def measured(path: Path) -> dict[str, Any]:
     """What a recording leaves: `profiles` of the remainder, `effects` that nobody put there."""
-    track, _ = load_track(path)
-    track, _ = without_jumps(roles.prepared(track)[0])
-    problem, fit = begun(put_right(track, hygiene(track)), Spec(), {})
+    track = prepared(load_track(path)[0]).put_right()
+    problem, fit = begun(track, Spec(), {})
     found = rich.richest(problem, fit.filtered, EFFECTS)
     return {"profiles": profiles(found), "effects": sizes(found)}
 
