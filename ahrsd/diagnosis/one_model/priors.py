@@ -122,3 +122,11 @@ NAME_ODDS, UNKNOWN_ODDS = 3.0, 3.0
 ODDS_REAL = 12.0
 #: nats that a move of the search must gain
 MOVE = 2.0
+
+# --- what is held against an answer --------------------------------------------------------------
+#: parts into which a recording is dealt, each foretold from the others, and seconds of a stretch:
+#: longer than a whitened reading remembers, shorter than an object that is passed by
+PARTS, STRETCH_S = 5, 2.0
+#: shares of a recording by which copies of a cause are moved: no simple ones, what comes again and
+#: again would meet itself
+SHIFTS = (0.236, 0.382, 0.472, 0.618, 0.764, 0.854)
