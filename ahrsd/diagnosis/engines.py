@@ -17,5 +17,5 @@ def diagnosed(
     if engine == ONE_MODEL:
         from ahrsd.diagnosis.one_model.diagnose import diagnose  # whom it serves waits for it
 
-        return diagnose(track, spec, recording=recording)
+        return diagnose(track, spec, recording=recording, simulated=simulated)
     return diagnose_logged(track, spec, recording=recording, simulated=simulated)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ahrsd.diagnosis.address import AXES, where_of
 from ahrsd.diagnosis.confound import separating_manoeuvre
 from ahrsd.diagnosis.diagnosis import Cost, Finding, Share, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.base import Effect, Setting
@@ -27,7 +28,6 @@ from ahrsd.diagnosis.validate import heading_error_deg
 from ahrsd.diagnosis.values import Term
 from ahrsd.samples import Array
 
-AXES = ("x", "y", "z")
 #: odds are told no surer than this
 _SUREST = 30.0
 _SMALLEST_SHARE = 0.01
@@ -38,9 +38,17 @@ _PIECES = 80
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """Names, terms and what is left of one hypothesis.  best: with nothing that is not told."""
+    """Names, terms and what is left of one hypothesis.
+
+    best: with nothing that is not told;  keys: of the findings and of the terms, in their order
+    unknown: of what is left: a course, a part of the remainder, a source's steps
+    rivals: what is likeliest without each member
+    """
 
     best: Hypothesis
+    keys: tuple[str, ...]
+    unknown: tuple[str, ...]
+    rivals: Mapping[str, Hypothesis]
     findings: tuple[Finding, ...]
     terms: tuple[Term, ...]
     unexplained: Unexplained
@@ -51,9 +59,10 @@ def decided(
     all_sets: Hypotheses, space: Space, best: Hypothesis, library: Mapping[str, Effect]
 ) -> Answer:
     """The answer of a search."""
-    best, odds = _borne_out(all_sets, space, best)
+    best, rivals = _borne_out(all_sets, space, best)
+    odds = {key: best.score - rival.score for key, rival in rivals.items()}
     switching = _switching(all_sets, best)
-    found, terms = [], []
+    found, terms, keys = [], [], []
     for key in sorted(odds, key=lambda one: -odds[one]):
         effect = all_sets.component(key).effect
         if effect is None or effect in switching or _is_ordinary(all_sets, best, key):
@@ -61,16 +70,19 @@ def decided(
         finding, term = _told(all_sets, space, best, key, odds[key], library)
         found.append(finding)
         terms.append(term)
+        keys.append(key)
     drifts = _drifts(all_sets, space, best, library)
     for key, row in drifts.items():
         finding, term = _drifting(all_sets, best, key, odds[key], row)
         found.append(finding)
         terms.append(term)
-    left = _left(all_sets, space, best, {k: v for k, v in odds.items() if k not in drifts})
+        keys.append(key)
+    unknown, left = _left(all_sets, space, best, {k: v for k, v in odds.items() if k not in drifts})
     if switching and not left.detected:
-        left = _jumping(all_sets, best, switching[0], odds)
+        unknown, left = _jumping(all_sets, best, switching[0], odds)
     surest = max([*odds.values(), left.evidence_nats], default=0.0)
-    return Answer(best, tuple(found), tuple(terms), left, surest)
+    told = tuple(found), tuple(terms), left, surest
+    return Answer(best, tuple(keys), unknown, rivals, *told)
 
 
 def _drifts(
@@ -125,7 +137,7 @@ def _switching(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
 
 def _jumping(
     all_sets: Hypotheses, best: Hypothesis, kind: str, odds: Mapping[str, float]
-) -> Unexplained:
+) -> tuple[tuple[str, ...], Unexplained]:
     """A source that goes in steps: its levels between the changes, along its direction."""
     keys = [key for key in best.names if all_sets.component(key).effect == kind]
     keys.sort(key=lambda key: float(all_sets.component(key).setting["onset_s"]))
@@ -137,29 +149,30 @@ def _jumping(
     course = levels[np.searchsorted(onsets, at, side="right")]
     frame = all_sets.component(keys[0]).frame
     nats = sum(odds[key] for key in keys)
-    return _described(at, course, frame, nats, ((onsets[0], float(time_s[-1])),))
+    return tuple(keys), _described(at, course, frame, nats, ((onsets[0], float(time_s[-1])),))
 
 
 def _borne_out(
     all_sets: Hypotheses, space: Space, best: Hypothesis
-) -> tuple[Hypothesis, dict[str, float]]:
-    """The set without members that are not sure, and the log odds of the others."""
+) -> tuple[Hypothesis, dict[str, Hypothesis]]:
+    """The set without members that are not sure, and what is likeliest without each other one."""
     while True:
         own = [key for key in best.names if key not in all_sets.remainder]
         real = all_sets.is_real(best.names)
-        asked = {key: _asked_odds(all_sets, key, real) for key in own}
+        asked = {key: asked_odds(all_sets, key, real=real) for key in own}
         rivals = {key: all_sets.judge(all_sets.without(best.names, key), best) for key in own}
         if all(best.score - rivals[key].score >= asked[key] for key in own):
             rivals = {key: _without(all_sets, space, best, key) for key in own}
         odds = {key: best.score - rival.score for key, rival in rivals.items()}
         unsure = [key for key in own if odds[key] < asked[key]]
         if not unsure:
-            return best, odds
+            return best, rivals
         key = min(unsure, key=lambda one: odds[one])
         best = _without(all_sets, space, best, key)
 
 
-def _asked_odds(all_sets: Hypotheses, key: str, real: bool) -> float:
+def asked_odds(all_sets: Hypotheses, key: str, *, real: bool) -> float:
+    """Log odds from which on a member is told."""
     if real and key != LAG:
         return priors.ODDS_REAL
     return priors.UNKNOWN_ODDS if all_sets.component(key).effect is None else priors.NAME_ODDS
@@ -307,30 +320,30 @@ def _which_delay(
     return plain_delay(library, 1.0 if lag_s >= 0.0 else -1.0)
 
 
-def _where(all_sets: Hypotheses, best: Hypothesis, key: str) -> Where:
-    """When, on which axes and in which frame a member acts."""
+def added_by(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, str]:
+    """(N, 3) what a member adds to the readings, and its unit: gauss, or rad/s of the gyro's."""
     one, track = all_sets.component(key), all_sets.made.context.track
     value, _ = coefficients(all_sets, best, key)
-    matrix = one.columns.mag if one.columns.mag is not None else one.columns.gyro
+    matrix = one.columns.gyro if one.columns.mag is None else one.columns.mag
     added = np.zeros((len(track), 3)) if matrix is None else np.asarray(matrix @ value)
-    spread = np.sqrt(np.mean(added**2, axis=0))
-    axes = tuple(axis for axis, size in zip(AXES, spread, strict=True) if size > 0.2 * spread.max())
-    begin, end = float(track.time_s[0]), float(track.time_s[-1])
-    if "onset_s" in one.setting:
-        begin = float(one.setting["onset_s"])
-        end = min(end, begin + float(one.setting.get("length_s", end - begin)))
-    return Where(((begin, end),), axes, one.frame)
+    return added, "rad/s" if one.columns.mag is None else "gauss"
+
+
+def _where(all_sets: Hypotheses, best: Hypothesis, key: str) -> Where:
+    """When, on which axes, in which frame and regime a member acts."""
+    one, track = all_sets.component(key), all_sets.made.context.track
+    return where_of(track, added_by(all_sets, best, key)[0], one.setting, one.frame)
 
 
 def _left(
     all_sets: Hypotheses, space: Space, best: Hypothesis, odds: Mapping[str, float]
-) -> Unexplained:
-    """What no name explains, where that is beyond the ordinary."""
+) -> tuple[tuple[str, ...], Unexplained]:
+    """What no name explains, where that is beyond the ordinary, and the members that it is."""
     courses = [key for key in space.courses if key in odds]
     courses = [key for key in courses if not _is_ordinary(all_sets, best, key)]
     if courses:
         key = max(courses, key=lambda one: odds[one])
-        return _course(all_sets, best, key, odds[key])
+        return (key,), _course(all_sets, best, key, odds[key])
     for key, size in priors.ORDINARY.items():
         if key not in best.names or size_of(all_sets, best, key) < size.up_to():
             continue
@@ -339,8 +352,8 @@ def _left(
             frame, found = all_sets.component(key).frame, size_of(all_sets, best, key)
             unit = "rad/s" if frame == "gyro" else "gauss"
             where = Where((), AXES, frame, f"a part of what is left ({key})")
-            return Unexplained(True, where, None, found, unit, evidence_nats=nats)
-    return Unexplained(False)
+            return (key,), Unexplained(True, where, None, found, unit, evidence_nats=nats)
+    return (), Unexplained(False)
 
 
 def size_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:

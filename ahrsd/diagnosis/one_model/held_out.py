@@ -56,7 +56,9 @@ class _Parts:
 class Foretold:
     """How well a set foretells each part from the others.
 
-    nats: log density of all parts;  square: mean square of what is not foretold, the filter's unit
+    nats: log density of all parts
+    square: mean square by which the next reading is off, in the filter's unit: the mean of the
+            noise's log powers is the error of a forecast by all that was before
     """
 
     nats: float
@@ -93,15 +95,25 @@ class HeldOut:
 
     def gain(self, without: Names) -> float:
         """Nats per recorded reading by which the best set foretells better than another."""
-        return (self.of(self.best.names).nats - self.of(without).nats) / self.samples
+        return float(self.of(self.best.names).nats - self.of(without).nats) / self.samples
 
-    def told(self, key: str) -> Heldout:
-        """The held-out gain of one member of the best set, and the largest of its copies."""
-        without = self.all_sets.without(self.best.names, key)
-        course = self.all_sets.component(key).row is None
-        copies = self._elsewhere(key, without) if course else self._moved(key, without)
+    def told(self, keys: Sequence[str]) -> Heldout:
+        """The held-out gain of members of the best set together, and the largest of its copies."""
+        without = self.less(keys)
+        courses = any(self.all_sets.component(key).row is None for key in keys)
+        if courses:
+            copies = self._elsewhere(without)
+        else:
+            copies = max(self._moved(key, without) for key in keys)
         before, after = (self._rms_gauss(names) for names in (without, self.best.names))
         return Heldout(before, after, self.gain(without), copies / self.samples)
+
+    def less(self, keys: Sequence[str]) -> Names:
+        """The best set without some members."""
+        names = self.best.names
+        for key in keys:
+            names = self.all_sets.without(names, key)
+        return names
 
     def _rms_gauss(self, names: Names) -> float:
         """Root mean square of what is not foretold, gauss."""
@@ -137,8 +149,8 @@ class HeldOut:
         without_one = sum((worth(number) for number in range(folds)), np.zeros(len(steps)))
         return float(np.max(folds * worth(folds) - without_one))
 
-    def _elsewhere(self, key: str, without: Names) -> float:
-        """Nats of the best course of the same law in another frame, in a course's place."""
+    def _elsewhere(self, without: Names) -> float:
+        """Nats of the best free course in a frame in which the best set has none."""
         others = [one for one in priors.COURSE_UNIT if f"free {one}" not in self.best.names]
         known = [f"free {one}" for one in others if f"free {one}" in self.all_sets.made.seen]
         base = self.of(without).nats
@@ -182,7 +194,7 @@ def _foretold(parts: _Parts, rows: WhiteRows) -> Foretold:
         total += whole - nats
         own = parts.square[number] - 2 * parts.s[number] @ w + w @ parts.G[number] @ w
         left += float(own)
-    return Foretold(total, rows.power * left / float(parts.rows.sum()))
+    return Foretold(total, float(np.exp(rows.log_power)) * left / float(parts.rows.sum()))
 
 
 def _rolled(columns: Columns, step: int) -> Columns:
@@ -192,11 +204,3 @@ def _rolled(columns: Columns, step: int) -> Columns:
         for part in (columns.mag, columns.gyro)
     )
     return Columns(mag, gyro)
-
-
-def together(held: HeldOut, names: Sequence[str]) -> float:
-    """Nats per recorded reading that members gain together."""
-    without = held.best.names
-    for key in names:
-        without = held.all_sets.without(without, key)
-    return held.gain(without) if names else 0.0

@@ -144,10 +144,14 @@ class Beside:
     root: Array
     seen: Array
 
+    def projected(self, products: Array) -> Array:
+        """(q, p) root^-1 times products of the model with candidates."""
+        return np.asarray(solve_triangular(self.root, products, lower=True, check_finite=False))
+
     def worth(self, candidates: Sequence[str]) -> dict[str, float]:
         """Log Bayes factor of each candidate, sizes averaged."""
         C, own, s = self.made.candidates(self.keys, candidates, self.inverse)
-        W = solve_triangular(self.root, C, lower=True, check_finite=False)
+        W = self.projected(C)
         left = s - self.seen @ W
         out, begin = {}, 0
         for key, square in zip(candidates, own, strict=True):

@@ -130,3 +130,5 @@ PARTS, STRETCH_S = 5, 2.0
 #: shares of a recording by which copies of a cause are moved: no simple ones, what comes again and
 #: again would meet itself
 SHIFTS = (0.236, 0.382, 0.472, 0.618, 0.764, 0.854)
+#: deviations of a coefficient from which on it would have been told nine times in ten
+SHOWN_AT = 6.5

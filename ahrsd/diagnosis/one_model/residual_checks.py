@@ -1,10 +1,10 @@
 """What of the residual is still unlike the model: whiteness, by time, attitude, rate and column.
 
-In the noise that the answer leaves, its residual is V^-1 y, y of variance V = 1 + X Phi X^T.  Copies
-are drawn of that law with the residual's own tails and fitted as the recording was; each statistic,
-chosen before anything is looked at, has the band of its copies (`predictive`).  A bin of a regime
-(heading, tilt, rate, a column) is asked for a field of its own, Z: its score Z^T V^-1 y has the
-variance Z^T V^-1 Z, so half of the square has three halves of a nat where nothing is left.
+In the noise that the answer leaves, its residual is V^-1 y, y of variance V = 1 + X Phi X^T.
+Copies are drawn of that law with the residual's own tails and fitted as the recording was; each
+statistic, chosen before anything is looked at, has the band of its copies (`predictive`).  A bin of
+a regime (heading, tilt, rate, a column) is asked for a field of its own, Z: its score Z^T V^-1 y
+has the variance Z^T V^-1 Z, so half of the square has three halves of a nat where nothing is left.
 
 Before is the calibration alone in the same noise: what was left out would else pass for noise.
 """
@@ -33,7 +33,7 @@ _OUTSIDE = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """The rows of an answer, and what is left of them (3 N,) by the calibration and by all of it."""
+    """The rows of an answer, and what is left of them (3 N,) by the calibration and by all."""
 
     rows: WhiteRows
     calibration: Fit

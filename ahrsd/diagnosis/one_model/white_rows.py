@@ -36,7 +36,7 @@ class WhiteRows:
     """Rows of the readings that are there, and of a set's columns, in the set's noise.
 
     y (N, 3);  X (N, 3, q);  phi (q,): log variances of the coefficients
-    log_power, power: of the noise that was taken out, mean over the rows
+    log_power: of the noise that was taken out, mean over the rows
     rows:      of the track, numbers (N,) of those that are here
     made, log_noise: of which and by which they were made
     """
@@ -45,7 +45,6 @@ class WhiteRows:
     X: Array
     phi: Array
     log_power: float
-    power: float
     rows: NDArray[np.intp]
     made: Linearised
     log_noise: Array
@@ -121,13 +120,9 @@ def white_rows(all_sets: Hypotheses, known: Hypothesis) -> WhiteRows:
     psi = all_sets.psi_of(known)
     phi = [law.log_variance(psi[key]) for key, law in zip(known.keys, laws, strict=True)]
     count = np.diff(made.edges)
-    log_power, power = (
-        float(count @ value) / float(count.sum())
-        for value in (known.at.log_noise, np.exp(known.at.log_noise))
-    )
+    log_power = float(count @ known.at.log_noise) / float(count.sum())
     y, X = cube[seen, :, -1], cube[seen, :, :-1]
-    phis = np.concatenate(phi)
-    return WhiteRows(y, X, phis, log_power, power, seen, made, known.at.log_noise)
+    return WhiteRows(y, X, np.concatenate(phi), log_power, seen, made, known.at.log_noise)
 
 
 def _in_time(made: Linearised, rows: Array, log_noise: Array) -> Array:
