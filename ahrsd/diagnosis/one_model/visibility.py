@@ -35,6 +35,8 @@ def seen_alone(all_sets: Hypotheses, space: Space, names: Names) -> list[Seen]:
     asked = {
         name: [key for key in keys if key not in base.names] for name, keys in space.effects.items()
     }
+    if not any(asked.values()):
+        return []
     worth = scan.worth([key for keys in asked.values() for key in keys])
     best = [max(keys, key=lambda key: worth[key]) for keys in asked.values() if keys]
     C, own, _ = all_sets.made.candidates(base.keys, best, scan.inverse)
