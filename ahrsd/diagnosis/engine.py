@@ -50,17 +50,8 @@ from ahrsd.diagnosis.problem import Problem, model_at_rate, problem_of
 from ahrsd.diagnosis.quick import Quick, cleaned, quick, without_quick
 from ahrsd.diagnosis.refined import left_alone, refined
 from ahrsd.diagnosis.remainder_sizes import sizes_left
-from ahrsd.diagnosis.resting import resting
-from ahrsd.diagnosis.search import (
-    HARDLY_TURNED,
-    STEPS,
-    State,
-    Survey,
-    at_rest,
-    basis_of,
-    formed_basis_of,
-    settled,
-)
+from ahrsd.diagnosis.resting import HARDLY_TURNED, at_rest, resting
+from ahrsd.diagnosis.search import STEPS, State, Survey, basis_of, formed_basis_of, settled
 from ahrsd.diagnosis.sought import sought
 from ahrsd.diagnosis.spectrum import against, spectrum_of
 from ahrsd.diagnosis.track import Spec, Track

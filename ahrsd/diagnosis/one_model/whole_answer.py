@@ -17,6 +17,7 @@ from ahrsd.diagnosis.diagnosis import Diagnosis, Suspect, Unexplained
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.facts import Fact, of_fact, rounding
 from ahrsd.diagnosis.hygiene import would_have_shown
+from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.noise import level_facts
 from ahrsd.diagnosis.null import baseline
 from ahrsd.diagnosis.one_model import pictures, residual_checks, support, visibility
@@ -26,6 +27,7 @@ from ahrsd.diagnosis.one_model.recorded_rate import Quick
 from ahrsd.diagnosis.one_model.repaired_noise import repaired_noise
 from ahrsd.diagnosis.one_model.search_rounds import Searched
 from ahrsd.diagnosis.prepared import Prepared
+from ahrsd.diagnosis.resting import HARDLY_TURNED, at_rest, resting
 
 NOTE = "by the engine one-model, which is experimental"
 #: what moves with a course: probability by chance, and correlation
@@ -56,7 +58,8 @@ def whole_answer(
     remainder_nats = support.nats_of_remainder(all_sets, answer)
     left = told_sizes(all_sets, answer, left, remainder_nats, simulated=simulated)
     loud = _loud(found, fast, spec_given=spec_given)
-    named = (*asked.told(library), *(of_fact(fact, library) for fact in loud), *told)
+    still = resting(start.context(), library, LIMITS) if at_rest(start) else ()
+    named = (*asked.told(library), *told, *(of_fact(fact, library) for fact in loud), *still)
     something = bool(named) or left.detected
     residuals = residual_checks.residuals_of(held.rows(answer.best.names))
     maps = residual_checks.regime_maps(residuals)
@@ -81,7 +84,7 @@ def whole_answer(
         unexplained=left,
         posterior_predictive=residual_checks.checks(residuals, maps),
         sensitivity=hidden,
-        notes=_notes(asked, found, support.doubts(told), something=something),
+        notes=_notes(asked, found, support.doubts(told), still=at_rest(start), something=something),
         model=fast.left.filtered.model,
         noise=repaired_noise(found, fast, library, asked.facts, _spans(loud)),
         terms=(*answer.terms, *fast.answer.terms, *rounding(asked.facts)),
@@ -104,11 +107,12 @@ def _spans(facts: Sequence[Fact]) -> list[tuple[float, float]]:
 
 
 def _notes(
-    asked: Prepared, found: Searched, doubts: tuple[str, ...], *, something: bool
+    asked: Prepared, found: Searched, doubts: tuple[str, ...], *, still: bool, something: bool
 ) -> tuple[str, ...]:
     problem = found.all_sets.made.point.problem
     seen = () if something else would_have_shown(problem.recorded)
-    return (NOTE, *asked.notes, *problem.notes, *doubts, *asked.lesser, *seen)
+    how = (NOTE, *asked.notes, *problem.notes, *((HARDLY_TURNED,) if still else ()))
+    return (*how, *doubts, *asked.lesser, *seen)
 
 
 def _with_channels(

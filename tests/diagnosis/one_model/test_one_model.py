@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from test_resting import standing, warming
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.track import NothingToFit
 
 
 @pytest.mark.parametrize("scenario", ["wam", "mam"])
@@ -85,3 +87,28 @@ def test_pulses_that_averaging_loses_are_named_at_the_recorded_rate():
     (one,) = found.findings
     assert one.setting["period_s"] == pytest.approx(2.0, abs=0.01)
     np.testing.assert_allclose([p.value for p in one.parameters], pulse, atol=6e-4)
+
+
+def test_the_bias_of_a_gyro_that_stands_is_told_without_the_field():
+    warmth = warming()
+    slope = np.array([5e-5, -2e-5, -1.5e-4])
+    found = diagnose(standing(1e-3 + (warmth - 12.0)[:, None] * slope, warmth))
+    told = [one for one in found.findings if one.effect == "gyro_bias_temperature"]
+    assert len(told) == 1
+    np.testing.assert_allclose([p.value for p in told[0].parameters], slope, atol=3e-5)
+    assert any("hardly turned" in note for note in found.notes)
+
+
+def test_a_dead_sensor_is_refused_in_words():
+    track = track_of(experiment("wam", seed=3, samples=2000))
+    with pytest.raises(NothingToFit, match="stuck or was not logged"):
+        diagnose(replace(track, gyro_b_rad_s=np.zeros_like(track.gyro_b_rad_s)))
+
+
+def test_a_recording_with_facts_that_stop_is_told_them_and_nothing_else():
+    track = track_of(experiment("wam", seed=3, samples=2000))
+    swapped = track.gyro_b_rad_s[:, [1, 0, 2]] * np.array([1.0, 1.0, 1.0])
+    found = diagnose(replace(track, gyro_b_rad_s=swapped))
+    assert [one.effect for one in found.findings] == ["frame_error"]
+    assert found.model is None
+    assert found.mismatch
