@@ -24,7 +24,7 @@ from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Fixed
 from ahrsd.diagnosis.one_model.decision import Answer, added_by, coefficients, size_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, beside
-from ahrsd.diagnosis.ordinary import SIMULATED, TABLE
+from ahrsd.diagnosis.ordinary import SIMULATED
 from ahrsd.samples import Array
 
 _WORDS = {
@@ -83,25 +83,32 @@ def left_sizes(
         there = nats[key] > priors.ODDS_REAL
         row = Component(key, _words(key), frame, size, up_to, unit, heading_deg, nats[key], there)
         parts.append(row)
-    fields = sorted(one.size for one in parts if one.unit == "gauss")
+    fields = [one for one in parts if one.unit == "gauss"]
+    sizes = sorted(one.size for one in fields)
+    headings = [(one.heading_deg or 0.0) * one.up_to / max(one.size, 1e-300) for one in fields]
     return Ordinary(
         within=why is None,
         why=why,
         field_gauss=deviation(whole["gauss"]),
-        field_up_to_gauss=TABLE.field.up_to(),
+        field_up_to_gauss=_together([one.up_to for one in fields]),
         heading_deg=heading_off_deg(whole["gauss"], context),
-        heading_up_to_deg=TABLE.heading.up_to(),
+        heading_up_to_deg=_together(headings),
         gyro_rad_s=deviation(whole["rad/s"]),
-        gyro_up_to_rad_s=TABLE.gyro.up_to(),
-        beside_gauss=float(np.linalg.norm(fields[:-1])),
-        beside_from_gauss=TABLE.beside.from_on(),
-        recordings=TABLE.recordings,
+        gyro_up_to_rad_s=_together([one.up_to for one in parts if one.unit != "gauss"]),
+        beside_gauss=float(np.linalg.norm(sizes[:-1])),
+        beside_from_gauss=0.0,
+        recordings=priors.RECORDINGS,
         components=tuple(parts),
     )
 
 
 def _words(key: str) -> str:
     return _WORDS.get(key, "a course that changes with time")
+
+
+def _together(limits: Sequence[float]) -> float:
+    """What parts that know nothing of each other are ordinarily at most together."""
+    return float(np.linalg.norm(limits))
 
 
 def _to_limit(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:

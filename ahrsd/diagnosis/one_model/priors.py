@@ -28,6 +28,8 @@ class Size:
 
 
 # --- what every real recording leaves: measured ----------------------------------------------
+#: untouched recordings that were measured
+RECORDINGS = 19
 #: deviation over the recording, gauss and rad/s; of the others of the coefficient of unit functions
 ORDINARY: Mapping[str, Size] = {
     "world_course": Size(7.75e-03, 1.53, 0.1),  # gauss
