@@ -85,7 +85,7 @@ class Effect(ABC):
     recurs:      a further one is no rare thing where there is one: what was put on is taken off
     delay:       sign of the magnetometer's delay against the gyro that it is; 0 where it is none
     plain:       among delays of a sign, the one that is told where nothing speaks for another
-    filters:     its delay is a filter's
+    filters:     its delay is a filter's;  of_step: its delay is told in half steps of the recording
     ordinary:    its size, in usual scales, that one in ten untouched recordings is beyond, beside
                  what such leave; 0 where hardly any has it
                  (`python tests/benchmarks/diagnosis/bench_remainder_priors.py`)
@@ -122,6 +122,7 @@ class Effect(ABC):
     delay: float = 0.0
     plain: bool = False
     filters: bool = False
+    of_step: bool = False
     ordinary: float = 0.0
     ordinary_part: str | None = None
     stands_for: tuple[str, ...] = ()

@@ -203,6 +203,7 @@ class GyroIntegration(Linear):
     size = "1e-5 to 1e-3 rad/s"
     source = "VN-100 delta-theta output (dossier G13)"
     delay = 1.0
+    of_step = True
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Nothing to choose."""

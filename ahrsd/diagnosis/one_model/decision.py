@@ -14,12 +14,13 @@ import numpy as np
 
 from ahrsd.diagnosis.address import AXES, where_of
 from ahrsd.diagnosis.confound import separating_manoeuvre
+from ahrsd.diagnosis.delay import usual_step
 from ahrsd.diagnosis.diagnosis import Cost, Finding, Share, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.locate import single_source
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Sized
-from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, delay_of_filter, plain_delay
+from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, plain_delay
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
 from ahrsd.diagnosis.one_model.remainder import still_spells
@@ -31,8 +32,6 @@ from ahrsd.samples import Array
 #: odds are told no surer than this
 _SUREST = 30.0
 _SMALLEST_SHARE = 0.01
-#: how near to all of a delay must be a filter's to be called one
-_NEARLY_ALL = 0.25
 _PIECES = 80
 
 
@@ -73,7 +72,7 @@ def decided(
         keys.append(key)
     drifts = _drifts(all_sets, space, best, library)
     for key, row in drifts.items():
-        finding, term = _drifting(all_sets, best, key, odds[key], row)
+        finding, term = _drifting(all_sets, space, best, key, odds[key], row, library)
         found.append(finding)
         terms.append(term)
         keys.append(key)
@@ -103,8 +102,9 @@ def _drifts(
 
 
 def _drifting(
-    all_sets: Hypotheses, best: Hypothesis, key: str, odds: float, effect: Effect
-) -> tuple[Finding, Term]:
+    all_sets: Hypotheses, space: Space, best: Hypothesis, key: str, odds: float, effect: Effect,
+    library: Mapping[str, Effect],
+) -> tuple[Finding, Term]:  # fmt: skip
     """A slow course as a finding: the drift's own coefficients that are nearest to it."""
     context = all_sets.made.context
     setting = effect.settings(context)[0]
@@ -117,11 +117,13 @@ def _drifting(
     nearest = np.linalg.pinv(X) @ Y
     value, deviation = coefficients(all_sets, best, key)
     drift, unsure = nearest @ value, np.sqrt(np.square(nearest) @ np.square(deviation))
-    sure = float(1.0 / (1.0 + np.exp(-min(odds, _SUREST))))
     kept = {k: v for k, v in setting.items() if k != "searched"}
-    finding = _found(effect, sure, _where(all_sets, best, key), drift, unsure, kept, odds)
-    finding = replace(finding, cost_if_left_out=_cost(all_sets, best, key))
-    return finding, Term(effect.identifier, drift, unsure, kept)
+    shares = _shares(all_sets, space, best, key)
+    shares = {effect.identifier if k == key else k: share for k, share in shares.items()}
+    where = _where(all_sets, best, key, effect.frame or effect.family)
+    found = _found(effect, shares, where, drift, unsure, kept, odds, library)
+    found = replace(found, cost_if_left_out=_cost(all_sets, best, key))
+    return found, Term(effect.identifier, drift, unsure, kept)
 
 
 def _switching(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
@@ -216,44 +218,42 @@ def _told(
     """A member as a finding and as a term of the repaired model."""
     one = all_sets.component(key)
     value, deviation = coefficients(all_sets, best, key)
-    shares = _shares(all_sets, space, best, key)
     effect = library[one.effect or key]
     if key == LAG:
-        effect = _which_delay(all_sets, best, float(value[0]), library)
-        shares, value = {effect.identifier: 1.0}, value * effect.delay
-    name = effect.identifier
-    sure = 1.0 / (1.0 + np.exp(-min(odds, _SUREST)))
-    others = tuple(
-        Share(other, share * sure) for other, share in shares.items()
-        if other != name and share > _SMALLEST_SHARE
-    )  # fmt: skip
+        shares = _which_delay(all_sets, best, value, deviation, library)
+        effect = library[next(iter(shares))]
+        unit = effect.delay / _delay_unit(all_sets, effect)
+        value, deviation = value * unit, deviation * abs(unit)
+    else:
+        shares = _shares(all_sets, space, best, key)
     setting = {k: v for k, v in one.setting.items() if k != "searched"}
-    share = float(shares.get(name, 1.0) * sure)
-    where = _where(all_sets, best, key)
-    close = [one.effect for one in others]
-    finding = replace(
-        _found(effect, share, where, value, deviation, setting, odds),
-        alternatives=others,
-        cost_if_left_out=_cost(all_sets, best, key),
-        separate_from=separating_manoeuvre(library, name, close) if close else None,
-    )
-    return finding, Term(name, value, deviation, setting)
+    where = _where(all_sets, best, key, effect.frame or effect.family)
+    found = _found(effect, shares, where, value, deviation, setting, odds, library)
+    found = replace(found, cost_if_left_out=_cost(all_sets, best, key))
+    return found, Term(effect.identifier, value, deviation, setting)
 
 
 def _found(
-    effect: Effect, confidence: float, where: Where, value: Array, deviation: Array,
-    setting: Setting, odds: float,
+    effect: Effect, shares: Mapping[str, float], where: Where, value: Array, deviation: Array,
+    setting: Setting, odds: float, library: Mapping[str, Effect],
 ) -> Finding:  # fmt: skip
+    """A finding with what it may be in its place, and what to drive to tell."""
+    sure = float(1.0 / (1.0 + np.exp(-min(odds, _SUREST))))
+    others = tuple(
+        Share(other, share * sure) for other, share in shares.items()
+        if other != effect.identifier and share > _SMALLEST_SHARE
+    )  # fmt: skip
+    close = [one.effect for one in others]
     told = zip(effect.parameters, value, deviation, strict=True)
     return Finding(
         effect=effect.identifier,
-        confidence=confidence,
-        alternatives=(),
+        confidence=shares.get(effect.identifier, 1.0) * sure,
+        alternatives=others,
         where=where,
         parameters=tuple(Value(p.name, float(v), float(d), p.unit) for p, v, d in told),
         heldout=None,
         cost_if_left_out=None,
-        separate_from=None,
+        separate_from=separating_manoeuvre(library, effect.identifier, close) if close else None,
         words=effect.words,
         equation=effect.equation,
         setting=setting,
@@ -301,23 +301,50 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
         by_name[name] = float(np.logaddexp(by_name.get(name, -np.inf), nats + one.prior))
     mine = own.effect or key
     by_name[mine] = max(by_name[mine], worth[key] + own.prior)
+    if own.row is None:  # a course has two sizes, of which the scan knows none
+        by_name[mine] = best.score - fewer.score
     total = np.logaddexp.reduce(list(by_name.values()))
     shares = {name: float(np.exp(nats - total)) for name, nats in by_name.items()}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
 def _which_delay(
-    all_sets: Hypotheses, best: Hypothesis, lag_s: float, library: Mapping[str, Effect]
-) -> Effect:
-    """Which delay it is: a filter's where its form is there in full."""
-    if lag_s > 0.0 and LAG_FORM in best.keys:
-        value, deviation = coefficients(all_sets, best, LAG_FORM)
-        as_filter = -0.5 * ((value[0] - 1.0) / deviation[0]) ** 2
-        as_lag = -0.5 * (value[0] / deviation[0]) ** 2
-        near = abs(value[0] - 1.0) < max(2.0 * deviation[0], _NEARLY_ALL)
-        if near and as_filter - as_lag > priors.ODDS_REAL:
-            return delay_of_filter(library)
-    return plain_delay(library, 1.0 if lag_s >= 0.0 else -1.0)
+    all_sets: Hypotheses, best: Hypothesis, lag_s: Array, deviation_s: Array,
+    library: Mapping[str, Effect],
+) -> dict[str, float]:  # fmt: skip
+    """Which delay it is, with probabilities, that which is told first.
+
+    A filter's where its form is there in full; half a step's where the delay is that and no other.
+    """
+    tau, unsure = float(lag_s[0]), float(deviation_s[0])
+    plain = plain_delay(library, 1.0 if tau >= 0.0 else -1.0)
+    nats = {plain.identifier: 0.0}
+    half_s = _half_step_s(all_sets)
+    for row in library.values() if tau > 0.0 else ():
+        if row.filters and LAG_FORM in best.keys:
+            value, deviation = (float(one[0]) for one in coefficients(all_sets, best, LAG_FORM))
+            whole = 0.5 * ((value / deviation) ** 2 - ((value - 1.0) / deviation) ** 2)
+            full = abs(value - 1.0) < max(2.0 * deviation, priors.NEARLY_ALL)
+            nats[row.identifier] = whole - priors.ODDS_REAL if full else -np.inf
+        elif row.of_step and half_s is not None:
+            miss, usual = (tau - half_s) / unsure, tau / priors.ORDINARY_LAG_S
+            point = 0.5 * (usual**2 - miss**2) + float(np.log(priors.ORDINARY_LAG_S / unsure))
+            nats[row.identifier] = point + float(np.log(priors.HALF_STEP))
+    total = np.logaddexp.reduce(list(nats.values()))
+    shares = {name: float(np.exp(one - total)) for name, one in nats.items()}
+    return dict(sorted(shares.items(), key=lambda item: -item[1]))
+
+
+def _half_step_s(all_sets: Hypotheses) -> float | None:
+    """Half of the recording's step, None where the steps are not alike."""
+    step_s = usual_step(all_sets.made.point.problem.recorded.dt_s)
+    return None if step_s is None else step_s / 2.0
+
+
+def _delay_unit(all_sets: Hypotheses, effect: Effect) -> float:
+    """Seconds of an effect's unit of delay."""
+    half_s = _half_step_s(all_sets) if effect.of_step else None
+    return 1.0 if half_s is None else half_s
 
 
 def added_by(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, str]:
@@ -329,10 +356,10 @@ def added_by(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, s
     return added, "rad/s" if one.columns.mag is None else "gauss"
 
 
-def _where(all_sets: Hypotheses, best: Hypothesis, key: str) -> Where:
-    """When, on which axes, in which frame and regime a member acts."""
+def _where(all_sets: Hypotheses, best: Hypothesis, key: str, frame: str) -> Where:
+    """When, on which axes and in which regime a member acts, told in a frame."""
     one, track = all_sets.component(key), all_sets.made.context.track
-    return where_of(track, added_by(all_sets, best, key)[0], one.setting, one.frame)
+    return where_of(track, added_by(all_sets, best, key)[0], one.setting, frame)
 
 
 def _left(

@@ -92,11 +92,6 @@ def plain_delay(library: Mapping[str, Effect], sign: float) -> Effect:
     return next(one for one in library.values() if one.plain and one.delay * sign > 0.0)
 
 
-def delay_of_filter(library: Mapping[str, Effect]) -> Effect:
-    """The library's delay by a filter."""
-    return next(one for one in library.values() if one.filters)
-
-
 def holds(one: Component, part: Component) -> bool:
     """Whether a component can be all that another is: its columns are among the first's."""
     mine, other = one.columns.mag, part.columns.mag

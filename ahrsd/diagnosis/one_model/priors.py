@@ -124,6 +124,10 @@ NAME_ODDS, UNKNOWN_ODDS = 3.0, 3.0
 ODDS_REAL = 12.0
 #: nats that a move of the search must gain
 MOVE = 2.0
+#: how near to all of a delay must be a filter's to be called one
+NEARLY_ALL = 0.25
+#: of a delay to be half a step of the recording: a gyro that tells the rate of the moment
+HALF_STEP = 0.1
 
 # --- what is held against an answer --------------------------------------------------------------
 #: parts into which a recording is dealt, each foretold from the others, and seconds of a stretch:
@@ -134,3 +138,7 @@ PARTS, STRETCH_S = 5, 2.0
 SHIFTS = (0.236, 0.382, 0.472, 0.618, 0.764, 0.854)
 #: deviations of a coefficient from which on it would have been told nine times in ten
 SHOWN_AT = 6.5
+#: probability that any bin of any regime is outside of its band where nothing is left
+BINS_OUTSIDE = 0.01
+#: probability by chance, and correlation, of a logged column that is said to move with a course
+CHANCE, ALIKE = 0.2, 0.5

@@ -21,14 +21,12 @@ from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.diagnosis import Check, RegimeMap, Whiteness
 from ahrsd.diagnosis.noise import tails_of
 from ahrsd.diagnosis.omnibus import omnibus
+from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION
 from ahrsd.diagnosis.one_model.white_rows import Fit, WhiteRows
 from ahrsd.diagnosis.predictive import COPIES, bands, scene_of, statistics
 from ahrsd.diagnosis.regime import regime_columns, regimes
 from ahrsd.samples import Array
-
-#: probability that any bin of a regime is beyond its band where nothing is left
-_OUTSIDE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +63,7 @@ def checks(found: Residuals, maps: Sequence[RegimeMap]) -> dict[str, Check]:
         for name, band in expected.items()
     }
     for one in maps:
-        each = _OUTSIDE / (len(maps) * len(one.after))
+        each = priors.BINS_OUTSIDE / (len(maps) * len(one.after))
         limit = float(special.chdtri(3.0, each)) / 2.0
         was, now = max(one.before), max(one.after)
         out[f"by_{one.quantity}"] = Check(now, (0.0, limit), was <= limit, now <= limit)

@@ -20,7 +20,7 @@ from ahrsd.diagnosis.hygiene import would_have_shown
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.noise import level_facts
 from ahrsd.diagnosis.null import baseline
-from ahrsd.diagnosis.one_model import pictures, residual_checks, support, visibility
+from ahrsd.diagnosis.one_model import pictures, priors, residual_checks, support, visibility
 from ahrsd.diagnosis.one_model.held_out import HeldOut
 from ahrsd.diagnosis.one_model.left_sizes import told_sizes
 from ahrsd.diagnosis.one_model.recorded_rate import Quick
@@ -30,8 +30,6 @@ from ahrsd.diagnosis.prepared import Prepared
 from ahrsd.diagnosis.resting import HARDLY_TURNED, at_rest, resting
 
 NOTE = "by the engine one-model, which is experimental"
-#: what moves with a course: probability by chance, and correlation
-_CHANCE, _ALIKE = 0.2, 0.5
 
 
 def whole_answer(
@@ -127,6 +125,6 @@ def _with_channels(
     follows = tuple(
         Suspect(one.channel, one.correlation, one.p_value)
         for one in like
-        if one.p_value < _CHANCE and abs(one.correlation) > _ALIKE
+        if one.p_value < priors.CHANCE and abs(one.correlation) > priors.ALIKE
     )
     return replace(left, follows=follows)
