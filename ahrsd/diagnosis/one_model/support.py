@@ -69,10 +69,36 @@ def doubts(told: Sequence[Finding]) -> tuple[str, ...]:
                 "copies at other times: doubt it"
             )
         elif one.priors is not None and not one.priors.stays:
+            least = min(one.priors.assumed, key=lambda each: min(each.half_nats, each.double_nats))
+            nats, how = min((least.half_nats, "half"), (least.double_nats, "twice"))
             out.append(
-                f"{one.effect} is told for what is assumed: with half or twice of it, it is not"
+                f"{one.effect} owes its name to what is assumed: with {how} of {least.what} it has "
+                f"{nats:.0f} nats of odds, {one.priors.asked:.0f} are asked"
             )
     return tuple(out)
+
+
+def nearest(answer: Answer, all_sets: Hypotheses) -> tuple[str, ...]:
+    """A sentence on the likeliest name that is not told: how far from one it is."""
+    best = answer.best
+    more = {
+        key: one
+        for names, one in all_sets.judged.items()
+        if best.names < names and len(names - best.names) == 1
+        for key in names - best.names
+        if all_sets.component(key).row is not None
+    }
+    if not more:
+        return ()
+    key = max(more, key=lambda one: more[one].score)
+    asked = asked_odds(all_sets, key, real=all_sets.is_real(best.names))
+    found = on_priors(all_sets, more[key], best, asked)
+    most = max(nats for one in found.assumed for nats in (one.half_nats, one.double_nats))
+    name = all_sets.component(key).effect
+    return (
+        f"nearest to a name is {name}: {found.log_odds:+.1f} nats of odds where {asked:.0f} are "
+        f"asked, {most:+.1f} at most with half or twice of what was assumed",
+    )
 
 
 def nats_of_remainder(all_sets: Hypotheses, answer: Answer) -> float:

@@ -68,11 +68,7 @@ def whole_answer(
     ]
     surest = max(answer.log_odds, fast.answer.log_odds, remainder_nats, 0.0)
     counted = len(named) > len(told)
-    hidden = () if something else visibility.limits(alone)
-    if not something:
-        hidden += visibility.limits(
-            visibility.seen_alone(fast.all_sets, fast.space, fast.answer.best.names)
-        )
+    said = support.doubts(told) if something else support.nearest(answer, all_sets)
     return Diagnosis(
         recording="",
         baseline=baseline(start),
@@ -81,8 +77,8 @@ def whole_answer(
         findings=named,
         unexplained=left,
         posterior_predictive=residual_checks.checks(residuals, maps),
-        sensitivity=hidden,
-        notes=_notes(asked, found, support.doubts(told), still=at_rest(start), something=something),
+        sensitivity=() if something else visibility.limits([*alone, *_seen_quickly(fast)]),
+        notes=_notes(asked, found, said, still=at_rest(start), something=something),
         model=fast.left.filtered.model,
         noise=repaired_noise(found, fast, library, asked.facts, _spans(loud)),
         terms=(*answer.terms, *fast.answer.terms, *rounding(asked.facts)),
@@ -91,6 +87,10 @@ def whole_answer(
         validation=support.validation((answer, held), (fast.answer, quickly), told, left),
         regime_map=maps,
     )
+
+
+def _seen_quickly(fast: Quick) -> list[visibility.Seen]:
+    return visibility.seen_alone(fast.all_sets, fast.space, fast.answer.best.names)
 
 
 def _loud(found: Searched, fast: Quick, *, spec_given: bool) -> list[Fact]:
@@ -105,12 +105,12 @@ def _spans(facts: Sequence[Fact]) -> list[tuple[float, float]]:
 
 
 def _notes(
-    asked: Prepared, found: Searched, doubts: tuple[str, ...], *, still: bool, something: bool
+    asked: Prepared, found: Searched, said: tuple[str, ...], *, still: bool, something: bool
 ) -> tuple[str, ...]:
     problem = found.all_sets.made.point.problem
     seen = () if something else would_have_shown(problem.recorded)
     how = (NOTE, *asked.notes, *problem.notes, *((HARDLY_TURNED,) if still else ()))
-    return (*how, *doubts, *asked.lesser, *seen)
+    return (*how, *said, *asked.lesser, *seen)
 
 
 def _with_channels(
