@@ -77,6 +77,14 @@ def test_nothing_that_the_rules_tell_is_missing(run, recording, tmp_path, capsys
     assert one["priors"]["log_odds"] == pytest.approx(one["evidence_nats"])
 
 
+def test_what_the_simulation_has_as_well_is_no_difference(run, recording, capsys):
+    words = ["diagnose", str(recording), "--simulation", str(recording), "--engine", "one-model"]
+    assert run(*words) == 0
+    told = capsys.readouterr().out
+    assert "hard_iron_step is in the simulation already, to the same size" in told
+    assert "recording and model agree" in told
+
+
 def test_the_option_is_hidden_and_a_wrong_one_is_refused(run, recording, capsys):
     assert run("diagnose", "--help") == 0
     assert "--engine" not in capsys.readouterr().out

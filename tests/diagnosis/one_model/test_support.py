@@ -10,6 +10,7 @@ from scipy.special import chdtri
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.added_field import calibration_of, deviation, less_calibration
+from ahrsd.diagnosis.diagnosis import Assumed, Finding, Heldout, OnPriors, Where
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.null import fit_null
@@ -20,6 +21,7 @@ from ahrsd.diagnosis.one_model.model_search import Hypotheses, Space
 from ahrsd.diagnosis.one_model.prior_dependence import COURSE, NAME, NOISE, ORDINARY, on_priors
 from ahrsd.diagnosis.one_model.residual_checks import checks, regime_maps, residuals_of, whiteness
 from ahrsd.diagnosis.one_model.search_space import space_at
+from ahrsd.diagnosis.one_model.support import doubts
 from ahrsd.diagnosis.one_model.visibility import limits, seen_alone
 from ahrsd.diagnosis.problem import problem_of
 from ahrsd.diagnosis.track import Spec, Track
@@ -276,3 +278,21 @@ def test_sizes_of_what_is_left_are_those_that_were_put_in(track):
     others = [one for name, one in parts.items() if name != "world_course"]
     assert max(one.size for one in others if one.unit == "gauss") < 0.3 * put_in
     assert found.heading_deg > 0.3
+
+
+def test_a_name_that_gains_no_more_than_its_copies_or_owes_itself_to_a_prior_is_doubted():
+    held = Heldout(1e-3, 9e-4, 0.01, 0.001)
+    sure = OnPriors(20.0, 3.0, True, (Assumed(NAME, 19.3, 20.7),))
+    told = Finding(
+        effect="hysteresis", confidence=1.0, alternatives=(), where=Where((), (), "sensor"),
+        parameters=(), heldout=held, cost_if_left_out=None, separate_from=None, priors=sure,
+    )  # fmt: skip
+    assert doubts((told,)) == ()
+    (copied,) = doubts((replace(told, heldout=replace(held, placebo_gain=0.02)),))
+    assert copied.startswith("hysteresis foretells readings that it was not fitted to no better")
+    owed = OnPriors(3.4, 3.0, False, (Assumed(NAME, 2.7, 4.1), Assumed(NOISE, 5.0, 1.2)))
+    (note,) = doubts((replace(told, priors=owed),))
+    assert note == (
+        "hysteresis owes its name to what is assumed: with twice of steps of the noise from octave "
+        "to octave it has 1 nats of odds, 3 are asked"
+    )
