@@ -42,7 +42,7 @@ class _Parts:
     rows: Array
 
     def others(self, number: int) -> tuple[Array, Array, float, float]:
-        """The same of all parts but one, together; of none but one where there is no such part."""
+        """The same of all parts but one, together; of all where none has the number."""
         kept = np.arange(len(self.rows)) != number
         return (
             self.G[kept].sum(axis=0),
