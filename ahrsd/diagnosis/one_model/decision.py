@@ -227,6 +227,8 @@ def _told(
     else:
         shares = _shares(all_sets, space, best, key)
     setting = {k: v for k, v in one.setting.items() if k != "searched"}
+    if effect.filters:  # its form is that of the filter itself
+        setting["time_constant_s"] = float(value[0])
     where = _where(all_sets, best, key, effect.frame or effect.family)
     found = _found(effect, shares, where, value, deviation, setting, odds, library)
     found = replace(found, cost_if_left_out=_cost(all_sets, best, key))

@@ -11,7 +11,9 @@ from mismatch_trials import Trial, made
 from test_resting import standing, warming
 from tracks import experiment, track_of
 
+from ahrsd.diagnosis.forward import context_along, contribution
 from ahrsd.diagnosis.logged import with_columns_as_logged
+from ahrsd.diagnosis.model_file import from_text, of_diagnosis, to_text
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import NothingToFit
 
@@ -146,3 +148,22 @@ def test_a_column_with_a_hole_names_its_cause():
     assert found.notes[0].startswith("column motor_current_a has no values in ")
     _, value, _ = one.truth[0]
     np.testing.assert_allclose([p.value for p in found.findings[0].parameters], value, rtol=0.1)
+
+
+@pytest.mark.parametrize(("name", "strength"), [("mag_low_pass", 3.0), ("gyro_time_lag", 2.0)])
+def test_a_delay_of_any_kind_is_in_the_repaired_model_as_it_was(name, strength):
+    one = made(Trial(seed=34, effects=((name, strength),), samples=2500, rate_hz=12.5))
+    found = diagnose(one.track)
+    (term,) = found.terms
+    assert term.identifier == name
+    _, value, _ = one.truth[0]
+    np.testing.assert_allclose(term.value, value, rtol=0.06)
+    kept = from_text(to_text(of_diagnosis(found)))
+    clean = context_along(one.track, kept.calibration)
+    mag, gyro = contribution(clean, kept.terms)
+    # as large as the field turns in that time
+    if name == "mag_low_pass":
+        late = np.linalg.norm(clean.field_dot_b, axis=1) * float(value[0])
+        assert np.median(np.linalg.norm(mag, axis=1)) == pytest.approx(np.median(late), rel=0.2)
+    else:
+        assert np.max(np.abs(gyro)) > 1e-3
