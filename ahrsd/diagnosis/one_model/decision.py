@@ -303,8 +303,12 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
         by_name[name] = float(np.logaddexp(by_name.get(name, -np.inf), nats + one.prior))
     mine = own.effect or key
     by_name[mine] = max(by_name[mine], worth[key] + own.prior)
-    if own.row is None:  # a course has two sizes, of which the scan knows none
+    rival = max((k for k in worth if k != key), key=lambda k: worth[k], default=key)
+    named_so = all_sets.component(rival).effect or rival
+    if own.row is None or by_name[named_so] > by_name[mine]:
+        # the scan knows sizes and noise but roughly: both as sets of their own
         by_name[mine] = best.score - fewer.score
+        by_name[named_so] = all_sets.judge(fewer.names | {rival}, best).score - fewer.score
     total = np.logaddexp.reduce(list(by_name.values()))
     shares = {name: float(np.exp(nats - total)) for name, nats in by_name.items()}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))

@@ -75,6 +75,7 @@ class HeldOut:
     def __post_init__(self) -> None:
         """Nothing is foretold yet."""
         self._rows: dict[Names, WhiteRows] = {}
+        self._parts: dict[Names, _Parts] = {}
         self._foretold: dict[Names, Foretold] = {}
         recorded = self.all_sets.made.point.problem.recorded
         self.samples = int(np.count_nonzero(np.isfinite(recorded.mag_b_gauss).all(axis=1)))
@@ -88,10 +89,15 @@ class HeldOut:
     def of(self, names: Names) -> Foretold:
         """How well a set foretells."""
         if names not in self._foretold:
-            rows = self.rows(names)
-            parts = _parts(rows.X, rows.y, dealt(rows))
-            self._foretold[names] = _foretold(parts, rows)
+            self._foretold[names] = _foretold(self.parts(names), self.rows(names))
         return self._foretold[names]
+
+    def parts(self, names: Names) -> _Parts:
+        """Products of a set's rows, part by part."""
+        if names not in self._parts:
+            rows = self.rows(names)
+            self._parts[names] = _parts(rows.X, rows.y, dealt(rows))
+        return self._parts[names]
 
     def gain(self, without: Names) -> float:
         """Nats per recorded reading by which the best set foretells better than another."""
@@ -129,7 +135,7 @@ class HeldOut:
         count = len(self.all_sets.made.point.amplitude)
         steps = [round(share * count) for share in priors.SHIFTS]
         copies = rows.passed([_rolled(one.columns, step) for step in steps])
-        parts = _parts(np.concatenate([rows.X, copies], axis=2), rows.y, dealt(rows))
+        parts = _beside(self.parts(without), rows, copies)
         known = rows.X.shape[2]
         cuts = [slice(k * one.width, (k + 1) * one.width) for k in range(len(steps))]
 
@@ -172,6 +178,20 @@ def _parts(X: Array, y: Array, part: NDArray[np.intp]) -> _Parts:
         A, b = X[mine].reshape(-1, X.shape[2]), y[mine].reshape(-1)
         found.append((A.T @ A, A.T @ b, float(b @ b), float(len(b))))
     return _Parts(*(np.array(one) for one in zip(*found, strict=True)))
+
+
+def _beside(known: _Parts, rows: WhiteRows, copies: Array) -> _Parts:
+    """The products with more columns (N, 3, p) behind the set's own."""
+    part, more = dealt(rows), []
+    for number in range(priors.PARTS):
+        mine = part == number
+        X, C = (one[mine].reshape(-1, one.shape[2]) for one in (rows.X, copies))
+        more.append((X.T @ C, C.T @ C, C.T @ rows.y[mine].reshape(-1)))
+    across, own, s = (np.array(one) for one in zip(*more, strict=True))
+    above = np.concatenate([known.G, across], axis=2)
+    below = np.concatenate([np.swapaxes(across, 1, 2), own], axis=2)
+    G = np.concatenate([above, below], axis=1)
+    return _Parts(G, np.concatenate([known.s, s], axis=1), known.square, known.rows)
 
 
 def _foretold(parts: _Parts, rows: WhiteRows) -> Foretold:

@@ -53,8 +53,9 @@ def told_sizes(
     if not all_sets.is_real(best.names):
         return left
     if left.detected:
-        known = [f"{_words(key)}, beyond what is ordinary for such" for key in answer.unknown]
-        sizes = left_sizes(all_sets, best, "; ".join(known), answer.unknown)
+        known = dict.fromkeys(_words(all_sets, key) for key in answer.unknown)
+        why = f"beyond what such recordings ordinarily leave: {', '.join(known)}"
+        sizes = left_sizes(all_sets, best, why, answer.unknown)
         return replace(left, ordinary=sizes)
     if simulated and nats > priors.UNKNOWN_ODDS:
         sizes = left_sizes(all_sets, best, SIMULATED, ())
@@ -81,7 +82,9 @@ def left_sizes(
         heading_deg = heading_off_deg(added, context) if unit == "gauss" else None
         up_to = size * _to_limit(all_sets, best, key)
         there = nats[key] > priors.ODDS_REAL
-        row = Component(key, _words(key), frame, size, up_to, unit, heading_deg, nats[key], there)
+        row = Component(
+            key, _words(all_sets, key), frame, size, up_to, unit, heading_deg, nats[key], there
+        )
         parts.append(row)
     fields = [one for one in parts if one.unit == "gauss"]
     sizes = sorted(one.size for one in fields)
@@ -102,8 +105,11 @@ def left_sizes(
     )
 
 
-def _words(key: str) -> str:
-    return _WORDS.get(key, "a course that changes with time")
+def _words(all_sets: Hypotheses, key: str) -> str:
+    """What a part is, in words."""
+    if all_sets.component(key).row is not None:
+        return f"one of the steps of a source that changes ({key.split(maxsplit=1)[0]})"
+    return _WORDS.get(key, f"a course in time, free ({all_sets.component(key).frame})")
 
 
 def _together(limits: Sequence[float]) -> float:

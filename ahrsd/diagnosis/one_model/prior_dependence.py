@@ -26,7 +26,7 @@ ORDINARY, NOISE = "what recordings ordinarily leave", "steps of the noise from o
 
 def on_priors(all_sets: Hypotheses, best: Hypothesis, rival: Hypothesis, asked: float) -> OnPriors:
     """The odds of a set to its rival, with each prior as it is, halved and doubled."""
-    log_odds = best.score - rival.score
+    log_odds = float(best.score - rival.score)
     half, double = (_apart(all_sets, best, rival, factor) for factor in (0.5, 2.0))
     assumed = tuple(
         Assumed(what, log_odds + half[what], log_odds + double[what])
@@ -34,7 +34,7 @@ def on_priors(all_sets: Hypotheses, best: Hypothesis, rival: Hypothesis, asked: 
         if half[what] or double[what]
     )
     least = min([log_odds, *(nats for one in assumed for nats in (one.half_nats, one.double_nats))])
-    return OnPriors(log_odds, asked, least >= asked, assumed)
+    return OnPriors(log_odds, asked, bool(least >= asked), assumed)
 
 
 def _apart(
