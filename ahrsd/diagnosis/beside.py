@@ -24,6 +24,7 @@ from ahrsd.diagnosis.nested import simplest
 from ahrsd.diagnosis.often import OFTEN, logged_often
 from ahrsd.diagnosis.problem import Problem
 from ahrsd.diagnosis.regression import Base, Candidate, candidate_gram, columns_of, quieter
+from ahrsd.diagnosis.resting import at_rest
 from ahrsd.diagnosis.reweighted import reweighted
 from ahrsd.diagnosis.rivals import OWN_SHARE, by_matrix, by_memory, compared, more
 from ahrsd.diagnosis.score import Score
@@ -32,7 +33,6 @@ from ahrsd.diagnosis.search import (
     State,
     Survey,
     added,
-    at_rest,
     formed_basis_of,
     term_group,
     without_term,

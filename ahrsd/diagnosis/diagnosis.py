@@ -78,11 +78,35 @@ class Cost:
 
 
 @dataclass(frozen=True, slots=True)
+class Assumed:
+    """The log odds of an answer where one thing that was assumed is half and twice as much."""
+
+    what: str
+    half_nats: float
+    double_nats: float
+
+
+@dataclass(frozen=True, slots=True)
+class OnPriors:
+    """How an answer depends on what was assumed before any reading.
+
+    log_odds: of it, nats, to what is likeliest without it;  asked: from which on it is told
+    stays: whether it is told whichever of these is half or twice as much
+    """
+
+    log_odds: float
+    asked: float
+    stays: bool
+    assumed: tuple[Assumed, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Finding:
     """One named effect.
 
     heldout, cost_if_left_out: None, and no key in the answer, for what was counted and not fitted
     term: its number among the terms of the repaired model, likewise
+    priors: likewise, where the odds are no posterior's
     """
 
     effect: str
@@ -98,6 +122,7 @@ class Finding:
     setting: dict[str, Any] = field(default_factory=dict)
     evidence_nats: float = 0.0
     term: int | None = None
+    priors: OnPriors | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +196,7 @@ class Unexplained:
     evidence_nats: float = 0.0
     course: tuple[tuple[float, float], ...] = ()
     ordinary: Ordinary | None = None
+    priors: OnPriors | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,7 +322,7 @@ class Diagnosis:
             "mismatch": self.mismatch,
             "p_value": self.p_value,
             "findings": [_told(finding) for finding in self.findings],
-            "unexplained": _plain(self.unexplained),
+            "unexplained": _measured(self.unexplained, ("priors",)),
             "posterior_predictive": {k: _plain(v) for k, v in self.posterior_predictive.items()},
             "omnibus": {k: _plain(v) for k, v in self.omnibus.items()},
             "validation": _plain(self.validation),
@@ -311,9 +337,13 @@ class Diagnosis:
 
 def _told(finding: Finding) -> dict[str, Any]:
     """A finding without the keys of what was not measured."""
-    out: dict[str, Any] = _plain(finding)
-    unmeasured = [key for key in ("heldout", "cost_if_left_out", "term") if out[key] is None]
-    return {key: value for key, value in out.items() if key not in unmeasured}
+    return _measured(finding, ("heldout", "cost_if_left_out", "term", "priors"))
+
+
+def _measured(record: Any, optional: tuple[str, ...]) -> dict[str, Any]:  # noqa: ANN401 - as below
+    """A record without the keys of these that were not measured."""
+    out: dict[str, Any] = _plain(record)
+    return {k: value for k, value in out.items() if value is not None or k not in optional}
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 - any of the records above

@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ahrsd.diagnosis import roles, unknown
+from ahrsd.diagnosis import unknown
 from ahrsd.diagnosis.along_field import framed
 from ahrsd.diagnosis.beside import named_beside
 from ahrsd.diagnosis.bursts import bursts
 from ahrsd.diagnosis.cut_out import beside_brief
-from ahrsd.diagnosis.dead import dead
 from ahrsd.diagnosis.delays import DELAYS
 from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.diagnosis import Check, Diagnosis, Finding, Unexplained, Whiteness
@@ -25,14 +24,14 @@ from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.exam import rest_of
 from ahrsd.diagnosis.explained import explained
-from ahrsd.diagnosis.facts import Fact, around, lost_at, matters, of_fact, stopped
-from ahrsd.diagnosis.findings import finding, rounding, whole_term
+from ahrsd.diagnosis.facts import Fact, around, lost_at, of_fact, rounding
+from ahrsd.diagnosis.findings import finding, whole_term
 from ahrsd.diagnosis.foretold import without_unforetold
 from ahrsd.diagnosis.free_course import with_free_course
 from ahrsd.diagnosis.free_source import without_names_of_a_source
 from ahrsd.diagnosis.gyro_noise import loud_gyro
 from ahrsd.diagnosis.humming import heard
-from ahrsd.diagnosis.hygiene import hygiene, put_right, would_have_shown
+from ahrsd.diagnosis.hygiene import would_have_shown
 from ahrsd.diagnosis.levels import without_levels
 from ahrsd.diagnosis.likelier_forms import without_likelier_forms
 from ahrsd.diagnosis.limits import LIMITS, Limits
@@ -40,31 +39,22 @@ from ahrsd.diagnosis.lost import believed, beyond_lost, differ, lost_beside
 from ahrsd.diagnosis.missing import lost_turns
 from ahrsd.diagnosis.name import Judged
 from ahrsd.diagnosis.noise import level_facts
-from ahrsd.diagnosis.null import baseline, fit_null, unusable
+from ahrsd.diagnosis.null import baseline, fit_null
 from ahrsd.diagnosis.omnibus import omnibus
 from ahrsd.diagnosis.ordinary import held_against, is_course_on_sensor
 from ahrsd.diagnosis.own_form import without_trifles
 from ahrsd.diagnosis.passing import without_passing
-from ahrsd.diagnosis.pauses import without_jumps
 from ahrsd.diagnosis.predictive import checks, usual_noise
+from ahrsd.diagnosis.prepared import Prepared, prepared
 from ahrsd.diagnosis.problem import Problem, model_at_rate, problem_of
 from ahrsd.diagnosis.quick import Quick, cleaned, quick, without_quick
 from ahrsd.diagnosis.refined import left_alone, refined
 from ahrsd.diagnosis.remainder_sizes import sizes_left
-from ahrsd.diagnosis.resting import resting
-from ahrsd.diagnosis.search import (
-    HARDLY_TURNED,
-    STEPS,
-    State,
-    Survey,
-    at_rest,
-    basis_of,
-    formed_basis_of,
-    settled,
-)
+from ahrsd.diagnosis.resting import HARDLY_TURNED, at_rest, resting
+from ahrsd.diagnosis.search import STEPS, State, Survey, basis_of, formed_basis_of, settled
 from ahrsd.diagnosis.sought import sought
 from ahrsd.diagnosis.spectrum import against, spectrum_of
-from ahrsd.diagnosis.track import NothingToFit, Spec, Track
+from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.diagnosis.unplaced import without_unplaced
 from ahrsd.diagnosis.values import NullModel, Term
 from ahrsd.diagnosis.wandering import wandering
@@ -87,28 +77,23 @@ def diagnose(
     Deterministic.  ValueError, one line, where nothing can be fitted.
     """
     spec = spec or Spec()
-    track, notes = roles.prepared(track)
-    track, jumped = without_jumps(track)
-    notes = (*jumped, *notes)
-    if why := unusable(track) or dead(track):
-        raise NothingToFit(why)
-    facts = hygiene(track)
-    if any(fact.stops for fact in facts):
-        return stopped(recording, [fact for fact in facts if fact.stops], EFFECTS, notes)
-    problem, cold = problem_of(put_right(track, facts), spec, library, limits)
+    asked = prepared(track)
+    if (nothing := asked.stopped(recording, EFFECTS)) is not None:
+        return nothing
+    problem, cold = problem_of(asked.put_right(), spec, library, limits)
     whole, lost = problem, lost_turns(problem.recorded, problem.cold)
     if lost:
-        problem, cold = problem_of(put_right(track, (*facts, *lost)), spec, library, limits)
+        problem, cold = problem_of(asked.with_facts(lost).put_right(), spec, library, limits)
     done, fast = _named(problem, cold)
     beside = lost_beside(whole, fast.state, lost)
     if differ(lost, beside):
-        other, cold = problem_of(put_right(track, (*facts, *beside)), spec, library, limits)
+        other, cold = problem_of(asked.with_facts(beside).put_right(), spec, library, limits)
         again = _named(other, cold)
         if not believed(lost, done.state, beside, again[0].state):
             lost, problem, (done, fast) = beside, other, again
     still = (HARDLY_TURNED,) if at_rest(done.start) else ()
-    notes = (*notes, *still, *done.state.problem.notes)
-    return _told(recording, problem, done, fast, (*facts, *lost), notes)
+    notes = (*asked.notes, *still, *done.state.problem.notes)
+    return _told(recording, problem, done, fast, asked.with_facts(lost), notes)
 
 
 def _named(problem: Problem, cold: NullModel) -> tuple[_Searched, Quick]:
@@ -185,10 +170,11 @@ def _told(
     problem: Problem,
     done: _Searched,
     fast: Quick,
-    facts: Sequence[Fact],
+    asked: Prepared,
     notes: tuple[str, ...],
 ) -> Diagnosis:
     """Everything that was found, in the contract's form."""
+    facts = asked.facts
     state, library, limits = done.state, problem.library, problem.limits
     basis = basis_of(state)
     named, terms = _names(done, fast)
@@ -197,7 +183,7 @@ def _told(
     if burst := loud_gyro(left, problem.recorded):
         noise, left = [*noise, burst], Unexplained(False)
     found = (
-        *(of_fact(fact, library) for fact in facts if matters(fact)),
+        *asked.told(library),
         *sorted(named, key=_least_gain),
         *(of_fact(fact, library) for fact in noise),
         *(resting(done.start.context(), library, limits) if at_rest(done.start) else ()),
@@ -212,7 +198,6 @@ def _told(
     left = _sized(left, done)
     something = bool(found) or left.detected
     steps = rounding(facts)
-    lesser = (fact.words for fact in facts if not matters(fact))
     return Diagnosis(
         recording=recording,
         baseline=baseline(done.start),
@@ -222,7 +207,7 @@ def _told(
         unexplained=left,
         posterior_predictive=checked,
         sensitivity=() if something else would_show(problem, basis, done.first, fast),
-        notes=(*notes, *lesser, *(() if something else would_have_shown(problem.recorded))),
+        notes=(*notes, *asked.lesser, *(() if something else would_have_shown(problem.recorded))),
         model=model_at_rate(state.fit.model, problem),
         noise=usual_noise(
             fast.state.fit, _loud(noise), (*_in_track(terms, fast.state), *steps), library

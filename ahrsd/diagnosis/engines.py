@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from ahrsd.diagnosis.diagnosis import Diagnosis
-from ahrsd.diagnosis.logged import diagnose_logged
+from ahrsd.diagnosis.logged import diagnose_logged, with_columns_as_logged
 from ahrsd.diagnosis.track import Spec, Track
 
 #: by rules; by one generative model, experimental (docs/design/engine.md)
@@ -17,5 +19,6 @@ def diagnosed(
     if engine == ONE_MODEL:
         from ahrsd.diagnosis.one_model.diagnose import diagnose  # whom it serves waits for it
 
-        return diagnose(track, spec, recording=recording)
+        ask = partial(diagnose, recording=recording, simulated=simulated)
+        return with_columns_as_logged(track, spec, ask)
     return diagnose_logged(track, spec, recording=recording, simulated=simulated)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ahrsd.diagnosis.diagnosis import Diagnosis, Finding, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.values import Term
 from ahrsd.samples import Array
 
 
@@ -75,6 +76,19 @@ def around(burst: Fact, moments: Sequence[tuple[float, float]]) -> bool:
 def lost_at(facts: Sequence[Fact]) -> list[tuple[float, float]]:
     """Where turns were lost, seconds."""
     return [span for fact in facts if fact.turned is not None for span in fact.where.intervals_s]
+
+
+def rounding(facts: Sequence[Fact]) -> tuple[Term, ...]:
+    """The coarse steps of the readings, where they were counted, as a term of the model."""
+    return tuple(
+        Term(
+            fact.effect,
+            np.array([value.value for value in fact.parameters]),
+            np.array([value.std for value in fact.parameters]),
+        )
+        for fact in facts
+        if fact.effect == "mag_quantisation"
+    )
 
 
 def spans_of(rows: NDArray[np.bool], gap: int = 0) -> list[tuple[int, int]]:

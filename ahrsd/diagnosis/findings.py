@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
+from ahrsd.diagnosis.address import where_of
 from ahrsd.diagnosis.confound import separating_manoeuvre
 from ahrsd.diagnosis.delay import usual_step
 from ahrsd.diagnosis.delays import DELAYS, time_constant_less_lag, weighed
 from ahrsd.diagnosis.diagnosis import Cost, Finding, Heldout, Share, Value, Where
 from ahrsd.diagnosis.evidence import SHARPER, posterior
-from ahrsd.diagnosis.facts import Fact
 from ahrsd.diagnosis.gram import solve
 from ahrsd.diagnosis.heldout import gain_of
 from ahrsd.diagnosis.innovation import TRACELESS
-from ahrsd.diagnosis.intervals import spans
 from ahrsd.diagnosis.itself import beside_itself
-from ahrsd.diagnosis.locate import segments
 from ahrsd.diagnosis.name import LONELY_BLOCKS, Judged
 from ahrsd.diagnosis.regression import CALIBRATION, Base, Candidate, candidate_gram
 from ahrsd.diagnosis.reweighted import stepped
@@ -31,8 +29,7 @@ from ahrsd.diagnosis.search import (
     term_group,
 )
 from ahrsd.diagnosis.settings import scale_of, scaled
-from ahrsd.diagnosis.shown import shown
-from ahrsd.diagnosis.unknown import AXES, innovation_rms
+from ahrsd.diagnosis.unknown import innovation_rms
 from ahrsd.diagnosis.validate import Gain, alternating, heading_error_deg, heldout
 from ahrsd.diagnosis.values import NullModel, Term
 from ahrsd.samples import Array
@@ -90,19 +87,6 @@ def finding(
         setting=term.setting,
         evidence_nats=judged.evidence,
         term=number,
-    )
-
-
-def rounding(facts: Sequence[Fact]) -> tuple[Term, ...]:
-    """The coarse steps of the readings, where they were counted, as a term of the model."""
-    return tuple(
-        Term(
-            fact.effect,
-            np.array([value.value for value in fact.parameters]),
-            np.array([value.std for value in fact.parameters]),
-        )
-        for fact in facts
-        if fact.effect == "mag_quantisation"
     )
 
 
@@ -243,33 +227,10 @@ def contribution(judged: Judged, value: Array, basis: Base) -> Array:
 
 def where(judged: Judged, value: Array, basis: Base) -> Where:
     """When and on which axes the term acts."""
-    track = basis.context.track
+    effect = judged.candidate.effect
     added = contribution(judged, value, basis)
-    spread = np.sqrt(np.mean(added**2, axis=0))
-    axes = tuple(AXES[k] for k in range(3) if spread[k] > 0.2 * spread.max())
-    cut = segments(track.time_s, 100)
-    size = np.array(
-        [
-            np.sqrt(np.mean(added[cut.index == k] ** 2)) if (cut.index == k).any() else 0.0
-            for k in range(len(cut))
-        ]
-    )
-    setting = judged.candidate.setting
-    if "onset_s" in setting and "length_s" not in setting:
-        found = [(float(setting["onset_s"]), float(setting.get("end_s", track.time_s[-1])))]
-    else:
-        found = spans(cut.edges_s, size > 0.15 * size.max())
-        if sum(b - a for a, b in found) > 0.6 * track.duration_s:
-            found = [(float(track.time_s[0]), float(track.time_s[-1]))]
-    frequency = setting.get("frequency_hz")
-    width = 1.0 / max(track.duration_s, 1e-9)
-    return Where(
-        tuple(found),
-        axes,
-        judged.candidate.effect.frame or judged.candidate.effect.family,
-        _regime(judged, basis, added),
-        None if frequency is None else (float(frequency) - width, float(frequency) + width),
-    )
+    frame = effect.frame or effect.family
+    return where_of(basis.context.track, added, judged.candidate.setting, frame)
 
 
 def cost(basis: Base, number: int, value: Array) -> Cost:
@@ -349,18 +310,3 @@ def _within_seconds(basis: Base, number: int, value: Array, scale: Array) -> Gai
     gram = candidate_gram(basis.without(name, value), columns, SECOND_S)
     known = [group for group in basis.groups if group != name]
     return heldout(gram, known, name, scale, alternating)
-
-
-def _regime(judged: Judged, basis: Base, added: Array) -> str | None:
-    """`motor_current_a > 6`: the covariate's upper range, where the term acts most."""
-    name = judged.candidate.setting.get("covariate")
-    values = basis.context.track.covariates.get(str(name))
-    if values is None or not np.isfinite(values).any():
-        return None
-    size = np.linalg.norm(added, axis=1)
-    strong = values[size >= np.median(size)]
-    low, high = float(np.min(strong)), float(np.max(strong))
-    if low > float(np.median(values)) * 0.9:
-        return f"{shown(str(name))} > {low:.3g}"
-    below = high < float(np.median(values))
-    return f"{shown(str(name))} < {high:.3g}" if below else f"follows {shown(str(name))}"

@@ -6,7 +6,9 @@ answer is the one that the recording gives without it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from ahrsd.diagnosis.clocks import Late, clock_of, suspects
 from ahrsd.diagnosis.delays import DELAYS
 from ahrsd.diagnosis.diagnosis import Diagnosis
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.engine import diagnose as by_rules
 from ahrsd.diagnosis.held_columns import drawn_between, held_columns
 from ahrsd.diagnosis.hygiene import hygiene, put_right
 from ahrsd.diagnosis.limits import LIMITS
@@ -28,6 +30,8 @@ from ahrsd.diagnosis.search import State, formed_basis_of
 from ahrsd.diagnosis.shown import shown
 from ahrsd.diagnosis.track import Spec, Track
 
+#: an engine: a track and what is known of the sensor
+Ask = Callable[[Track, Spec | None], Diagnosis]
 #: of the unknown that may be left when a column is at its true time, or without its noise
 LEFT = 0.5
 #: columns whose clock is sought, the likeliest first
@@ -39,17 +43,21 @@ ON_TIME_S = 1.0
 def diagnose_logged(
     track: Track, spec: Spec | None = None, *, recording: str = "", simulated: bool = False
 ) -> Diagnosis:
-    """`diagnose`, with what columns with holes and wrong clocks can still say.
+    """The answer of the rules, with what columns with holes and wrong clocks can still say.
 
     What is left of a recording that is not known to be simulated is unknown only where it is beyond
     the ordinary.
     ValueError, one line, where nothing can be fitted.
     """
-    return beyond_ordinary(_with_holes(track, spec, recording), simulated=simulated)
+    found = with_columns_as_logged(track, spec, partial(by_rules, recording=recording))
+    return beyond_ordinary(found, simulated=simulated)
 
 
-def _with_holes(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
-    """The diagnosis with columns that have holes, where an effect is named by one."""
+def with_columns_as_logged(track: Track, spec: Spec | None, ask: Ask) -> Diagnosis:
+    """An engine's answer, with what columns with holes and wrong clocks can still say.
+
+    With columns that have holes where an effect is named by one.
+    """
     holed = roles.holed(track)
     if holed:
         filled = track.with_columns(
@@ -58,25 +66,25 @@ def _with_holes(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
         missing = np.zeros(len(track), dtype=bool)
         for one in holed.values():
             missing |= one.missing
-        found = _straight(_blind(filled, missing), spec, recording)
+        found = _straight(_blind(filled, missing), spec, ask)
         used = [name for name in holed if name in causes(found)]
         if used:
             notes = tuple(holed[name].words for name in used)
             return replace(found, notes=(*notes, *found.notes))
-    return _straight(track, spec, recording)
+    return _straight(track, spec, ask)
 
 
-def _straight(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
+def _straight(track: Track, spec: Spec | None, ask: Ask) -> Diagnosis:
     """The diagnosis, with columns that were held between their values drawn straight if better.
 
     Better is what gains more, all names together, on what was not fitted.
     """
-    found = _as_logged(track, spec, recording)
+    found = _as_logged(track, spec, ask)
     seldom = held_columns(roles.prepared(track)[0])
     by = set(causes(found))
     if not seldom or not (found.unexplained.detected or by & {one.name for one in seldom}):
         return found
-    again = _as_logged(drawn_between(track, seldom), spec, recording)
+    again = _as_logged(drawn_between(track, seldom), spec, ask)
     used = [one for one in seldom if one.name in causes(again)]
     if used and _gain(again) > _gain(found):
         words = ", ".join(f"{shown(one.name)} ({one.often})" for one in used)
@@ -94,18 +102,18 @@ def _gain(found: Diagnosis) -> float:
     return 0.0 if found.validation is None else found.validation.named
 
 
-def _as_logged(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
+def _as_logged(track: Track, spec: Spec | None, ask: Ask) -> Diagnosis:
     """The diagnosis, with the logger's noise taken out of a cause where that leaves less.
 
     Noise in a cause is told too small, and itself as a source that nobody knows.
     """
-    found = _on_time(track, spec, recording)
+    found = _on_time(track, spec, ask)
     usable = roles.prepared(track)[0]
     by = tuple(name for name in causes(found) if name in usable.covariates)
     clean = cleaned(usable, by) if found.unexplained.detected else None
     if clean is None:
         return found
-    again = _on_time(clean, spec, recording)
+    again = _on_time(clean, spec, ask)
     if not (_names(again) == _names(found) and _less(again, found)):
         return found
     own = [name for name in by if clean.covariates[name] is not usable.covariates[name]]
@@ -124,14 +132,14 @@ def _less(again: Diagnosis, found: Diagnosis) -> bool:
     return not after.detected or after.evidence_nats < LEFT * before.evidence_nats
 
 
-def _on_time(track: Track, spec: Spec | None, recording: str) -> Diagnosis:
+def _on_time(track: Track, spec: Spec | None, ask: Ask) -> Diagnosis:
     """The diagnosis, with a column whose clock is wrong at its true time where that names it."""
-    found = diagnose(track, spec, recording=recording)
+    found = ask(track, spec)
     usable = roles.prepared(track)[0]
     clock = _clock(found, usable, spec or Spec())
     if clock is None:
         return found
-    again = diagnose(clock.moved(usable), spec, recording=recording)
+    again = ask(clock.moved(usable), spec)
     by_it = [one for one in again.findings if one.setting.get("covariate") == clock.column]
     worth = max((one.evidence_nats for one in by_it), default=0.0)
     if not by_it or not (_less(again, found) or worth > found.unexplained.evidence_nats):

@@ -194,8 +194,8 @@ def _compared(
     found = _Fitted.of(fit, context)
     value = statistics(found.left(fit.filtered.whitened), scene)
     made = _innovations(fit, noise, terms, library, COPIES, seed)
-    bands = _bands([statistics(found.left(e), scene) for e in made])
-    return {name: (value[name], bands[name]) for name in value}
+    expected = bands([statistics(found.left(e), scene) for e in made])
+    return {name: (value[name], expected[name]) for name in value}
 
 
 def _innovations(
@@ -371,7 +371,7 @@ def _joined(tracks: Sequence[Track]) -> Track:
     )
 
 
-def _bands(found: Sequence[Mapping[str, float]]) -> dict[str, tuple[float, float]]:
+def bands(found: Sequence[Mapping[str, float]]) -> dict[str, tuple[float, float]]:
     """Where one more simulation would be, for every statistic."""
     count, names = len(found), list(found[0])
     outside = _OUTSIDE / len(names)

@@ -21,13 +21,8 @@ from ahrsd.diagnosis.loudness import beside_bursts, in_even_noise
 from ahrsd.diagnosis.one_course import smooth_nats
 from ahrsd.diagnosis.one_source import ANY_NATS, NATS, with_any_course, with_course, with_one_source
 from ahrsd.diagnosis.own_form import free_price_of, price_of
-from ahrsd.diagnosis.search import (
-    ORDINARY_WALK_RAD_S_SQRT_S,
-    State,
-    at_rest,
-    formed_basis_of,
-    refitted,
-)
+from ahrsd.diagnosis.resting import ORDINARY_WALK_RAD_S_SQRT_S, at_rest
+from ahrsd.diagnosis.search import State, formed_basis_of, refitted
 from ahrsd.diagnosis.slow_noise import in_its_noise
 from ahrsd.diagnosis.spells import with_spells
 from ahrsd.diagnosis.unknown import Remainder

@@ -16,6 +16,12 @@ import numpy as np
 from scipy import linalg
 
 from ahrsd.diagnosis import locate
+from ahrsd.diagnosis.added_field import (
+    calibration_of,
+    deviation,
+    heading_off_deg,
+    less_calibration,
+)
 from ahrsd.diagnosis.discrepancy import (
     COURSES,
     PIECES,
@@ -38,10 +44,6 @@ COMPONENTS = {
     "gyro_course": (2,),
     "by_rate": (4,),
 }
-#: where no accelerometer says what is level: the horizontal part of the field at 60 degrees of dip
-LEVEL_SHARE = 0.5
-#: smallest horizontal part of the field in which a heading is told
-LEAST_SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,48 +136,3 @@ def _without(found: Discrepancy, G: Array, s: Array, groups: Sequence[int]) -> f
 def _added(columns: Columns, value: Array) -> Array:
     matrix = columns.gyro if columns.mag is None else columns.mag
     return np.zeros((0, 3)) if matrix is None else np.asarray(matrix @ value)
-
-
-def calibration_of(context: Context) -> Array:
-    """(3 N, 9) orthonormal: how readings move with soft and hard iron."""
-    x, y, z = context.field_b.T
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    soft = [
-        (x, zero, zero), (zero, y, zero), (zero, zero, z), (y, x, zero), (z, zero, x), (zero, z, y)
-    ]  # fmt: skip
-    hard = [(one, zero, zero), (zero, one, zero), (zero, zero, one)]
-    columns = np.stack([np.column_stack(part).ravel() for part in (*soft, *hard)], axis=1)
-    return np.asarray(np.linalg.svd(columns, full_matrices=False)[0])
-
-
-def less_calibration(added: Array, take: Array) -> Array:
-    """(N, 3) what no soft and hard iron would take over; take: `calibration_of`."""
-    flat = added.ravel()
-    return np.asarray((flat - take @ (take.T @ flat)).reshape(added.shape))
-
-
-def deviation(added: Array) -> float:
-    """Root mean square length of (N, 3) about its mean."""
-    return float(np.sqrt(np.sum(np.var(added, axis=0))))
-
-
-def heading_off_deg(added: Array, context: Context) -> float:
-    """Deviation of a level vehicle's heading by a field (N, 3) that is added to the readings.
-
-    Across the horizontal field; where nothing says what is level, of any direction in a field of
-    usual dip.
-    """
-    read = context.field_b @ context.model.soft_iron.T
-    if not context.world_levelled:
-        size = float(np.median(np.linalg.norm(read, axis=1)))
-        return float(np.degrees(deviation(added) / np.sqrt(3.0) / (LEVEL_SHARE * size)))
-    outside, in_world = (_turned(context.R_nb, vectors) for vectors in (read, added))
-    north, east, _ = mean = outside.mean(axis=0)
-    level = float(np.hypot(north, east))
-    least = max(level, LEAST_SHARE * float(np.linalg.norm(mean)))
-    across = in_world[:, :2] @ np.array([-east, north]) / max(level, 1e-300)
-    return float(np.degrees(np.std(across) / least))
-
-
-def _turned(rotations: Array, vectors: Array) -> Array:
-    return np.asarray(np.einsum("nij,nj->ni", rotations, vectors))

@@ -17,16 +17,24 @@ from scipy import linalg
 from scipy.special import logsumexp
 
 from ahrsd.diagnosis.confound import separating_manoeuvre
+from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.diagnosis import Finding, Share, Value, Where
 from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.evidence import log_bayes, posterior
 from ahrsd.diagnosis.gram import solve
 from ahrsd.diagnosis.limits import Limits
 from ahrsd.diagnosis.score import total_score
-from ahrsd.diagnosis.search import ORDINARY_WALK_RAD_S_SQRT_S
 from ahrsd.diagnosis.values import Context
 from ahrsd.samples import Array
 
+#: 1 - |mean direction| of the field in the sensor: directions within about 5 degrees
+REST_SPREAD = 4e-3
+HARDLY_TURNED = (
+    "the sensor hardly turned: only the gyro, a logged current, switches and alternating fields "
+    "can be told"
+)
+#: a gyro bias that wanders by 20 deg/h in 400 s is noise of an ordinary gyro and gets no name
+ORDINARY_WALK_RAD_S_SQRT_S = 5e-6
 #: what may move the bias of a gyro that stands, and log prior odds: that the recording began when
 #: the power came on, as a start-up needs, is seldom so
 CAUSES: Mapping[str, float] = {
@@ -60,6 +68,13 @@ class _Rest:
     def means(self, values: Array) -> Array:
         """(n, ...) means of (N, ...) over the still seconds."""
         return np.stack([values[self.second == k].mean(axis=0) for k in self.chosen])
+
+
+def at_rest(fit: NullFit) -> bool:
+    """Whether the field hardly turns in the sensor: then only the gyro can be told about."""
+    field = fit.filtered.nominal_b
+    unit = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-300)
+    return bool(1.0 - np.linalg.norm(unit.mean(axis=0)) < REST_SPREAD)
 
 
 def resting(context: Context, library: Mapping[str, Effect], limits: Limits) -> tuple[Finding, ...]:

@@ -27,6 +27,7 @@ from ahrsd.diagnosis.name import Judged, judge, ranked
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.problem import Problem
 from ahrsd.diagnosis.regression import Base, Candidate, base, candidate_gram, columns_of, quieter
+from ahrsd.diagnosis.resting import at_rest
 from ahrsd.diagnosis.settings import best_settings, closest_scale, evidence_of, scale_of
 from ahrsd.samples import Array
 
@@ -34,12 +35,6 @@ from ahrsd.samples import Array
 LOOKED_AT = 8
 #: settings that are a form of the course, of which another may be likelier once all is fitted
 FORMS = ("power", "form", "shape", "of", "products")
-#: 1 - |mean direction| of the field in the sensor: directions within about 5 degrees
-REST_SPREAD = 4e-3
-HARDLY_TURNED = (
-    "the sensor hardly turned: only the gyro, a logged current, switches and alternating fields "
-    "can be told"
-)
 #: nats by which a frame must lead before steps in it are believed
 FRAME_LEAD = 10.0
 #: a jump in each frame
@@ -58,8 +53,6 @@ CANCELS = 0.25
 COUNTERPART_NATS = 3 * float(np.log(1 / CANCELS))
 SMALL_LAG_S = 2e-3
 LAG_STEPS = 3
-#: a gyro bias that wanders by 20 deg/h in 400 s is noise of an ordinary gyro and gets no name
-ORDINARY_WALK_RAD_S_SQRT_S = 5e-6
 #: what a vehicle that hardly turns can tell of the field: what no turn and no drift does
 ALTERNATING = ("ac_interference", "rotor_field", "sync_pulses")
 #: fields of the sensor that need no turning: those, and the logged causes whose manoeuvre is a rest
@@ -157,13 +150,6 @@ def survey(state: State, basis: Base | None = None, own: Candidate | None = None
     gram = candidate_gram(basis, columns, problem.block_s)
     judged = [judge(c, gram, columns[c.name], quiet, len(candidates), problem.limits) for c in near]
     return Survey(basis, candidates, tuple(judged))
-
-
-def at_rest(fit: NullFit) -> bool:
-    """Whether the field hardly turns in the sensor: then only the gyro can be told about."""
-    field = fit.filtered.nominal_b
-    unit = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-300)
-    return bool(1.0 - np.linalg.norm(unit.mean(axis=0)) < REST_SPREAD)
 
 
 def added(state: State, judged: Judged) -> State:

@@ -14,10 +14,10 @@ from ahrsd.diagnosis.name import ROBUST, Judged, judge
 from ahrsd.diagnosis.nested import simplest
 from ahrsd.diagnosis.null import at_model
 from ahrsd.diagnosis.regression import Candidate, candidate_gram, columns_of, quieter
+from ahrsd.diagnosis.resting import ORDINARY_WALK_RAD_S_SQRT_S
 from ahrsd.diagnosis.score import Score
 from ahrsd.diagnosis.search import (
     FRAME_LEAD,
-    ORDINARY_WALK_RAD_S_SQRT_S,
     STEPS,
     WANDERING,
     State,

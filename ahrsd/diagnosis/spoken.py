@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from ahrsd.diagnosis.diagnosis import Diagnosis, Finding, Limit, Unexplained, Value, Where
+from ahrsd.diagnosis.diagnosis import Diagnosis, Finding, Limit, OnPriors, Unexplained, Value, Where
 from ahrsd.diagnosis.ordinary_text import in_one_sentence, ordinary_left, size_lines
 from ahrsd.diagnosis.shown import shown
 
@@ -112,12 +112,23 @@ def _finding_lines(finding: Finding) -> list[str]:
             f"   held out   {held.nll_gain_per_sample:+.4f} nats/sample (moved in time: at most "
             f"{held.placebo_gain:+.4f})"
         )
+    if finding.priors is not None:
+        out.append(f"   assumed    {assumed(finding.priors)}")
     if finding.alternatives:
         rest = ", ".join(f"{a.effect} {a.confidence:.1%}" for a in finding.alternatives)
         out.append(f"   or else    {rest}")
     if finding.separate_from:
         out.append(f"   to be sure {finding.separate_from}")
     return [line for line in out if line]
+
+
+def assumed(one: OnPriors) -> str:
+    """`95 nats of odds (3 are asked), 94 at least with half or twice of what was assumed`."""
+    least = min(nats for each in one.assumed for nats in (each.half_nats, each.double_nats))
+    return (
+        f"{one.log_odds:.0f} nats of odds ({one.asked:.0f} are asked), {least:.0f} at least with "
+        "half or twice of what was assumed"
+    )
 
 
 def place(where: Where) -> str:
@@ -155,6 +166,8 @@ def _unexplained_lines(left: Unexplained) -> list[str]:
         f"p = {one.p_value:.1g})"
         for one in left.follows
     ]
+    if left.priors is not None:
+        out.append(f"   assumed    {assumed(left.priors)}")
     if left.heldout is not None:
         out.append(
             f"   held out   {left.heldout.nll_gain_per_sample:+.4f} nats/sample if drawn freely"

@@ -15,10 +15,10 @@ from ahrsd.diagnosis.findings import added_value, shares_of, where
 from ahrsd.diagnosis.locate import FRAMES, Frame
 from ahrsd.diagnosis.one_course import of_one_course
 from ahrsd.diagnosis.regression import Base
+from ahrsd.diagnosis.resting import ORDINARY_WALK_RAD_S_SQRT_S
 from ahrsd.diagnosis.rivals import of_another_form
 from ahrsd.diagnosis.search import (
     CANCELS,
-    ORDINARY_WALK_RAD_S_SQRT_S,
     STEPS,
     State,
     Survey,

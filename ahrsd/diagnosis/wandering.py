@@ -24,10 +24,10 @@ from ahrsd.diagnosis.findings import shares_of
 from ahrsd.diagnosis.limits import Limits
 from ahrsd.diagnosis.name import judge
 from ahrsd.diagnosis.regression import candidate_gram, columns_of
+from ahrsd.diagnosis.resting import ORDINARY_WALK_RAD_S_SQRT_S
 from ahrsd.diagnosis.score import score
 from ahrsd.diagnosis.search import (
     FRAME_LEAD,
-    ORDINARY_WALK_RAD_S_SQRT_S,
     STEPS,
     WANDERING,
     State,

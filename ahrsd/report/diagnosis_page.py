@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from ahrsd.diagnosis.diagnosis import Contribution, Diagnosis, Drawn, Finding, RegimeMap, Validation
 from ahrsd.diagnosis.ordinary_text import in_one_sentence, ordinary_left, size_lines
 from ahrsd.diagnosis.shown import shown
-from ahrsd.diagnosis.spoken import headline, place, sensitivity, value_text, verdict
+from ahrsd.diagnosis.spoken import assumed, headline, place, sensitivity, value_text, verdict
 from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN, legend_above
 from ahrsd.report.template import Picture, number, picture, render
 from ahrsd.samples import Array
@@ -336,6 +336,8 @@ def _finding(found: Diagnosis, one: Finding) -> dict[str, object]:
             f"at most {held.placebo_gain:+.4f}"
         )
         rows.append(("on data not fitted", gain))
+    if one.priors is not None:
+        rows.append(("by what is assumed", assumed(one.priors)))
     if one.alternatives:
         rest = ", ".join(f"{a.effect} ({a.confidence:.1%})" for a in one.alternatives)
         rows.append(("or else", rest))

@@ -44,7 +44,7 @@ def repaired(null, terms, model):
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_recording_of_the_null_is_inside_all_its_bands(seed):
+def test_a_recording_of_the_null_is_inside_all_itsbands(seed):
     null, _, _ = recorded(seed=seed)
     found = predictive.checks(null, null, ())
     assert set(found) == {
@@ -211,6 +211,6 @@ def test_the_largest_of_many_is_below_its_band_as_often_as_is_said():
     for size in (60, 5000):  # segments in three axes; lines of a periodogram
         share = np.random.default_rng(size).random((20_000, predictive.COPIES + 1))
         drawn = -np.log1p(-(share ** (1 / size)))  # of so many powers, by their distribution
-        bands = [predictive._bands([{"line": float(x)} for x in row[:-1]]) for row in drawn]
+        bands = [predictive.bands([{"line": float(x)} for x in row[:-1]]) for row in drawn]
         outside = [not b["line"][0] <= row[-1] <= b["line"][1] for b, row in zip(bands, drawn)]
         assert np.mean(outside) < 3e-3

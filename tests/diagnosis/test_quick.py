@@ -14,7 +14,7 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.effects.pulses import train, trains
 from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.null import cold_start, fit_null
-from ahrsd.diagnosis.search import at_rest
+from ahrsd.diagnosis.resting import at_rest
 from ahrsd.diagnosis.thin import working_factor
 from ahrsd.diagnosis.track import Spec, Track
 

@@ -15,7 +15,8 @@ from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.name import ROBUST
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.search import ORDINARY_WALK_RAD_S_SQRT_S, State, added, refitted, survey
+from ahrsd.diagnosis.resting import ORDINARY_WALK_RAD_S_SQRT_S
+from ahrsd.diagnosis.search import State, added, refitted, survey
 from ahrsd.diagnosis.selection import (
     _cause,
     _cause_after_all,

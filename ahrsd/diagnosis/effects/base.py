@@ -81,6 +81,15 @@ class Effect(ABC):
     form_share:  part of its evidence that its columns may leave, where they are not exact
     quick:       only the recorded rate shows it: averaged over some readings it is gone
     course:      whether any slow course in time of its frame is it, whatever the form
+    jumps:       one constant vector along the axes of its frame, from its onset on
+    recurs:      a further one is no rare thing where there is one: what was put on is taken off
+    delay:       sign of the magnetometer's delay against the gyro that it is; 0 where it is none
+    plain:       among delays of a sign, the one that is told where nothing speaks for another
+    filters:     its delay is a filter's;  of_step: its delay is told in half steps of the recording
+    ordinary:    its size, in usual scales, that one in ten untouched recordings is beyond, beside
+                 what such leave; 0 where hardly any has it
+                 (`python tests/benchmarks/diagnosis/bench_remainder_priors.py`)
+    ordinary_part: of what real recordings ordinarily leave, the part whose form it is
     stands_for:  effects that look like it, each a further way to it where its column was not logged
     loose:       prior of its parameters in the joint fit, in their own prior deviations: next to
                  none, unless the columns themselves follow what is fitted
@@ -108,6 +117,14 @@ class Effect(ABC):
     form_share: float = 0.0
     quick: bool = False
     course: bool = False
+    jumps: bool = False
+    recurs: bool = False
+    delay: float = 0.0
+    plain: bool = False
+    filters: bool = False
+    of_step: bool = False
+    ordinary: float = 0.0
+    ordinary_part: str | None = None
     stands_for: tuple[str, ...] = ()
     loose: float = 30.0
 

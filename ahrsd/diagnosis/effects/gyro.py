@@ -202,6 +202,8 @@ class GyroIntegration(Linear):
     manoeuvre = "record at two output rates, or use the device's delta-theta output"
     size = "1e-5 to 1e-3 rad/s"
     source = "VN-100 delta-theta output (dossier G13)"
+    delay = 1.0
+    of_step = True
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Nothing to choose."""
@@ -232,6 +234,8 @@ class GyroTimeLag(Effect):
     manoeuvre = "none: a clock outside of the device is needed"
     size = "1 to 20 ms"
     source = "dossier G15"
+    delay = -1.0
+    plain = True
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """Nothing to choose."""

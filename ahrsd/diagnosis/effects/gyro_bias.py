@@ -106,6 +106,8 @@ class GyroBiasStep(Linear):
     manoeuvre = "rest before and after"
     size = "0.005 to 0.2 deg/s"
     source = "the device's command to set the gyro bias (dossier G8)"
+    recurs = True
+    jumps = True
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """A coarse grid of times."""

@@ -72,6 +72,8 @@ class MagTimeLag(Effect):
     manoeuvre = "brisk reversals in heading"
     size = "1 to 60 ms; EKF3 corrects 60 ms"
     source = "ArduPilot #15899 (dossier M19)"
+    delay = 1.0
+    plain = True
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """Nothing to choose."""
@@ -117,6 +119,8 @@ class MagLowPass(Linear):
     manoeuvre = "shake the heading at several rates"
     size = "5 to 50 ms"
     source = "studies of telephones' magnetometer filters (dossier M20)"
+    delay = 1.0
+    filters = True
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Time constants a factor of three apart."""
@@ -161,6 +165,7 @@ class FlexibleMount(Effect):
     manoeuvre = "pitch and roll to 45 degrees, upside down if it can be"
     size = "0.1 to 2 degrees"
     source = "dossier M22"
+    ordinary_part = "bending"
     # C = c I turns about the specific force, which at rest is the vertical: Exp(c g_b) R^T h is
     # R^T (Exp(c g_n) h), another field in the world, and which one is there nobody knows
     unseen = (tuple(np.eye(3).ravel() / np.sqrt(3.0)),)
@@ -208,6 +213,7 @@ class MagGyroMisalignment(Effect):
     manoeuvre = "turns about all three axes"
     size = "0.05 degrees within a device, up to 3 where the sensors are mounted apart"
     source = "Kok and Schon 2016, arXiv 1612.01044 (dossier G3)"
+    ordinary = 4.7
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """Nothing to choose."""

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.values import Columns
 from ahrsd.samples import Array
 
@@ -58,7 +59,7 @@ class Component:
     columns: per unit of the coefficients
     law:     of the coefficients
     prior:   log odds of being there
-    effect, setting: of the library, where it is one
+    row, setting: of the library, where it is one
     """
 
     key: str
@@ -66,8 +67,18 @@ class Component:
     columns: Columns
     law: Law
     prior: float = 0.0
-    effect: str | None = None
+    row: Effect | None = None
     setting: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def effect(self) -> str | None:
+        """Its identifier in the library, where it is there."""
+        return None if self.row is None else self.row.identifier
+
+    @property
+    def jumps(self) -> bool:
+        """Whether it is one vector from a moment on."""
+        return self.row is not None and self.row.jumps
 
     @property
     def width(self) -> int:

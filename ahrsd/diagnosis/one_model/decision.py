@@ -12,13 +12,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ahrsd.diagnosis.address import AXES, where_of
 from ahrsd.diagnosis.confound import separating_manoeuvre
+from ahrsd.diagnosis.delay import usual_step
 from ahrsd.diagnosis.diagnosis import Cost, Finding, Share, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.locate import single_source
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Sized
-from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, STEPS
+from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, plain_delay
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
 from ahrsd.diagnosis.one_model.remainder import still_spells
@@ -27,20 +29,25 @@ from ahrsd.diagnosis.validate import heading_error_deg
 from ahrsd.diagnosis.values import Term
 from ahrsd.samples import Array
 
-AXES = ("x", "y", "z")
 #: odds are told no surer than this
 _SUREST = 30.0
 _SMALLEST_SHARE = 0.01
-#: how near to all of a delay must be a filter's to be called one
-_NEARLY_ALL = 0.25
 _PIECES = 80
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """Names, terms and what is left of one hypothesis.  best: with nothing that is not told."""
+    """Names, terms and what is left of one hypothesis.
+
+    best: with nothing that is not told;  keys: of the findings and of the terms, in their order
+    unknown: of what is left: a course, a part of the remainder, a source's steps
+    rivals: what is likeliest without each member
+    """
 
     best: Hypothesis
+    keys: tuple[str, ...]
+    unknown: tuple[str, ...]
+    rivals: Mapping[str, Hypothesis]
     findings: tuple[Finding, ...]
     terms: tuple[Term, ...]
     unexplained: Unexplained
@@ -51,9 +58,10 @@ def decided(
     all_sets: Hypotheses, space: Space, best: Hypothesis, library: Mapping[str, Effect]
 ) -> Answer:
     """The answer of a search."""
-    best, odds = _borne_out(all_sets, space, best)
+    best, rivals = _borne_out(all_sets, space, best)
+    odds = {key: best.score - rival.score for key, rival in rivals.items()}
     switching = _switching(all_sets, best)
-    found, terms = [], []
+    found, terms, keys = [], [], []
     for key in sorted(odds, key=lambda one: -odds[one]):
         effect = all_sets.component(key).effect
         if effect is None or effect in switching or _is_ordinary(all_sets, best, key):
@@ -61,16 +69,19 @@ def decided(
         finding, term = _told(all_sets, space, best, key, odds[key], library)
         found.append(finding)
         terms.append(term)
+        keys.append(key)
     drifts = _drifts(all_sets, space, best, library)
     for key, row in drifts.items():
-        finding, term = _drifting(all_sets, best, key, odds[key], row)
+        finding, term = _drifting(all_sets, space, best, key, odds[key], row, library)
         found.append(finding)
         terms.append(term)
-    left = _left(all_sets, space, best, {k: v for k, v in odds.items() if k not in drifts})
+        keys.append(key)
+    unknown, left = _left(all_sets, space, best, {k: v for k, v in odds.items() if k not in drifts})
     if switching and not left.detected:
-        left = _jumping(all_sets, best, switching[0], odds)
+        unknown, left = _jumping(all_sets, best, switching[0], odds)
     surest = max([*odds.values(), left.evidence_nats], default=0.0)
-    return Answer(best, tuple(found), tuple(terms), left, surest)
+    told = tuple(found), tuple(terms), left, surest
+    return Answer(best, tuple(keys), unknown, rivals, *told)
 
 
 def _drifts(
@@ -91,8 +102,9 @@ def _drifts(
 
 
 def _drifting(
-    all_sets: Hypotheses, best: Hypothesis, key: str, odds: float, effect: Effect
-) -> tuple[Finding, Term]:
+    all_sets: Hypotheses, space: Space, best: Hypothesis, key: str, odds: float, effect: Effect,
+    library: Mapping[str, Effect],
+) -> tuple[Finding, Term]:  # fmt: skip
     """A slow course as a finding: the drift's own coefficients that are nearest to it."""
     context = all_sets.made.context
     setting = effect.settings(context)[0]
@@ -105,11 +117,13 @@ def _drifting(
     nearest = np.linalg.pinv(X) @ Y
     value, deviation = coefficients(all_sets, best, key)
     drift, unsure = nearest @ value, np.sqrt(np.square(nearest) @ np.square(deviation))
-    sure = float(1.0 / (1.0 + np.exp(-min(odds, _SUREST))))
     kept = {k: v for k, v in setting.items() if k != "searched"}
-    finding = _found(effect, sure, _where(all_sets, best, key), drift, unsure, kept, odds)
-    finding = replace(finding, cost_if_left_out=_cost(all_sets, best, key))
-    return finding, Term(effect.identifier, drift, unsure, kept)
+    shares = _shares(all_sets, space, best, key)
+    shares = {effect.identifier if k == key else k: share for k, share in shares.items()}
+    where = _where(all_sets, best, key, effect.frame or effect.family)
+    found = _found(effect, shares, where, drift, unsure, kept, odds, library)
+    found = replace(found, cost_if_left_out=_cost(all_sets, best, key))
+    return found, Term(effect.identifier, drift, unsure, kept)
 
 
 def _switching(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
@@ -117,14 +131,15 @@ def _switching(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
 
     Those that are ordinary count as well.
     """
-    kinds = [all_sets.component(key).effect for key in best.names]
-    many = [k for k in STEPS if kinds.count(k) >= priors.CHANGES]
+    members = [all_sets.component(key) for key in best.names]
+    kinds = sorted(one.effect for one in members if one.effect is not None and one.jumps)
+    many = [k for k in dict.fromkeys(kinds) if kinds.count(k) >= priors.CHANGES]
     return sorted(many, key=kinds.count, reverse=True)
 
 
 def _jumping(
     all_sets: Hypotheses, best: Hypothesis, kind: str, odds: Mapping[str, float]
-) -> Unexplained:
+) -> tuple[tuple[str, ...], Unexplained]:
     """A source that goes in steps: its levels between the changes, along its direction."""
     keys = [key for key in best.names if all_sets.component(key).effect == kind]
     keys.sort(key=lambda key: float(all_sets.component(key).setting["onset_s"]))
@@ -134,31 +149,32 @@ def _jumping(
     at = np.linspace(time_s[0], time_s[-1], _PIECES)
     levels = np.vstack([np.zeros(3), np.cumsum(changes, axis=0)])
     course = levels[np.searchsorted(onsets, at, side="right")]
-    frame = STEPS[kind]
+    frame = all_sets.component(keys[0]).frame
     nats = sum(odds[key] for key in keys)
-    return _described(at, course, frame, nats, ((onsets[0], float(time_s[-1])),))
+    return tuple(keys), _described(at, course, frame, nats, ((onsets[0], float(time_s[-1])),))
 
 
 def _borne_out(
     all_sets: Hypotheses, space: Space, best: Hypothesis
-) -> tuple[Hypothesis, dict[str, float]]:
-    """The set without members that are not sure, and the log odds of the others."""
+) -> tuple[Hypothesis, dict[str, Hypothesis]]:
+    """The set without members that are not sure, and what is likeliest without each other one."""
     while True:
         own = [key for key in best.names if key not in all_sets.remainder]
         real = all_sets.is_real(best.names)
-        asked = {key: _asked_odds(all_sets, key, real) for key in own}
+        asked = {key: asked_odds(all_sets, key, real=real) for key in own}
         rivals = {key: all_sets.judge(all_sets.without(best.names, key), best) for key in own}
         if all(best.score - rivals[key].score >= asked[key] for key in own):
             rivals = {key: _without(all_sets, space, best, key) for key in own}
         odds = {key: best.score - rival.score for key, rival in rivals.items()}
         unsure = [key for key in own if odds[key] < asked[key]]
         if not unsure:
-            return best, odds
+            return best, rivals
         key = min(unsure, key=lambda one: odds[one])
         best = _without(all_sets, space, best, key)
 
 
-def _asked_odds(all_sets: Hypotheses, key: str, real: bool) -> float:
+def asked_odds(all_sets: Hypotheses, key: str, *, real: bool) -> float:
+    """Log odds from which on a member is told."""
     if real and key != LAG:
         return priors.ODDS_REAL
     return priors.UNKNOWN_ODDS if all_sets.component(key).effect is None else priors.NAME_ODDS
@@ -168,10 +184,11 @@ def _is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
     """Whether a member is no larger than what real recordings ordinarily have of its kind."""
     if key == LAG or not all_sets.is_real(best.names):
         return False
-    kind = all_sets.component(key).effect or key
-    if kind in STEPS and _is_place(all_sets, key):
+    one = all_sets.component(key)
+    if one.jumps and _is_place(all_sets, key):
         return True
-    return size_of(all_sets, best, key) < priors.ORDINARY_EFFECT.get(kind, 0.0)
+    course = priors.ORDINARY_COURSE.get(one.frame, 0.0)
+    return size_of(all_sets, best, key) < (course if one.row is None else one.row.ordinary)
 
 
 def _is_place(all_sets: Hypotheses, key: str) -> bool:
@@ -201,44 +218,44 @@ def _told(
     """A member as a finding and as a term of the repaired model."""
     one = all_sets.component(key)
     value, deviation = coefficients(all_sets, best, key)
-    shares = _shares(all_sets, space, best, key)
-    name = _delay_name(all_sets, best, float(value[0])) if key == LAG else one.effect or key
+    effect = library[one.effect or key]
     if key == LAG:
-        shares = {name: 1.0}
-        value = np.abs(value) if name == "gyro_time_lag" else value
-    effect = library[name]
-    sure = 1.0 / (1.0 + np.exp(-min(odds, _SUREST)))
-    others = tuple(
-        Share(other, share * sure) for other, share in shares.items()
-        if other != name and share > _SMALLEST_SHARE
-    )  # fmt: skip
+        shares = _which_delay(all_sets, best, value, deviation, library)
+        effect = library[next(iter(shares))]
+        unit = effect.delay / _delay_unit(all_sets, effect)
+        value, deviation = value * unit, deviation * abs(unit)
+    else:
+        shares = _shares(all_sets, space, best, key)
     setting = {k: v for k, v in one.setting.items() if k != "searched"}
-    share = float(shares.get(name, 1.0) * sure)
-    where = _where(all_sets, best, key)
-    close = [one.effect for one in others]
-    finding = replace(
-        _found(effect, share, where, value, deviation, setting, odds),
-        alternatives=others,
-        cost_if_left_out=_cost(all_sets, best, key),
-        separate_from=separating_manoeuvre(library, name, close) if close else None,
-    )
-    return finding, Term(name, value, deviation, setting)
+    if effect.filters:  # its form is that of the filter itself
+        setting["time_constant_s"] = float(value[0])
+    where = _where(all_sets, best, key, effect.frame or effect.family)
+    found = _found(effect, shares, where, value, deviation, setting, odds, library)
+    found = replace(found, cost_if_left_out=_cost(all_sets, best, key))
+    return found, Term(effect.identifier, value, deviation, setting)
 
 
 def _found(
-    effect: Effect, confidence: float, where: Where, value: Array, deviation: Array,
-    setting: Setting, odds: float,
+    effect: Effect, shares: Mapping[str, float], where: Where, value: Array, deviation: Array,
+    setting: Setting, odds: float, library: Mapping[str, Effect],
 ) -> Finding:  # fmt: skip
+    """A finding with what it may be in its place, and what to drive to tell."""
+    sure = float(1.0 / (1.0 + np.exp(-min(odds, _SUREST))))
+    others = tuple(
+        Share(other, share * sure) for other, share in shares.items()
+        if other != effect.identifier and share > _SMALLEST_SHARE
+    )  # fmt: skip
+    close = [one.effect for one in others]
     told = zip(effect.parameters, value, deviation, strict=True)
     return Finding(
         effect=effect.identifier,
-        confidence=confidence,
-        alternatives=(),
+        confidence=shares.get(effect.identifier, 1.0) * sure,
+        alternatives=others,
         where=where,
         parameters=tuple(Value(p.name, float(v), float(d), p.unit) for p, v, d in told),
         heldout=None,
         cost_if_left_out=None,
-        separate_from=None,
+        separate_from=separating_manoeuvre(library, effect.identifier, close) if close else None,
         words=effect.words,
         equation=effect.equation,
         setting=setting,
@@ -286,49 +303,80 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
         by_name[name] = float(np.logaddexp(by_name.get(name, -np.inf), nats + one.prior))
     mine = own.effect or key
     by_name[mine] = max(by_name[mine], worth[key] + own.prior)
+    rival = max((k for k in worth if k != key), key=lambda k: worth[k], default=key)
+    named_so = all_sets.component(rival).effect or rival
+    if own.row is None or by_name[named_so] > by_name[mine]:
+        # the scan knows sizes and noise but roughly: both as sets of their own
+        by_name[mine] = best.score - fewer.score
+        by_name[named_so] = all_sets.judge(fewer.names | {rival}, best).score - fewer.score
     total = np.logaddexp.reduce(list(by_name.values()))
     shares = {name: float(np.exp(nats - total)) for name, nats in by_name.items()}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
-def _delay_name(all_sets: Hypotheses, best: Hypothesis, lag_s: float) -> str:
-    """Which delay it is: a low-pass where its form is there in full."""
-    if lag_s < 0.0:
-        return "gyro_time_lag"
-    if LAG_FORM in best.keys:
-        value, deviation = coefficients(all_sets, best, LAG_FORM)
-        as_filter = -0.5 * ((value[0] - 1.0) / deviation[0]) ** 2
-        as_lag = -0.5 * (value[0] / deviation[0]) ** 2
-        near = abs(value[0] - 1.0) < max(2.0 * deviation[0], _NEARLY_ALL)
-        if near and as_filter - as_lag > priors.ODDS_REAL:
-            return "mag_low_pass"
-    return "mag_time_lag"
+def _which_delay(
+    all_sets: Hypotheses, best: Hypothesis, lag_s: Array, deviation_s: Array,
+    library: Mapping[str, Effect],
+) -> dict[str, float]:  # fmt: skip
+    """Which delay it is, with probabilities, that which is told first.
+
+    A filter's where its form is there in full; half a step's where the delay is that and no other.
+    """
+    tau, unsure = float(lag_s[0]), float(deviation_s[0])
+    plain = plain_delay(library, 1.0 if tau >= 0.0 else -1.0)
+    nats = {plain.identifier: 0.0}
+    half_s = _half_step_s(all_sets)
+    for row in library.values() if tau > 0.0 else ():
+        if row.filters and LAG_FORM in best.keys:
+            value, deviation = (float(one[0]) for one in coefficients(all_sets, best, LAG_FORM))
+            whole = 0.5 * ((value / deviation) ** 2 - ((value - 1.0) / deviation) ** 2)
+            full = abs(value - 1.0) < max(2.0 * deviation, priors.NEARLY_ALL)
+            nats[row.identifier] = whole - priors.ODDS_REAL if full else -np.inf
+        elif row.of_step and half_s is not None:
+            miss, usual = (tau - half_s) / unsure, tau / priors.ORDINARY_LAG_S
+            point = 0.5 * (usual**2 - miss**2) + float(np.log(priors.ORDINARY_LAG_S / unsure))
+            nats[row.identifier] = point + float(np.log(priors.HALF_STEP))
+    total = np.logaddexp.reduce(list(nats.values()))
+    shares = {name: float(np.exp(one - total)) for name, one in nats.items()}
+    return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
-def _where(all_sets: Hypotheses, best: Hypothesis, key: str) -> Where:
-    """When, on which axes and in which frame a member acts."""
+def _half_step_s(all_sets: Hypotheses) -> float | None:
+    """Half of the recording's step, None where the steps are not alike."""
+    step_s = usual_step(all_sets.made.point.problem.recorded.dt_s)
+    return None if step_s is None else step_s / 2.0
+
+
+def _delay_unit(all_sets: Hypotheses, effect: Effect) -> float:
+    """Seconds of an effect's unit of delay."""
+    half_s = _half_step_s(all_sets) if effect.of_step else None
+    return 1.0 if half_s is None else half_s
+
+
+def added_by(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, str]:
+    """(N, 3) what a member adds to the readings, and its unit: gauss, or rad/s of the gyro's."""
     one, track = all_sets.component(key), all_sets.made.context.track
     value, _ = coefficients(all_sets, best, key)
-    matrix = one.columns.mag if one.columns.mag is not None else one.columns.gyro
+    matrix = one.columns.gyro if one.columns.mag is None else one.columns.mag
     added = np.zeros((len(track), 3)) if matrix is None else np.asarray(matrix @ value)
-    spread = np.sqrt(np.mean(added**2, axis=0))
-    axes = tuple(axis for axis, size in zip(AXES, spread, strict=True) if size > 0.2 * spread.max())
-    begin, end = float(track.time_s[0]), float(track.time_s[-1])
-    if "onset_s" in one.setting:
-        begin = float(one.setting["onset_s"])
-        end = min(end, begin + float(one.setting.get("length_s", end - begin)))
-    return Where(((begin, end),), axes, one.frame)
+    return added, "rad/s" if one.columns.mag is None else "gauss"
+
+
+def _where(all_sets: Hypotheses, best: Hypothesis, key: str, frame: str) -> Where:
+    """When, on which axes and in which regime a member acts, told in a frame."""
+    one, track = all_sets.component(key), all_sets.made.context.track
+    return where_of(track, added_by(all_sets, best, key)[0], one.setting, frame)
 
 
 def _left(
     all_sets: Hypotheses, space: Space, best: Hypothesis, odds: Mapping[str, float]
-) -> Unexplained:
-    """What no name explains, where that is beyond the ordinary."""
+) -> tuple[tuple[str, ...], Unexplained]:
+    """What no name explains, where that is beyond the ordinary, and the members that it is."""
     courses = [key for key in space.courses if key in odds]
     courses = [key for key in courses if not _is_ordinary(all_sets, best, key)]
     if courses:
         key = max(courses, key=lambda one: odds[one])
-        return _course(all_sets, best, key, odds[key])
+        return (key,), _course(all_sets, best, key, odds[key])
     for key, size in priors.ORDINARY.items():
         if key not in best.names or size_of(all_sets, best, key) < size.up_to():
             continue
@@ -337,8 +385,8 @@ def _left(
             frame, found = all_sets.component(key).frame, size_of(all_sets, best, key)
             unit = "rad/s" if frame == "gyro" else "gauss"
             where = Where((), AXES, frame, f"a part of what is left ({key})")
-            return Unexplained(True, where, None, found, unit, evidence_nats=nats)
-    return Unexplained(False)
+            return (key,), Unexplained(True, where, None, found, unit, evidence_nats=nats)
+    return (), Unexplained(False)
 
 
 def size_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:

@@ -1,7 +1,8 @@
 """One diagnosis by one generative model.
 
-hygiene -> null fit -> richest model, linearised -> search over sets -> linearised there -> ...
-        -> names, and what is left beyond the ordinary -> quick effects at the recorded rate
+prepared -> null fit -> richest model, linearised -> search over sets -> linearised there -> ...
+         -> names, and what is left beyond the ordinary -> quick effects at the recorded rate
+         -> what holds it against other readings, other times, other priors
 """
 
 from __future__ import annotations
@@ -9,29 +10,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-
-from ahrsd.diagnosis import roles
 from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.diagnosis import Diagnosis
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.facts import matters, of_fact, stopped
-from ahrsd.diagnosis.hygiene import hygiene, put_right
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.missing import lost_turns
-from ahrsd.diagnosis.noise import level_facts
-from ahrsd.diagnosis.null import baseline, fit_null, unusable
-from ahrsd.diagnosis.one_model.decision import Answer
-from ahrsd.diagnosis.one_model.model_search import Hypotheses
+from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.one_model.recorded_rate import Quick, quick
 from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
-from ahrsd.diagnosis.one_model.search_rounds import answered
-from ahrsd.diagnosis.pauses import without_jumps
-from ahrsd.diagnosis.problem import Problem, model_at_rate, problem_of
-from ahrsd.diagnosis.track import NothingToFit, Spec, Track
-
-NOTE = "by the engine one-model, which is experimental"
+from ahrsd.diagnosis.one_model.search_rounds import Searched, answered
+from ahrsd.diagnosis.one_model.whole_answer import whole_answer
+from ahrsd.diagnosis.prepared import prepared
+from ahrsd.diagnosis.problem import Problem, problem_of
+from ahrsd.diagnosis.track import Spec, Track
 
 
 def begun(track: Track, spec: Spec, library: Mapping[str, Effect]) -> tuple[Problem, NullFit]:
@@ -46,52 +38,46 @@ def diagnose(
     *,
     library: Mapping[str, Effect] = EFFECTS,
     recording: str = "",
+    simulated: bool = False,
 ) -> Diagnosis:
     """Where the recording and the model differ, and which physics was left out.
 
+    simulated: known to be no real recording, of which nothing is ordinary
     Deterministic.  ValueError, one line, where nothing can be fitted.
     """
-    track, notes = roles.prepared(track)
-    track, jumped = without_jumps(track)
-    if why := unusable(track):
-        raise NothingToFit(why)
-    facts = hygiene(track)
-    said = [of_fact(fact, library) for fact in facts if matters(fact)]
-    notes = (NOTE, *jumped, *notes, *(fact.words for fact in facts if not matters(fact)))
-    if any(fact.stops for fact in facts):
-        return stopped(recording, [fact for fact in facts if fact.stops], library, notes)
-    spec = spec or Spec()
-    problem, start = begun(put_right(track, facts), spec, library)
+    asked, spec = prepared(track), spec or Spec()
+    if (nothing := asked.stopped(recording, library)) is not None:
+        return nothing
+    problem, start = begun(asked.put_right(), spec, library)
     if lost := lost_turns(problem.recorded, problem.cold):
-        facts = (*facts, *lost)
-        said += [of_fact(fact, library) for fact in lost if matters(fact)]
-        problem, start = begun(put_right(track, facts), spec, library)
-    answer, all_sets = answered(problem, start, library)
-    fast = _quick(answer, all_sets, library)
+        asked = asked.with_facts(lost)
+        problem, start = begun(asked.put_right(), spec, library)
+    found, fast = _found(problem, start, library)
+    told = whole_answer(
+        asked,
+        start,
+        found,
+        fast,
+        library,
+        spec_given=spec.sigma_mag_gauss is not None,
+        simulated=simulated,
+    )
+    return replace(told, recording=recording)
+
+
+def _found(
+    problem: Problem, start: NullFit, library: Mapping[str, Effect]
+) -> tuple[Searched, Quick]:
+    """The search, and what only the recorded rate shows; with that taken out the search anew."""
+    found = answered(problem, start, library)
+    fast = _quick(found, library)
     if fast.slower is not None:
         again = fit_null(fast.slower.track, problem.spec, start.model, walk=False)
-        answer, all_sets = answered(fast.slower, again, library)
-        fast = replace(fast, filtered=_quick(answer, all_sets, library).filtered)
-    if not all_sets.is_real(answer.best.names):  # the ordinary remainder's level comes and goes
-        loud = level_facts(fast.filtered, spec_given=spec.sigma_mag_gauss is not None)
-        said += [of_fact(fact, library) for fact in loud]
-    named = (*answer.findings, *fast.answer.findings)
-    something = bool(said or named or answer.unexplained.detected)
-    surest = max(answer.log_odds, fast.answer.log_odds, 0.0)
-    return Diagnosis(
-        recording=recording,
-        baseline=baseline(start),
-        mismatch=something,
-        p_value=float(np.exp(-surest)) if not said else 0.0,
-        findings=(*said, *named),
-        unexplained=answer.unexplained,
-        posterior_predictive={},
-        notes=(*notes, *problem.notes),
-        model=model_at_rate(all_sets.made.point.filtered.model, problem),
-        terms=(*answer.terms, *fast.answer.terms),
-    )
+        found = answered(fast.slower, again, library)
+        fast = replace(fast, left=_quick(found, library).left)
+    return found, fast
 
 
-def _quick(answer: Answer, all_sets: Hypotheses, library: Mapping[str, Effect]) -> Quick:
-    real = all_sets.is_real(answer.best.names)
-    return quick(all_sets.made, answer.best, library, real=real)
+def _quick(found: Searched, library: Mapping[str, Effect]) -> Quick:
+    real = found.all_sets.is_real(found.answer.best.names)
+    return quick(found.all_sets.made, found.answer.best, library, real=real)

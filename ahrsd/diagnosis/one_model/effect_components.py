@@ -17,12 +17,8 @@ from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
 from ahrsd.diagnosis.values import Columns, Context
 
 #: the delay that stands for all delays: which of them it is, is asked at the end
-LAG = "mag_time_lag"
+LAG = "delay"
 LAG_FORM = "form of the delay"
-#: what jumps, and in which frame
-STEPS = {"hard_iron_step": "sensor", "field_step": "world", "gyro_bias_step": "gyro"}
-#: delays are not asked: one stands for all
-DELAYS = (LAG, "gyro_time_lag", "gyro_integration", "mag_low_pass")
 #: part of the squares that may be left where one component's columns hold another's
 _ALIKE = 1e-3
 #: parts in which the transition of a step is free
@@ -37,7 +33,7 @@ def library_components(
     """Every effect's settings that can be computed here, by identifier."""
     out = {}
     for name, effect in library.items():
-        settings = () if name in DELAYS or effect.quick else effect.settings(context)
+        settings = () if effect.delay or effect.quick else effect.settings(context)
         found = [component(context, effect, one, len(settings)) for one in settings]
         if found:
             out[name] = found
@@ -53,7 +49,7 @@ def causes(context: Context, library: Mapping[str, Effect]) -> list[Component]:
     out = []
     for name, effect in library.items():
         logged = [need for need in effect.needs if "accel" not in need]
-        asked = logged and name not in DELAYS and not effect.quick
+        asked = logged and not effect.delay and not effect.quick
         settings = effect.settings(context) if asked else ()
         if settings:
             made = component(context, effect, settings[0], len(settings))
@@ -71,24 +67,29 @@ def component(context: Context, effect: Effect, setting: Setting, tried: int) ->
         effect.columns(context, setting),
         _sized(effect),
         odds,
-        effect.identifier,
+        effect,
         dict(setting),
     )
 
 
 def anew(known: Component, context: Context, library: Mapping[str, Effect]) -> Component:
     """A named component, its columns made of another context."""
-    if known.effect is None or known.key == LAG:
+    if known.row is None or known.key == LAG:
         return known
-    made = replace(known, columns=library[known.effect].columns(context, known.setting))
+    made = replace(known, columns=known.row.columns(context, known.setting))
     return beyond(made, delay(context, library))
 
 
 def delay(context: Context, library: Mapping[str, Effect]) -> Component:
     """The delay between the sensors, of either sign."""
-    odds = float(np.log(priors.ORDINARY_EFFECTS[LAG]))
+    row, odds = plain_delay(library, 1.0), float(np.log(priors.DELAY))
     law = Fixed(np.array([priors.ORDINARY_LAG_S**2]))
-    return Component(LAG, "sensor", library[LAG].columns(context, {}), law, odds, LAG)
+    return Component(LAG, "sensor", row.columns(context, {}), law, odds, row)
+
+
+def plain_delay(library: Mapping[str, Effect], sign: float) -> Effect:
+    """The library's delay of a sign that is told where nothing speaks for another."""
+    return next(one for one in library.values() if one.plain and one.delay * sign > 0.0)
 
 
 def holds(one: Component, part: Component) -> bool:
@@ -150,14 +151,14 @@ def form_of(known: Component, context: Context) -> Component | None:
 
     A step takes its time: within some seconds of its onset the source may be at any size.
     """
-    frame = STEPS.get(known.effect or "")
-    if frame is None:
+    if not known.jumps:
         return None
+    frame = cast("Frame", known.frame)
     onset_s, width_s = float(known.setting["onset_s"]), 2 * priors.APPROACH_S / PIECES
     edges = onset_s - priors.APPROACH_S + width_s * np.arange(PIECES + 1)
     piece = np.searchsorted(edges, context.track.time_s, side="right") - 1
     inside = (piece[:, None] == np.arange(PIECES)).astype(float)
-    axes = unit_columns(context, cast("Frame", frame))
+    axes = unit_columns(context, frame)
     flat = np.einsum("nk,nia->nika", inside, axes).reshape(len(piece), 3, -1)
     columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
     law = known.law

@@ -118,8 +118,12 @@ class Hypotheses:
 
     def _again(self, members: Names) -> float:
         """What was put on is taken off: a further step of one kind is no rare thing."""
-        steps = [e for key in members if (e := self.component(key).effect) and e.endswith("_step")]
-        more = len(steps) - len(set(steps))
+        rows = [
+            row.identifier
+            for key in members
+            if (row := self.component(key).row) is not None and row.recurs
+        ]
+        more = len(rows) - len(set(rows))
         return more * float(np.log(priors.AGAIN / priors.EFFECT))
 
     def _of_class(self, members: Names) -> float:
@@ -140,10 +144,14 @@ class Beside:
     root: Array
     seen: Array
 
+    def projected(self, products: Array) -> Array:
+        """(q, p) root^-1 times products of the model with candidates."""
+        return np.asarray(solve_triangular(self.root, products, lower=True, check_finite=False))
+
     def worth(self, candidates: Sequence[str]) -> dict[str, float]:
         """Log Bayes factor of each candidate, sizes averaged."""
         C, own, s = self.made.candidates(self.keys, candidates, self.inverse)
-        W = solve_triangular(self.root, C, lower=True, check_finite=False)
+        W = self.projected(C)
         left = s - self.seen @ W
         out, begin = {}, 0
         for key, square in zip(candidates, own, strict=True):
@@ -275,9 +283,13 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
     model = all_sets.judge(base, here)
     at = here.at_of(model)
     had = {all_sets.component(key).effect for key in base}
-    steps = {name for name in had if name and name.endswith("_step")}
+    again = {
+        row.identifier
+        for key in base
+        if (row := all_sets.component(key).row) is not None and row.recurs
+    }
     candidates = [
-        key for name, keys in space.effects.items() if name not in had or name in steps
+        key for name, keys in space.effects.items() if name not in had or name in again
         for key in keys if key not in base
     ]  # fmt: skip
     candidates = [key for key in candidates if not _beside_its_like(all_sets, base, key)]

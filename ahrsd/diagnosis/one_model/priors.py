@@ -28,6 +28,8 @@ class Size:
 
 
 # --- what every real recording leaves: measured ----------------------------------------------
+#: untouched recordings that were measured
+RECORDINGS = 19
 #: deviation over the recording, gauss and rad/s; of the others of the coefficient of unit functions
 ORDINARY: Mapping[str, Size] = {
     "world_course": Size(7.75e-03, 1.53, 0.1),  # gauss
@@ -61,8 +63,8 @@ SMOOTHED_S, STILL_S, MOST_SPELLS = 0.5, 3.0, 4
 MOVED = 10.0
 #: probability of any one effect of the library;  source: the brief of the engine, 1 in 60
 EFFECT = 1.0 / 60.0
-#: of effects that recordings ordinarily have: a delay of the magnetometer's pipeline
-ORDINARY_EFFECTS: Mapping[str, float] = {"mag_time_lag": 0.5, "gyro_time_lag": 0.1}
+#: of a delay between the sensors, which recordings ordinarily have
+DELAY = 0.5
 #: steps of a kind that are nearer than that are one, s
 TRANSITION_S = 2.0
 #: seconds before and after a step for which whatever makes it may be anywhere: a strong magnet is
@@ -105,22 +107,10 @@ LEVEL_S, LEVELS = 10.0, (0.02, 50.0)
 #: octaves of the noise's spectrum, at most
 BANDS = 7
 
-#: what untouched recordings have of effects, and of courses, that nobody put there: nine in ten
-#: stay below, in units of the effect's usual scale (of a course gauss, rad/s); beside the remainder
-#: it is a finding only where it is larger;  source: the same command
-ORDINARY_EFFECT: Mapping[str, float] = {
-    "field_anomaly": 0.97,
-    "field_step": 0.46,
-    "free sensor": 0.017,
-    "hard_iron_drift": 9.5,
-    "hard_iron_step": 1.3,
-    "hysteresis": 0.4,
-    "mag_cross_axis": 4.5,
-    "mag_gyro_misalignment": 4.7,
-    "onboard_calibration_active": 1.4,
-    "soft_iron_step": 11,
-    "viscous_magnetisation": 7.8,
-}
+#: size of a free course, by frame, that one in ten untouched recordings is beyond beside the
+#: remainder, gauss or rad/s: it is a finding only where it is larger;  source: the same command.
+#: Of effects it is a column of the library, `ordinary`
+ORDINARY_COURSE: Mapping[str, float] = {"sensor": 0.017}
 
 # --- where it is linearised --------------------------------------------------------------------
 #: deviations of calibration and delay to which a point is where its model wants it
@@ -134,3 +124,21 @@ NAME_ODDS, UNKNOWN_ODDS = 3.0, 3.0
 ODDS_REAL = 12.0
 #: nats that a move of the search must gain
 MOVE = 2.0
+#: how near to all of a delay must be a filter's to be called one
+NEARLY_ALL = 0.25
+#: of a delay to be half a step of the recording: a gyro that tells the rate of the moment
+HALF_STEP = 0.1
+
+# --- what is held against an answer --------------------------------------------------------------
+#: parts into which a recording is dealt, each foretold from the others, and seconds of a stretch:
+#: longer than a whitened reading remembers, shorter than an object that is passed by
+PARTS, STRETCH_S = 5, 2.0
+#: shares of a recording by which copies of a cause are moved: no simple ones, what comes again and
+#: again would meet itself
+SHIFTS = (0.236, 0.382, 0.472, 0.618, 0.764, 0.854)
+#: deviations of a coefficient from which on it would have been told nine times in ten
+SHOWN_AT = 6.5
+#: probability that any bin of any regime is outside of its band where nothing is left
+BINS_OUTSIDE = 0.01
+#: probability by chance, and correlation, of a logged column that is said to move with a course
+CHANCE, ALIKE = 0.2, 0.5

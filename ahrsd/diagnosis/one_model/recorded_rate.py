@@ -14,7 +14,7 @@ import numpy as np
 
 from ahrsd.diagnosis.delay import without_lag
 from ahrsd.diagnosis.effects.base import Effect
-from ahrsd.diagnosis.innovation import Filtered, run_filter
+from ahrsd.diagnosis.innovation import run_filter
 from ahrsd.diagnosis.one_model import decision, noise_model, priors, rich
 from ahrsd.diagnosis.one_model.effect_components import component
 from ahrsd.diagnosis.one_model.linearised import (
@@ -36,13 +36,15 @@ from ahrsd.samples import Array
 class Quick:
     """An answer at the recorded rate.
 
-    filtered: the recording with all names taken out;  slower: the problem of a search that begins
-    anew without what was found, None where nothing was
+    left: the recording with all that was found taken out;  all_sets, space: what was searched
+    slower: the problem of a search that begins anew without what was found, None where nothing was
     """
 
     answer: decision.Answer
-    filtered: Filtered
+    left: Point
     slower: Problem | None
+    all_sets: Hypotheses
+    space: Space
 
 
 def quick(
@@ -53,7 +55,7 @@ def quick(
     real: whether that set leaves what real recordings do: then a column has to tell, for a room has
           alternating fields of its own
     """
-    point = _at_recorded_rate(moved(made, best.keys, best.at))
+    point = at_recorded_rate(moved(made, best.keys, best.at))
     fast = linearised(point, point.context)
     candidates = {}
     for name, effect in library.items():
@@ -72,10 +74,10 @@ def quick(
     slower = None
     if answer.findings:
         slower = _without(point.problem, made.point.problem, fast, answer.best)
-    return Quick(answer, point.filtered, slower)
+    return Quick(answer, point, slower, all_sets, space)
 
 
-def _at_recorded_rate(slow: Point) -> Point:
+def at_recorded_rate(slow: Point) -> Point:
     """A point at the recording's own rate: all that is taken out is drawn between working rows."""
     problem = slow.problem
     track = without_lag(problem.recorded, problem.lag_s)

@@ -84,7 +84,7 @@ def by_change(context: Context) -> Component:
 
 def bending(context: Context) -> Component:
     """A mount that gives: turned by what force and angular acceleration do to it."""
-    found = EFFECTS["flexible_mount"]
+    found = next(one for one in EFFECTS.values() if one.ordinary_part == "bending")
     law = ordinary(priors.ORDINARY["bending"], np.array([one.scale for one in found.parameters]))
     return Component("bending", "sensor", found.columns(context, {}), law)
 

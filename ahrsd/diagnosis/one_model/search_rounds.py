@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.one_model import decision, priors, rich
 from ahrsd.diagnosis.one_model.effect_components import LAG, PIECES
 from ahrsd.diagnosis.one_model.linearised import unread
-from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis
+from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.one_model.search_space import best_at
 from ahrsd.diagnosis.problem import Problem
 
@@ -19,9 +20,16 @@ from ahrsd.diagnosis.problem import Problem
 ROUNDS = 3
 
 
-def answered(
-    problem: Problem, start: NullFit, library: Mapping[str, Effect]
-) -> tuple[decision.Answer, Hypotheses]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Searched:
+    """An answer, and the sets at the last linearisation that it was chosen of."""
+
+    answer: decision.Answer
+    all_sets: Hypotheses
+    space: Space
+
+
+def answered(problem: Problem, start: NullFit, library: Mapping[str, Effect]) -> Searched:
     """Searched at the richest model, and again at what was found, until that stays."""
     found = rich.richest(problem, start.filtered, library)
     all_sets, space, best = best_at(found, library, (), was_real=True)
@@ -40,7 +48,7 @@ def answered(
         answer = decision.decided(all_sets, space, best, library)
         if decision.names_of(all_sets, answer.best) == before and not spans:
             break
-    return answer, all_sets
+    return Searched(answer, all_sets, space)
 
 
 def moved_in(all_sets: Hypotheses, best: Hypothesis) -> list[tuple[float, float]]:

@@ -9,7 +9,6 @@ from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
     LAG_FORM,
-    STEPS,
     beyond,
     component,
     form_of,
@@ -57,7 +56,7 @@ def space_at(
     for name in nested:
         found[name] = [beyond(one, delay) for one in found[name]]
     made.add([one for parts in found.values() for one in parts])
-    effects[LAG] = [LAG]
+    effects[delay.effect or LAG] = [LAG]
     forms = {}
     for one in named:
         listed = effects.setdefault(one.effect or one.key, [])
@@ -74,16 +73,16 @@ def space_at(
     length_s = context.track.duration_s
 
     def finer(one: Component, round_: int) -> list[Component]:
-        if one.effect is None or one.effect == LAG:
+        if one.row is None or one.key == LAG:
             return []
-        tried = max(_SOUGHT, len(effects[one.effect]))
+        row, tried = one.row, max(_SOUGHT, len(effects[one.row.identifier]))
         near = neighbours(one.setting, length_s, round_)
-        return [component(context, library[one.effect], setting, tried) for setting in near]
+        return [component(context, row, setting, tried) for setting in near]
 
     def steps_at(time_s: float) -> list[Component]:
         setting = {"onset_s": round(time_s, 3)}
-        asked = [name for name in STEPS if name in library]
-        return [component(context, library[name], setting, _ONSETS) for name in asked]
+        jumping = [row for row in library.values() if row.jumps]
+        return [component(context, row, setting, _ONSETS) for row in jumping]
 
     space = Space(effects, COURSES, finer, lambda one: form_of(one, context), steps_at)
     return all_sets, space

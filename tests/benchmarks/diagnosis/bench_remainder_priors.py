@@ -8,14 +8,15 @@ The first fits the richest model to each untouched recording beside the project 
 component of the ordinary remainder, how likely each size is beside all others, and of each effect
 how large it comes out alone beside them (some two minutes of CPU; it goes on where it stopped).
 The second finds the lognormal law of each size that makes all recordings together likeliest, and
-prints it as it stands in the module, and the size of each effect that one in ten is beyond.  The
-third diagnoses each recording with the sizes that all others have: no recording is judged by what
-was measured on it.
+prints it as it stands in the module, and the size of each effect that one in ten is beyond, as its
+row of the library has it (`ordinary`), and of each course.  The third diagnoses each recording with
+the sizes that all others have: no recording is judged by what was measured on it.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 import time
 from collections.abc import Iterator
@@ -26,9 +27,8 @@ import numpy as np
 from bench_ordinary import AT_REST, DISTURBED, DOUBTFUL, FOLDERS, RECORDINGS
 from scipy.optimize import minimize
 
-from ahrsd.diagnosis import roles
+from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.hygiene import hygiene, put_right
 from ahrsd.diagnosis.one_model import priors, rich
 from ahrsd.diagnosis.one_model.decision import size_of
 from ahrsd.diagnosis.one_model.diagnose import begun, diagnose
@@ -36,7 +36,7 @@ from ahrsd.diagnosis.one_model.effect_components import LAG
 from ahrsd.diagnosis.one_model.evidence import evaluated
 from ahrsd.diagnosis.one_model.model_search import beside
 from ahrsd.diagnosis.one_model.search_space import space_at
-from ahrsd.diagnosis.pauses import without_jumps
+from ahrsd.diagnosis.prepared import prepared
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import RecordingError
 from ahrsd.offline.diagnose import load_track
@@ -56,9 +56,8 @@ def untouched(words: list[str]) -> Iterator[tuple[str, Path]]:
 
 def measured(path: Path) -> dict[str, Any]:
     """What a recording leaves: `profiles` of the remainder, `effects` that nobody put there."""
-    track, _ = load_track(path)
-    track, _ = without_jumps(roles.prepared(track)[0])
-    problem, fit = begun(put_right(track, hygiene(track)), Spec(), {})
+    track = prepared(load_track(path)[0]).put_right()
+    problem, fit = begun(track, Spec(), {})
     found = rich.richest(problem, fit.filtered, EFFECTS)
     return {"profiles": profiles(found), "effects": sizes(found)}
 
@@ -91,7 +90,7 @@ def sizes(found: rich.Judged) -> dict[str, list[float]]:
     scan = beside(all_sets.made, base.keys, base.at)
     out = {}
     for name, keys in {**space.effects, **{key: [key] for key in space.courses}}.items():
-        if name == LAG:
+        if keys == [LAG]:
             continue
         worth = scan.worth(keys)
         key = max(worth, key=lambda one: worth[one])
@@ -163,22 +162,34 @@ def table(path: Path) -> None:
     for key, size in laws_of(known).items():
         print(f'    "{key}": Size({size.median:.2e}, {size.spread:.2f}, {size.most:g}),')
     for name, most in ordinary_effects(known).items():
-        print(f'    "{name}": {most:.2g},')
+        print(f"    {name}: ordinary = {most:.2g}")
+
+
+def library_of(ordinary: dict[str, float]) -> dict[str, Effect]:
+    """The library with these ordinary sizes."""
+    rows = {name: copy.copy(row) for name, row in EFFECTS.items()}
+    for name, row in rows.items():
+        row.ordinary = ordinary.get(name, 0.0)
+    return rows
 
 
 def judge(path: Path, words: list[str]) -> None:
     known = json.loads(path.read_text())
-    laws, effects = priors.ORDINARY, priors.ORDINARY_EFFECT
+    laws, courses = priors.ORDINARY, priors.ORDINARY_COURSE
     for name, recording in untouched(words):
         others = [one for key, one in known.items() if key != name]
-        priors.ORDINARY, priors.ORDINARY_EFFECT = laws_of(others), ordinary_effects(others)
+        ordinary = ordinary_effects(others)
+        priors.ORDINARY = laws_of(others)
+        priors.ORDINARY_COURSE = {
+            key.removeprefix("free "): size for key, size in ordinary.items() if key not in EFFECTS
+        }
         begin = time.process_time()
-        said = diagnose(load_track(recording)[0])
+        said = diagnose(load_track(recording)[0], library=library_of(ordinary))
         names = [f"{one.effect} ({one.evidence_nats:.0f})" for one in said.findings]
         left = said.unexplained
         where = f"unknown {left.where.frame} {left.size:.3g}" if left.where else "nothing else"
         print(f"{name}: {names}, {where}, {time.process_time() - begin:.1f} s", flush=True)
-        priors.ORDINARY, priors.ORDINARY_EFFECT = laws, effects
+        priors.ORDINARY, priors.ORDINARY_COURSE = laws, courses
 
 
 def main() -> None:

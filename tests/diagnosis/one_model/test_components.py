@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from ahrsd.diagnosis import one_model
+from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.one_model import noise_model, priors
 from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw
@@ -90,3 +95,26 @@ def test_the_level_follows_noise_that_is_louder_for_long():
     residual[2500:] *= 4.0
     weight = noise_model.amplitude(residual, np.ones(4000, dtype=bool), 10.0)
     assert np.median(weight[3000:]) / np.median(weight[:2000]) == pytest.approx(4.0, rel=0.15)
+
+
+def test_identifiers_of_effects_stand_in_the_library_alone():
+    sources = sorted(Path(next(iter(one_model.__path__))).glob("*.py"))
+    texts = {
+        (path.name, node.value)
+        for path in sources
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+    assert len(sources) > 10
+    assert {(name, text) for name, text in texts if text in EFFECTS} == set()
+
+
+def test_what_the_model_must_know_of_an_effect_is_in_its_row():
+    jumps = {name: row.frame or row.family for name, row in EFFECTS.items() if row.jumps}
+    assert jumps == {"hard_iron_step": "sensor", "field_step": "world", "gyro_bias_step": "gyro"}
+    assert {name for name, row in EFFECTS.items() if row.recurs} - set(jumps) == {"soft_iron_step"}
+    delays = {name: row.delay for name, row in EFFECTS.items() if row.delay}
+    late = {"mag_time_lag": 1.0, "mag_low_pass": 1.0, "gyro_integration": 1.0}
+    assert delays == {**late, "gyro_time_lag": -1.0}
+    assert EFFECTS["field_anomaly"].ordinary == pytest.approx(0.97)
+    assert [name for name, row in EFFECTS.items() if row.ordinary_part] == ["flexible_mount"]

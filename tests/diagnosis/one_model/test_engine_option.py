@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tracks import experiment
 
+from ahrsd.diagnosis.model_file import from_text
 from ahrsd.recording.table import write_table
 
 
@@ -38,6 +39,50 @@ def test_the_step_is_named_in_the_same_form(run, recording, tmp_path, capsys):
     np.testing.assert_allclose(found, [0.0, 9e-3, -4e-3], atol=8e-4)
     assert any("experimental" in note for note in body["notes"])
     assert "hard_iron_step" in capsys.readouterr().out
+
+
+def keys_of(body, prefix=""):
+    """Paths of an answer's keys; of a list, those of its first entry."""
+    if isinstance(body, dict):
+        for key, value in body.items():
+            yield f"{prefix}.{key}"
+            yield from keys_of(value, f"{prefix}.{key}")
+    elif isinstance(body, list) and body:
+        yield from keys_of(body[0], f"{prefix}[]")
+
+
+def test_nothing_that_the_rules_tell_is_missing(run, recording, tmp_path, capsys):
+    bodies, words = {}, {}
+    for engine in ("rules", "one-model"):
+        folder = tmp_path / engine
+        assert run("diagnose", str(recording), "--engine", engine, "--report", str(folder)) == 0
+        bodies[engine] = json.loads((folder / "diagnosis.json").read_text())
+        words[engine] = capsys.readouterr().out
+        page = (folder / "report.html").read_text()
+        words[engine, "pictures"] = page.count("<figure") + page.count("<svg")
+        assert (folder / "diagnosis.rrd").stat().st_size > 100_000
+        model = from_text((folder / "model.json").read_text())
+        (term,) = model.terms
+        assert term.identifier == "hard_iron_step"
+        assert model.noise.mag_gauss == pytest.approx(1e-3, rel=0.1)
+    missing = set(keys_of(bodies["rules"])) - set(keys_of(bodies["one-model"]))
+    assert {one for one in missing if ".alternatives" not in one} == set()
+    assert words["one-model", "pictures"] == words["rules", "pictures"] > 4
+    for line in ("held out", "or else", "without it", "checks:", "innovations:"):
+        assert line in words["one-model"] or line not in words["rules"]
+    (one,) = bodies["one-model"]["findings"]
+    assert one["term"] == 0
+    assert one["heldout"]["nll_gain_per_sample"] > 10 * max(one["heldout"]["placebo_gain"], 0.001)
+    assert one["priors"]["stays"]
+    assert one["priors"]["log_odds"] == pytest.approx(one["evidence_nats"])
+
+
+def test_what_the_simulation_has_as_well_is_no_difference(run, recording, capsys):
+    words = ["diagnose", str(recording), "--simulation", str(recording), "--engine", "one-model"]
+    assert run(*words) == 0
+    told = capsys.readouterr().out
+    assert "hard_iron_step is in the simulation already, to the same size" in told
+    assert "recording and model agree" in told
 
 
 def test_the_option_is_hidden_and_a_wrong_one_is_refused(run, recording, capsys):

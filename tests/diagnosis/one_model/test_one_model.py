@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from mismatch_trials import Trial, made
+from test_resting import standing, warming
 from tracks import experiment, track_of
 
+from ahrsd.diagnosis.forward import context_along, contribution
+from ahrsd.diagnosis.logged import with_columns_as_logged
+from ahrsd.diagnosis.model_file import from_text, of_diagnosis, to_text
 from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.track import NothingToFit
 
 
 @pytest.mark.parametrize("scenario", ["wam", "mam"])
@@ -17,6 +24,11 @@ def test_a_null_has_no_name_and_no_unknown(scenario):
     assert found.findings == ()
     assert not found.unexplained.detected
     assert not found.mismatch
+    # how far from another answer: no name's odds reach what is asked whatever was assumed
+    (near,) = (note for note in found.notes if note.startswith("nearest to a name is "))
+    assert max(float(odds) for odds in re.findall(r"[+-]\d+\.\d", near)) < 3.0
+    assert {limit.effect for limit in found.sensitivity} >= {"hard_iron_step", "sync_pulses"}
+    assert all(check.inside_after for check in found.posterior_predictive.values())
 
 
 def test_a_step_of_the_hard_iron_is_dated_and_sized():
@@ -85,3 +97,73 @@ def test_pulses_that_averaging_loses_are_named_at_the_recorded_rate():
     (one,) = found.findings
     assert one.setting["period_s"] == pytest.approx(2.0, abs=0.01)
     np.testing.assert_allclose([p.value for p in one.parameters], pulse, atol=6e-4)
+
+
+def test_the_bias_of_a_gyro_that_stands_is_told_without_the_field():
+    warmth = warming()
+    slope = np.array([5e-5, -2e-5, -1.5e-4])
+    found = diagnose(standing(1e-3 + (warmth - 12.0)[:, None] * slope, warmth))
+    told = [one for one in found.findings if one.effect == "gyro_bias_temperature"]
+    assert len(told) == 1
+    np.testing.assert_allclose([p.value for p in told[0].parameters], slope, atol=3e-5)
+    assert any("hardly turned" in note for note in found.notes)
+
+
+def test_a_dead_sensor_is_refused_in_words():
+    track = track_of(experiment("wam", seed=3, samples=2000))
+    with pytest.raises(NothingToFit, match="stuck or was not logged"):
+        diagnose(replace(track, gyro_b_rad_s=np.zeros_like(track.gyro_b_rad_s)))
+
+
+def test_a_recording_with_facts_that_stop_is_told_them_and_nothing_else():
+    track = track_of(experiment("wam", seed=3, samples=2000))
+    swapped = track.gyro_b_rad_s[:, [1, 0, 2]] * np.array([1.0, 1.0, 1.0])
+    found = diagnose(replace(track, gyro_b_rad_s=swapped))
+    assert [one.effect for one in found.findings] == ["frame_error"]
+    assert found.model is None
+    assert found.mismatch
+
+
+def test_half_a_step_of_delay_is_told_with_what_would_tell_it_from_a_lag():
+    size = {"samples": 2000, "rate_hz": 12.5}
+    made_one = made(Trial(seed=31, effects=(("gyro_integration", 1.0),), **size))
+    (one,) = diagnose(made_one.track).findings
+    assert one.effect == "gyro_integration"
+    assert one.parameters[0].value == pytest.approx(1.0, abs=0.05)
+    assert one.where.frame == "gyro"
+    assert [share.effect for share in one.alternatives] == ["mag_time_lag"]
+    assert one.confidence + one.alternatives[0].confidence == pytest.approx(1.0, abs=1e-6)
+    assert "two rates" in one.separate_from
+
+
+def test_a_column_with_a_hole_names_its_cause():
+    name = "motor_current_field"
+    one = made(Trial(seed=32, effects=((name, 1.0),), samples=2500, rate_hz=12.5))
+    amps = one.track.covariates["motor_current_a"]
+    t = one.track.time_s - one.track.time_s[0]
+    holed = np.where((t > 60.0) & (t < 90.0), np.nan, amps)
+    track = one.track.with_columns({**one.track.covariates, "motor_current_a": holed})
+    found = with_columns_as_logged(track, None, diagnose)
+    assert [each.effect for each in found.findings] == [name]
+    assert found.notes[0].startswith("column motor_current_a has no values in ")
+    _, value, _ = one.truth[0]
+    np.testing.assert_allclose([p.value for p in found.findings[0].parameters], value, rtol=0.1)
+
+
+@pytest.mark.parametrize(("name", "strength"), [("mag_low_pass", 3.0), ("gyro_time_lag", 2.0)])
+def test_a_delay_of_any_kind_is_in_the_repaired_model_as_it_was(name, strength):
+    one = made(Trial(seed=34, effects=((name, strength),), samples=2500, rate_hz=12.5))
+    found = diagnose(one.track)
+    (term,) = found.terms
+    assert term.identifier == name
+    _, value, _ = one.truth[0]
+    np.testing.assert_allclose(term.value, value, rtol=0.06)
+    kept = from_text(to_text(of_diagnosis(found)))
+    clean = context_along(one.track, kept.calibration)
+    mag, gyro = contribution(clean, kept.terms)
+    # as large as the field turns in that time
+    if name == "mag_low_pass":
+        late = np.linalg.norm(clean.field_dot_b, axis=1) * float(value[0])
+        assert np.median(np.linalg.norm(mag, axis=1)) == pytest.approx(np.median(late), rel=0.2)
+    else:
+        assert np.max(np.abs(gyro)) > 1e-3

@@ -1,0 +1,154 @@
+"""The size of what a recording leaves, part by part, beside what such recordings ordinarily leave.
+
+A part of the ordinary remainder adds to the readings what its likeliest coefficients make of its
+columns; the deviation of that over the recording, less what another calibration would take of it,
+is its size.  What 95 % of untouched recordings stay below is told in the same motion: as many times
+its size as the limit of its coefficients is theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.diagnosis.added_field import (
+    calibration_of,
+    deviation,
+    heading_off_deg,
+    less_calibration,
+)
+from ahrsd.diagnosis.diagnosis import Component, Ordinary, Unexplained
+from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.component import Fixed
+from ahrsd.diagnosis.one_model.decision import Answer, added_by, coefficients, size_of
+from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, beside
+from ahrsd.diagnosis.ordinary import SIMULATED
+from ahrsd.samples import Array
+
+_WORDS = {
+    "world_course": "a field that differs from time to time and place to place",
+    "gyro_course": "a course in time of the gyro",
+    "by_direction": "a field by attitude",
+    "by_change": "axes that are late by different times",
+    "field_by_rate": "a field by the rates",
+    "by_rate_squared": "an error of the gyro by the squares of its rates",
+    "gyro_matrix": "a crooked gyro with scales of its own",
+    "by_force": "an error of the gyro by force",
+    "bending": "a mount that gives",
+}
+#: of 95 % of a normal size
+_WITHIN = 1.96
+
+
+def told_sizes(
+    all_sets: Hypotheses, answer: Answer, left: Unexplained, nats: float, *, simulated: bool
+) -> Unexplained:
+    """What is left, with its sizes where the recording leaves what real ones do.
+
+    nats: by which it is likelier that it does;  simulated: then none of it is ordinary
+    """
+    best = answer.best
+    if not all_sets.is_real(best.names):
+        return left
+    if left.detected:
+        known = dict.fromkeys(_words(all_sets, key) for key in answer.unknown)
+        why = f"beyond what such recordings ordinarily leave: {', '.join(known)}"
+        sizes = left_sizes(all_sets, best, why, answer.unknown)
+        return replace(left, ordinary=sizes)
+    if simulated and nats > priors.UNKNOWN_ODDS:
+        sizes = left_sizes(all_sets, best, SIMULATED, ())
+        return replace(left, detected=True, ordinary=sizes, evidence_nats=nats)
+    return replace(left, ordinary=left_sizes(all_sets, best, None, ()), evidence_nats=nats)
+
+
+def left_sizes(
+    all_sets: Hypotheses, best: Hypothesis, why: str | None, keys: Sequence[str]
+) -> Ordinary:
+    """Everything that is left beside the names.
+
+    why: it is not ordinary, None where it is;  keys: of a course that is left besides
+    """
+    context = all_sets.made.context
+    take, nats = calibration_of(context), _nats(all_sets, best)
+    whole = {unit: np.zeros((len(context.track), 3)) for unit in ("gauss", "rad/s")}
+    parts = []
+    for key in (*all_sets.remainder, *(key for key in keys if key not in all_sets.remainder)):
+        added, unit = added_by(all_sets, best, key)
+        added = less_calibration(added, take) if unit == "gauss" else added
+        whole[unit] += added
+        size, frame = deviation(added), all_sets.component(key).frame
+        heading_deg = heading_off_deg(added, context) if unit == "gauss" else None
+        up_to = size * _to_limit(all_sets, best, key)
+        there = nats[key] > priors.ODDS_REAL
+        row = Component(
+            key, _words(all_sets, key), frame, size, up_to, unit, heading_deg, nats[key], there
+        )
+        parts.append(row)
+    fields = [one for one in parts if one.unit == "gauss"]
+    sizes = sorted(one.size for one in fields)
+    headings = [(one.heading_deg or 0.0) * one.up_to / max(one.size, 1e-300) for one in fields]
+    return Ordinary(
+        within=why is None,
+        why=why,
+        field_gauss=deviation(whole["gauss"]),
+        field_up_to_gauss=_together([one.up_to for one in fields]),
+        heading_deg=heading_off_deg(whole["gauss"], context),
+        heading_up_to_deg=_together(headings),
+        gyro_rad_s=deviation(whole["rad/s"]),
+        gyro_up_to_rad_s=_together([one.up_to for one in parts if one.unit != "gauss"]),
+        beside_gauss=float(np.linalg.norm(sizes[:-1])),
+        beside_from_gauss=0.0,
+        recordings=priors.RECORDINGS,
+        components=tuple(parts),
+    )
+
+
+def _words(all_sets: Hypotheses, key: str) -> str:
+    """What a part is, in words."""
+    if all_sets.component(key).row is not None:
+        return f"one of the steps of a source that changes ({key.split(maxsplit=1)[0]})"
+    return _WORDS.get(key, f"a course in time, free ({all_sets.component(key).frame})")
+
+
+def _together(limits: Sequence[float]) -> float:
+    """What parts that know nothing of each other are ordinarily at most together."""
+    return float(np.linalg.norm(limits))
+
+
+def _to_limit(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
+    """How many times as large a part is ordinarily at most; 0 of what is not ordinary."""
+    law = all_sets.component(key).law
+    if isinstance(law, Fixed):
+        value, _ = coefficients(all_sets, best, key)
+        return _WITHIN / max(float(np.sqrt(np.mean(value**2 / law.variance))), 1e-12)
+    if key not in priors.ORDINARY:
+        return 0.0
+    return priors.ORDINARY[key].up_to() / max(size_of(all_sets, best, key), 1e-12)
+
+
+def _nats(all_sets: Hypotheses, best: Hypothesis) -> dict[str, float]:
+    """By how much likelier the recording is with each member, sizes and noise as they are.
+
+    Of a Gaussian: the prior's density where the coefficients are nothing, to the posterior's.
+    """
+    scan = beside(all_sets.made, best.keys, best.at)
+    inverse = np.linalg.inv(scan.root)
+    covariance = inverse.T @ inverse
+    psi, out, begin = all_sets.psi_of(best), {}, 0
+    for key in best.keys:
+        one = all_sets.component(key)
+        mine = slice(begin, begin + one.width)
+        begin = mine.stop
+        mean, phi = best.at.mean[mine], one.law.log_variance(psi[key])
+        out[key] = _to_nothing(mean, covariance[mine, mine], phi)
+    return out
+
+
+def _to_nothing(mean: Array, covariance: Array, log_variance: Array) -> float:
+    scale = np.exp(-0.5 * log_variance)
+    shrunk = covariance * scale * scale[:, None]
+    _, log_det = np.linalg.slogdet(shrunk)
+    z = mean * scale
+    return 0.5 * float(z @ np.linalg.solve(shrunk, z) + log_det)

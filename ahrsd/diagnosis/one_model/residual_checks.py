@@ -1,0 +1,140 @@
+"""What of the residual is still unlike the model: whiteness, by time, attitude, rate and column.
+
+In the noise that the answer leaves, its residual is V^-1 y, y of variance V = 1 + X Phi X^T.
+Copies are drawn of that law with the residual's own tails and fitted as the recording was; each
+statistic, chosen before anything is looked at, has the band of its copies (`predictive`).  A bin of
+a regime (heading, tilt, rate, a column) is asked for a field of its own, Z: its score Z^T V^-1 y
+has the variance Z^T V^-1 Z, so half of the square has three halves of a nat where nothing is left.
+
+Before is the calibration alone in the same noise: what was left out would else pass for noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import special
+
+from ahrsd.diagnosis.descent import NullFit
+from ahrsd.diagnosis.diagnosis import Check, RegimeMap, Whiteness
+from ahrsd.diagnosis.noise import tails_of
+from ahrsd.diagnosis.omnibus import omnibus
+from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.linearised import CALIBRATION
+from ahrsd.diagnosis.one_model.white_rows import Fit, WhiteRows
+from ahrsd.diagnosis.predictive import COPIES, bands, scene_of, statistics
+from ahrsd.diagnosis.regime import regime_columns, regimes
+from ahrsd.samples import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """The rows of an answer, and what is left of them (3 N,) by the calibration and by all."""
+
+    rows: WhiteRows
+    calibration: Fit
+    whole: Fit
+    before: Array
+    after: Array
+
+    @property
+    def whitened(self) -> Array:
+        """(rows of the track, 3) what is left by all of it, nothing where there is no reading."""
+        return self.rows.in_track(self.after.reshape(-1, 3))
+
+
+def residuals_of(rows: WhiteRows) -> Residuals:
+    """What is left of an answer's rows."""
+    y = rows.y.reshape(-1, 1)
+    few, whole = rows.fit(rows.made.seen[CALIBRATION].component.width), rows.fit()
+    return Residuals(rows, few, whole, few.left(y)[:, 0], whole.left(y)[:, 0])
+
+
+def checks(found: Residuals, maps: Sequence[RegimeMap]) -> dict[str, Check]:
+    """Each statistic of the residual beside its copies, and each regime's bin that stands out most.
+
+    Deterministic.
+    """
+    before, value, expected = _compared(found)
+    out = {
+        name: Check(value[name], band, _inside(before[name], band), _inside(value[name], band))
+        for name, band in expected.items()
+    }
+    for one in maps:
+        each = priors.BINS_OUTSIDE / (len(maps) * len(one.after))
+        limit = float(special.chdtri(3.0, each)) / 2.0
+        was, now = max(one.before), max(one.after)
+        out[f"by_{one.quantity}"] = Check(now, (0.0, limit), was <= limit, now <= limit)
+    return out
+
+
+def _compared(
+    found: Residuals,
+) -> tuple[dict[str, float], dict[str, float], dict[str, tuple[float, float]]]:
+    """Statistics before and after, and the bands of copies."""
+    rows = found.rows
+    scene, shape = scene_of(rows.made.context), (-1, 3)
+
+    def stated(left: Array) -> dict[str, float]:
+        return statistics(rows.in_track(left.reshape(shape)), scene)
+
+    rng = np.random.default_rng(0)
+    e = _drawn(rng, found, (len(found.after), COPIES))
+    w = rng.standard_normal((rows.X.shape[2], COPIES)) * found.whole.deviation[:, None]
+    copies = found.whole.left(e + found.whole.X @ w)
+    return stated(found.before), stated(found.after), bands([stated(one) for one in copies.T])
+
+
+def _drawn(rng: np.random.Generator, found: Residuals, shape: tuple[int, int]) -> Array:
+    """White noise of unit variance, its tails those of what is left."""
+    filtered = found.rows.made.point.filtered
+    freedom = tails_of(replace(filtered, whitened=found.whitened)).freedom
+    e = rng.standard_normal(shape)
+    if np.isfinite(freedom):
+        e *= np.sqrt((freedom - 2.0) / rng.chisquare(freedom, shape))
+    return e
+
+
+def _inside(value: float, band: tuple[float, float]) -> bool:
+    return band[0] <= value <= band[1]
+
+
+def regime_maps(found: Residuals) -> tuple[RegimeMap, ...]:
+    """How much is left under which conditions, the strongest first."""
+    asked = regimes(found.rows.made.context)
+    if not asked:
+        return ()
+    Z = found.rows.passed([regime_columns(one) for one in asked])
+    Z = Z.reshape(-1, Z.shape[2])
+    before = _nats(Z, found.calibration, found.before)
+    after = _nats(Z, found.whole, found.after)
+    maps, begin = [], 0
+    for one in asked:
+        mine = slice(begin, begin + len(one.edges) - 1)
+        begin = mine.stop
+        edges = tuple(float(edge) for edge in one.edges)
+        maps.append(RegimeMap(one.quantity, edges, tuple(before[mine]), tuple(after[mine])))
+    return tuple(sorted(maps, key=lambda one: -max(one.before)))
+
+
+def _nats(Z: Array, fit: Fit, left: Array) -> list[float]:
+    """What each three columns in turn gain."""
+    score, information = Z.T @ left, fit.information(Z)
+    out = []
+    for at in range(0, len(score), 3):
+        s, G = score[at : at + 3], information[at : at + 3, at : at + 3]
+        out.append(0.5 * float(s @ np.linalg.lstsq(G, s, rcond=1e-9)[0]))
+    return out
+
+
+def whiteness(start: NullFit, found: Residuals) -> dict[str, Whiteness]:
+    """Tests that need no idea of what may be wrong, of the null and of what the answer leaves."""
+    context = found.rows.made.context
+    left = replace(found.rows.made.point.filtered, whitened=found.whitened)
+    later = {test.name: test.p_value for test in omnibus(left, context)}
+    return {
+        test.name: Whiteness(test.words, test.p_value, later.get(test.name, 1.0))
+        for test in omnibus(start.filtered, start.context())
+    }

@@ -1,0 +1,130 @@
+"""An answer with all that is said beside its names, in the contract's form.
+
+held-out gains and moved copies, priors halved and doubled, checks of the residual, sizes of what is
+left, the smallest effects that would have shown, the repaired model with its noise, pictures
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.diagnosis import locate
+from ahrsd.diagnosis.descent import NullFit
+from ahrsd.diagnosis.diagnosis import Diagnosis, Suspect, Unexplained
+from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.facts import Fact, of_fact, rounding
+from ahrsd.diagnosis.hygiene import would_have_shown
+from ahrsd.diagnosis.limits import LIMITS
+from ahrsd.diagnosis.noise import level_facts
+from ahrsd.diagnosis.null import baseline
+from ahrsd.diagnosis.one_model import pictures, priors, residual_checks, support, visibility
+from ahrsd.diagnosis.one_model.held_out import HeldOut
+from ahrsd.diagnosis.one_model.left_sizes import told_sizes
+from ahrsd.diagnosis.one_model.recorded_rate import Quick
+from ahrsd.diagnosis.one_model.repaired_noise import repaired_noise
+from ahrsd.diagnosis.one_model.search_rounds import Searched
+from ahrsd.diagnosis.prepared import Prepared
+from ahrsd.diagnosis.resting import HARDLY_TURNED, at_rest, resting
+
+NOTE = "by the engine one-model, which is experimental"
+
+
+def whole_answer(
+    asked: Prepared,
+    start: NullFit,
+    found: Searched,
+    fast: Quick,
+    library: Mapping[str, Effect],
+    *,
+    spec_given: bool,
+    simulated: bool,
+) -> Diagnosis:
+    """Everything that was found.
+
+    start: the calibration alone;  spec_given: whether somebody said how loud the sensor is
+    simulated: known to be no real recording
+    """
+    answer, all_sets = found.answer, found.all_sets
+    held, quickly = HeldOut(all_sets, answer.best), HeldOut(fast.all_sets, fast.answer.best)
+    slow = support.supported(answer, held, 0)
+    told = (*slow, *support.supported(fast.answer, quickly, len(slow)))
+    courses = pictures.courses(all_sets, answer.best)
+    left = _with_channels(support.what_is_left(answer, held), found, courses)
+    remainder_nats = support.nats_of_remainder(all_sets, answer)
+    left = told_sizes(all_sets, answer, left, remainder_nats, simulated=simulated)
+    loud = _loud(found, fast, spec_given=spec_given)
+    still = resting(start.context(), library, LIMITS) if at_rest(start) else ()
+    named = (*asked.told(library), *told, *(of_fact(fact, library) for fact in loud), *still)
+    something = bool(named) or left.detected
+    residuals = residual_checks.residuals_of(held.rows(answer.best.names))
+    maps = residual_checks.regime_maps(residuals)
+    alone = visibility.seen_alone(all_sets, found.space, held.less(answer.keys))
+    contributions = [
+        *pictures.contributions(all_sets, answer),
+        *pictures.contributions(fast.all_sets, fast.answer),
+    ]
+    surest = max(answer.log_odds, fast.answer.log_odds, remainder_nats, 0.0)
+    counted = len(named) > len(told)
+    said = support.doubts(told) if something else support.nearest(answer, all_sets)
+    return Diagnosis(
+        recording="",
+        baseline=baseline(start),
+        mismatch=something,
+        p_value=0.0 if counted else float(np.exp(-surest)),
+        findings=named,
+        unexplained=left,
+        posterior_predictive=residual_checks.checks(residuals, maps),
+        sensitivity=() if something else visibility.limits([*alone, *_seen_quickly(fast)]),
+        notes=_notes(asked, found, said, still=at_rest(start), something=something),
+        model=fast.left.filtered.model,
+        noise=repaired_noise(found, fast, library, asked.facts, _spans(loud)),
+        terms=(*answer.terms, *fast.answer.terms, *rounding(asked.facts)),
+        drawn=pictures.drawn(start, found, residuals.whitened, contributions, courses, alone),
+        omnibus=residual_checks.whiteness(start, residuals),
+        validation=support.validation((answer, held), (fast.answer, quickly), told, left),
+        regime_map=maps,
+    )
+
+
+def _seen_quickly(fast: Quick) -> list[visibility.Seen]:
+    return visibility.seen_alone(fast.all_sets, fast.space, fast.answer.best.names)
+
+
+def _loud(found: Searched, fast: Quick, *, spec_given: bool) -> list[Fact]:
+    """What is to be said of the noise's level: beside a real remainder it comes and goes."""
+    if found.all_sets.is_real(found.answer.best.names):
+        return []
+    return level_facts(fast.left.filtered, spec_given=spec_given)
+
+
+def _spans(facts: Sequence[Fact]) -> list[tuple[float, float]]:
+    return [span for fact in facts for span in fact.where.intervals_s]
+
+
+def _notes(
+    asked: Prepared, found: Searched, said: tuple[str, ...], *, still: bool, something: bool
+) -> tuple[str, ...]:
+    problem = found.all_sets.made.point.problem
+    seen = () if something else would_have_shown(problem.recorded)
+    how = (NOTE, *asked.notes, *problem.notes, *((HARDLY_TURNED,) if still else ()))
+    return (*how, *said, *asked.lesser, *seen)
+
+
+def _with_channels(
+    left: Unexplained, found: Searched, courses: Sequence[locate.Located]
+) -> Unexplained:
+    """What is left, with the logged columns that move with it."""
+    if left.where is None or not left.course:
+        return left
+    frame, track = left.where.frame, found.all_sets.made.context.track
+    like = [one for course in courses if course.frame == frame
+            for one in locate.matches(track, course)]  # fmt: skip
+    follows = tuple(
+        Suspect(one.channel, one.correlation, one.p_value)
+        for one in like
+        if one.p_value < priors.CHANCE and abs(one.correlation) > priors.ALIKE
+    )
+    return replace(left, follows=follows)
