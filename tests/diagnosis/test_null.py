@@ -65,7 +65,7 @@ def test_a_gyro_louder_than_the_magnetometer_still_leads_to_the_iron(scenario: s
 
 @pytest.mark.parametrize("noise", [(1e-4, 2e-3), (1e-4, 0.05), (1e-3, 5e-3)])
 def test_what_hardly_tilts_is_known_as_well_as_it_says(noise: tuple[float, float]) -> None:
-    """With gains held its deviations were a fifteenth of its errors, and it stopped where it was
+    """With gains held its deviations were a twelfth of what they are, and it stopped where it was
     set down."""
     squares = []
     for seed in (0, 1, 2):
