@@ -8,6 +8,9 @@ takes it along, and the gains and the frame of the whitening with it.  With the 
 stand out of that frame: the iron looks much better known than it is (five times and more where the
 sensor hardly tilts), and the descent goes, and stops, beside the lowest point.  So the derivatives
 by the iron are of what the filter whitens with the gains of its own, as differences.
+
+Where the gyro turns up next to nothing the gains stay within a step: there the squares alone, with
+gains of their own, would favour whatever makes the innovations' covariance large.
 """
 
 from __future__ import annotations
@@ -28,12 +31,15 @@ from ahrsd.diagnosis.innovation import (
     sensitivities,
 )
 from ahrsd.diagnosis.prior import PRIOR, Prior
+from ahrsd.diagnosis.thin import turned_up
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Columns, Context, NullModel
 from ahrsd.samples import Array
 
 _DONE = 0.05  # largest step in standard deviations
 _NEAR = 3.0  # largest step in standard deviations behind which the gains move as before it
+#: field that the gyro's noise of a step turns up over the magnetometer's, from which gains move
+_TURNED_UP = 0.1
 _BESIDE = 1e-3  # standard deviations by which the iron is moved to see how
 _STALE = 1.0  # nats that a point costs more with columns of its own context, to go on from there
 _HALVINGS = 3
@@ -141,10 +147,11 @@ def descended(problem: FitProblem, model: NullModel, steps: int) -> NullFit:
     count = 0
     own: _Point | None = None
     lever: Array | None = None
+    loud = turned_up(problem.track, model) > _TURNED_UP
     covariance: Array = np.zeros((11 + len(values), 11 + len(values)))
     while count < steps and not converged:
         count += 1
-        if lever is None:
+        if loud and lever is None:
             lever = _of_gains(point.filtered, point.terms_mag, point.terms_gyro)
         gradient, data, prior = _normal(problem, point, lever)
         covariance = np.asarray(np.linalg.inv(data + np.diag(prior)), dtype=np.float64)
@@ -152,7 +159,7 @@ def descended(problem: FitProblem, model: NullModel, steps: int) -> NullFit:
             break
         step = covariance @ gradient
         largest = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
-        new = _taken(problem, point, step, cost)
+        new = _taken(problem, point, step, cost, near=largest < _NEAR, loud=loud)
         afresh = _with_own_columns(problem, point, cost, own) if new is None else None
         if afresh is not None:
             point = own = afresh
@@ -195,8 +202,12 @@ def _at(
     model: NullModel,
     values: Array,
     last: _Point | None,
+    held: Filtered | None = None,
 ) -> _Point:
-    """Filter at these parameters; the terms' columns are those of the context before."""
+    """Filter at these parameters; the terms' columns are those of the context before.
+
+    held: whose gains to take, the model being next to the same
+    """
     mag: Array | None = None
     gyro: Array | None = None
     columns: tuple[Columns, ...] = ()
@@ -205,7 +216,7 @@ def _at(
         context = build_context(problem.track, basis)
         columns = tuple(term.columns(context) for term in problem.terms)
         mag, gyro = _contributions(problem, columns, values)
-    filtered = run_filter(problem.track, model, mag, gyro)
+    filtered = run_filter(problem.track, model, mag, gyro, held=held)
     return _Point(model, values, filtered, mag, gyro, columns)
 
 
@@ -240,13 +251,14 @@ def _contributions(
     return mag, gyro
 
 
-def _normal(problem: FitProblem, point: _Point, lever: Array) -> tuple[Array, Array, Array]:
+def _normal(problem: FitProblem, point: _Point, lever: Array | None) -> tuple[Array, Array, Array]:
     """Gradient (11 + p,) downhill, information of the data (11 + p, 11 + p), of the prior.
 
-    lever: of `_of_gains`, here or near
+    lever: of `_of_gains`, here or near; None where the gains stay
     """
     X = sensitivities(point.filtered, nuisance_columns(point.filtered))
-    X[:, :, :_IRON] += lever
+    if lever is not None:
+        X[:, :, :_IRON] += lever
     parts = [X, *(sensitivities(point.filtered, mine) for mine in point.columns)]
     flat = np.concatenate(parts, axis=2).reshape(-1, 11 + len(point.values))
     prior = problem.weight
@@ -267,17 +279,23 @@ def _cost(problem: FitProblem, point: _Point) -> float:
     return 0.5 * (float(np.sum(point.filtered.whitened**2)) + prior)
 
 
-def _taken(problem: FitProblem, point: _Point, step: Array, cost: float) -> _Point | None:
-    """The longest of step, step / 4 and step / 16 that lowers the cost; None where none does."""
+def _taken(
+    problem: FitProblem, point: _Point, step: Array, cost: float, *, near: bool, loud: bool
+) -> _Point | None:
+    """The longest of step, step / 4 and step / 16 that lowers the cost; None where none does.
+
+    near: the step is so short that the gains stay as they are, but where the gyro is `loud`
+    """
+    gains = point.filtered if near and not loud else None
     for halving in range(_HALVINGS):
         part = step / 4**halving
         if not np.isfinite(part).all():
             continue
         try:
-            model = moved(point.model, part)
+            model = (moved_along if loud else moved)(point.model, part)
             if np.linalg.eigvalsh(model.soft_iron)[0] < _SMALLEST_EIGENVALUE:
                 continue
-            new = _at(problem, model, point.values + part[11:], point)
+            new = _at(problem, model, point.values + part[11:], point, gains)
         except np.linalg.LinAlgError:  # a step too far
             continue
         if _cost(problem, new) <= cost * (1 + 1e-9):
@@ -296,23 +314,33 @@ def _of_gains(
     known = np.maximum(np.sum(X**2, axis=(0, 1)), PRIOR[:_IRON] ** -2.0)
     out = np.empty_like(X)
     for k, size in enumerate(_BESIDE / np.sqrt(known)):
-        model = moved(filtered.model, size * np.eye(11)[k])
+        model = moved_along(filtered.model, size * np.eye(11)[k])
         beside = run_filter(filtered.track, model, terms_mag, terms_gyro, sensitive=False)
         out[:, :, k] = (filtered.whitened - beside.whitened) / size
     return out - X
 
 
 def moved(model: NullModel, step: Array) -> NullModel:
-    """A model with its 11 numbers of the calibration changed by step (11,) or more.
+    """A model with its 11 numbers of the calibration changed by step (11,) or more."""
+    return replace(
+        model,
+        soft_iron=model.soft_iron + np.einsum("a,aij->ij", step[:5], TRACELESS),
+        hard_iron_gauss=model.hard_iron_gauss + step[5:8],
+        gyro_bias_rad_s=model.gyro_bias_rad_s + step[8:11],
+    )
 
-    To first order.  Iron moves on a straight line of its quadric (I + q.T, u) = (A^-2, A^-2 b) of
-    trace 3: there the size of the field, |m|^2 + q.(m^T T m) - 2 m.u, is linear, and a long step
-    stays in the valley of calibrations under which it is the same all along.
-    LinAlgError where the line leaves the ellipsoids.
+
+def moved_along(model: NullModel, step: Array) -> NullModel:
+    """The same to first order, on a straight line of the iron's quadric.
+
+    (I + q.T, u) = (A^-2, A^-2 b) of trace 3: there the size of the field, |m|^2 + q.(m^T T m) -
+    2 m.u, is linear, and a long step stays in the valley of calibrations under which it is the same
+    all along.  Where that line leaves the ellipsoids, iron moves straight itself.
     """
     C = np.linalg.inv(model.soft_iron)
     quadric = C @ C
-    bent = -C @ np.einsum("a,aij->ij", step[:5], TRACELESS) @ quadric
+    more = np.einsum("a,aij->ij", step[:5], TRACELESS)
+    bent = -C @ more @ quadric
     bent = bent + bent.T
     scale = 3.0 / np.trace(quadric)
     change = scale * (bent - quadric * np.trace(bent) / np.trace(quadric))
@@ -320,11 +348,11 @@ def moved(model: NullModel, step: Array) -> NullModel:
     centre = quadric @ (model.hard_iron_gauss + step[5:8]) + change @ model.hard_iron_gauss
     values, vectors = np.linalg.eigh(quadric + change)
     if values[0] <= 0.0:
-        raise np.linalg.LinAlgError("the step leaves the ellipsoids")
-    soft_iron = (vectors / np.sqrt(values)) @ vectors.T
+        return moved(model, step)
+    root = (vectors / np.sqrt(values)) @ vectors.T
     return replace(
         model,
-        soft_iron=soft_iron * 3.0 / np.trace(soft_iron),
+        soft_iron=root * 3.0 / np.trace(root),
         hard_iron_gauss=np.linalg.solve(quadric + change, centre),
         gyro_bias_rad_s=model.gyro_bias_rad_s + step[8:11],
     )

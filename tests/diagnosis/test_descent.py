@@ -31,6 +31,6 @@ def _another_fit_gains() -> float:
 def test_a_fit_does_not_stop_at_columns_that_its_own_step_made_stale(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert -20.0 < _another_fit_gains() < 10.0
+    assert _another_fit_gains() < 10.0
     monkeypatch.setattr(descent, "_STALE", float("inf"))
-    assert _another_fit_gains() < -20.0  # it had promised that much more than its own columns hold
+    assert _another_fit_gains() > 30.0
