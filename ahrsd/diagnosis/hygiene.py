@@ -19,7 +19,7 @@ from ahrsd.diagnosis.diagnosis import Value, Where
 from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.facts import Fact
 from ahrsd.diagnosis.frames import Frame, ranked, window_rows, windows
-from ahrsd.diagnosis.handedness import advice, odd_magnetometer, turns_gravity
+from ahrsd.diagnosis.handedness import Askew, advice, askew, odd_magnetometer, turns_gravity
 from ahrsd.diagnosis.repeats import repeats
 from ahrsd.diagnosis.stamps import regular, stamps
 from ahrsd.diagnosis.track import Track
@@ -77,6 +77,9 @@ def _gyro(track: Track) -> list[Fact]:
     found = windows(track)
     if found is None:
         return []
+    turned = askew(track, _worse)
+    if turned is not None:
+        return [_turned(track, turned)]
     order = ranked(found)
     same = next((one for one in order if one.is_identity), None)
     if not order:
@@ -132,6 +135,21 @@ def _frame_error(track: Track, best: Frame, equal: int) -> Fact:
         (Value("present", 1.0, 0.0, "1"),),
         # the true rate is signs * reading[axes]
         {"axes": list(best.axes), "signs": list(best.signs)},
+        stops=True,
+    )
+
+
+def _turned(track: Track, turned: Askew) -> Fact:
+    names = (f"angle_{axis}" for axis in "xyz")
+    return Fact(
+        "mag_gyro_misalignment",
+        turned.words,
+        Where(_whole(track), ("x", "y", "z"), "sensor" if turned.of_magnetometer else "gyro"),
+        _SURE,
+        tuple(
+            Value(name, float(value), 0.0, "rad")
+            for name, value in zip(names, turned.rotation_rad, strict=True)
+        ),
         stops=True,
     )
 

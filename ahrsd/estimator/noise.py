@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ahrsd.estimator import chain
 from ahrsd.estimator.parameters import EstimatorParameters
@@ -188,12 +189,18 @@ class DirectionCells:
     @staticmethod
     def of(directions: Array, each: Array | float) -> DirectionCells:
         """Of unit vectors (n, 3), each standing for that many steps."""
-        band = np.minimum((directions[:, 2] + 1) / 2 * _BANDS, _BANDS - 1).astype(int)
-        angle = np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) % 1.0
-        sector = np.minimum(angle * _SECTORS, _SECTORS - 1).astype(int)
         weights = np.broadcast_to(each, len(directions))
-        count = np.bincount(band * _SECTORS + sector, weights, minlength=_BANDS * _SECTORS)
+        cells = DirectionCells.numbers(directions)
+        count = np.bincount(cells, weights, minlength=_BANDS * _SECTORS)
         return DirectionCells(count.astype(np.float64))
+
+    @staticmethod
+    def numbers(directions: Array) -> NDArray[np.intp]:
+        """(n,) cells of unit vectors (n, 3)."""
+        band = np.minimum((directions[:, 2] + 1) / 2 * _BANDS, _BANDS - 1).astype(np.intp)
+        angle = np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) % 1.0
+        sector = np.minimum(angle * _SECTORS, _SECTORS - 1).astype(np.intp)
+        return np.asarray(band * _SECTORS + sector)
 
     def __add__(self, other: DirectionCells) -> DirectionCells:
         return DirectionCells(self._count + other._count)
@@ -278,3 +285,133 @@ def _root(covariance: Array) -> Array:
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray(scale[:, None] * (vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
+
+
+# -- What is left over: of the attitude, or of the time --------------------------------------------
+#
+# Noise of the magnetometer that is slow, a field that differs with place or attitude, and iron that
+# changes all leave residuals that last. The size of the field tells some of them apart without the
+# gyro. What repeats with the attitude is the same whenever the sensor points there again; noise is
+# another one by then. Noise forgets sooner than a motion passes through directions, and goes on
+# while the sensor is at rest, where no place is passed by.
+
+_FORGOTTEN = float(np.exp(-1.0))  # of the correlation of what is slow
+_APART, _APART_S = 4.0, 2.0  # times that, and seconds, after which a visit is another one
+_FEWEST_VISITS = 12  # further ones of the same directions, all together
+_REPEATS, _NEW = 0.6, 0.3  # correlation of visits above, below which they are alike, are not
+_SLOW_SHARE = 0.2  # of the residuals' variance, that is slow: less is no matter
+_RESTED = 10.0  # times that it takes to forget, that a sensor must have been at rest to tell
+_GOES_ON, _STOPS = 0.5, 0.1  # of its variance, at rest
+
+
+@dataclass(frozen=True, slots=True)
+class SlowResidual:
+    """What the size of the field has beyond calibration and white noise.
+
+    size_gauss:  deviation of its slow part;  forgets_s: after which it is another one
+    repeats:     correlation of visits of the same directions, None where there are too few
+    goes_on:     whether it is there at rest too, None where nobody can tell
+    """
+
+    size_gauss: float
+    forgets_s: float
+    repeats: float | None
+    goes_on: bool | None
+
+    @property
+    def words(self) -> str:
+        """What it is, and what shrinks what it does; empty: it is not told from other causes."""
+        if self.repeats is None or self.repeats > _NEW or self.goes_on is False:
+            return ""
+        slow = (
+            f"what is left over is slow ({1e3 * self.size_gauss:.1f} mG, another after "
+            f"{self.forgets_s:.2g} s) and not the same when an attitude comes back"
+        )
+        if self.goes_on:
+            return (
+                f"the magnetometer's noise is not white: {slow}, and at rest it goes on: record "
+                "for longer, another place changes nothing"
+            )
+        return (
+            f"{slow}: noise of the magnetometer that is not white, which a longer recording "
+            "averages, or places that were passed by; which of the two, a minute at rest tells: "
+            "there noise goes on"
+        )
+
+
+def slow_residual(c: Array, epochs: Sequence[tuple[chain.EpochData, bool]]) -> SlowResidual | None:
+    """Of a calibration c (9,) = [M, b] and epochs, with motion or not; None where nothing is slow,
+    or it lasts for as long as an epoch does."""
+    M = chain.symmetric(c[:6])
+    size = float(np.cbrt(np.linalg.det(M)))
+    parts = []
+    for data, turned in epochs:
+        h = np.linalg.solve(M, (data.field_b_gauss - c[6:9]).T).T
+        length = np.linalg.norm(h, axis=1)
+        parts.append((data, turned, size * (length - 1.0), h / length[:, None]))
+    moving = [part for part in parts if part[1]]
+    if not moving:
+        return None
+    step_s = float(np.median(np.concatenate([part[0].dt_s[1:] for part in moving])))
+    slow, lag = _forgotten([part[2] for part in moving])
+    total = float(np.mean(np.concatenate([part[2] for part in moving]) ** 2))
+    if lag is None or slow < _SLOW_SHARE * total:
+        return None
+    forgets_s = lag * step_s
+    rests = [part[2] for part in parts if not part[1]]
+    rested_s = sum(float(np.sum(part[0].dt_s[1:])) for part in parts if not part[1])
+    goes_on = None
+    if rested_s > _RESTED * forgets_s:
+        share = _slow_variance(rests) / slow
+        goes_on = True if share > _GOES_ON else False if share < _STOPS else None
+    repeats = _visits(moving, max(_APART * forgets_s, _APART_S))
+    return SlowResidual(float(np.sqrt(slow)), forgets_s, repeats, goes_on)
+
+
+def _forgotten(residuals_gauss: Sequence[Array]) -> tuple[float, int | None]:
+    """Variance of what is slow, and rows after which it is another one, None: not within a half."""
+    longest = max(len(part) for part in residuals_gauss) // 2
+    slow = _covariance(residuals_gauss, 1)
+    for lag in range(2, longest):
+        if _covariance(residuals_gauss, lag) < _FORGOTTEN * slow:
+            return slow, lag
+    return slow, None
+
+
+def _covariance(parts: Sequence[Array], lag: int) -> float:
+    long = [part for part in parts if len(part) > 2 * lag]
+    products = [float(part[lag:] @ part[:-lag]) for part in long]
+    return sum(products) / max(sum(len(part) - lag for part in long), 1)
+
+
+def _slow_variance(parts: Sequence[Array]) -> float:
+    """At rest, where a constant is nobody's noise."""
+    return _covariance([part - part.mean() for part in parts if len(part) > 2], 1)
+
+
+def _visits(
+    parts: Sequence[tuple[chain.EpochData, bool, Array, Array]], apart_s: float
+) -> float | None:
+    """Correlation of what is left over in the same directions, at times that far apart."""
+    time_s = np.concatenate([data.time_s for data, *_ in parts])
+    left = np.concatenate([part[2] for part in parts])
+    cell = DirectionCells.numbers(np.concatenate([part[3] for part in parts]))
+    edges = np.flatnonzero(np.diff(cell) != 0) + 1
+    begins = np.r_[0, edges]
+    count = np.diff(np.r_[begins, len(cell)])
+    mean = np.add.reduceat(left, begins) / count
+    when, where = time_s[begins], cell[begins]
+    product = square = 0.0
+    further = 0
+    for one in np.unique(where):
+        own = np.flatnonzero(where == one)
+        kept = [own[0]]
+        for k in own[1:]:
+            if when[k] - when[kept[-1]] > apart_s:
+                kept.append(k)
+        values = mean[kept]
+        if len(values) > 1:
+            further += len(values) - 1
+            product += float((values.sum() ** 2 - values @ values) / (len(values) - 1))
+            square += float(values @ values)
+    return product / square if further >= _FEWEST_VISITS and square > 0.0 else None

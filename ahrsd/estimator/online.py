@@ -11,7 +11,7 @@ it better known, observability.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 
@@ -160,13 +160,17 @@ class HeadingAdvice:
     noise_gauss: float
 
     def widened_by(
-        self, parts: Mapping[str, Array], covariance: Array, turned_deg: float = 0.0
+        self,
+        parts: Mapping[str, Array],
+        covariance: Array,
+        turned_deg: float = 0.0,
+        slow: Callable[[], noise.SlowResidual | None] = lambda: None,
     ) -> str:
         """What makes more than half of the heading's variance, in words; empty: it is known well.
 
         covariance (12, 12): the answer's; parts: covariances (12, 12) by "motion" and the names of
         `_WIDENED`, which add up to it but for what they have in common; turned_deg: what axes that
-        were found to be turned make of the heading
+        were found to be turned make of the heading; slow: what the model leaves over that lasts
         """
         if not np.hypot(self._sigma_deg(covariance), turned_deg) > _TELLS_DEG:
             return ""
@@ -177,6 +181,8 @@ class HeadingAdvice:
             return ""
         if most == "motion":
             return _MOTION.format(self.manoeuvre(covariance))
+        if most == "misfit" and (left := slow()) is not None and left.words:
+            return left.words
         return _WIDENED[most]
 
     def manoeuvre(self, covariance: Array) -> str:
@@ -728,6 +734,6 @@ class Estimator:
             mag_lag_s=window.taken.lag_s,
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,
-            widened_by=advice.widened_by(parts, covariance, turned),
+            widened_by=advice.widened_by(parts, covariance, turned, window.slow_residual),
             place_gauss=place_gauss,
         )

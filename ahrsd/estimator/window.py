@@ -579,6 +579,10 @@ class Window:
         loud = self.usual.gyro_rad_s > _LOUD_GYRO * self._guess.gyro_rad_s
         return loud or self.unexplained > 1.0
 
+    def slow_residual(self) -> noise.SlowResidual | None:
+        """What is left over that lasts, by the epochs that are still here."""
+        return noise.slow_residual(self.graph.c, [(e.data, e.turned) for e in self.epochs])
+
     def covariance(self) -> Array:
         """Of c and the newest gyro bias (12, 12), with all that the model leaves over in it.
 

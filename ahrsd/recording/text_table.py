@@ -50,6 +50,8 @@ _THOUSANDS = tuple(
     )
     for mark, point in ((",", "."), (".", ","), ("'", "."), ("\u2019", "."), ("\u00a0", ","))
 )
+#: minus signs of typesetting in front of a number: U+2212, the en dash, the full-width one
+_MINUS = re.compile(rb"(?:\xe2\x88\x92|\xe2\x80\x93|\xef\xbc\x8d)(?=[\d.,])")
 _WRONG_SHARE, _WRONG_FEW = 0.01, 3  # rows with another number of cells that are left out
 _OF_TABLES = (b"time_s", b"mag_x_gauss", b"TimeStartup,")  # names in the first line
 _PREAMBLE_BYTES = 16384  # in front of the names
@@ -375,6 +377,7 @@ def _parsed(path: Path, text: _Text, notes: list[str]) -> pyarrow.Table:
 
     if not bytes(memoryview(text.data)[text.at :]).strip():
         return pyarrow.Table.from_arrays([pyarrow.nulls(0) for _ in names], names=names)
+    _plain_minus(text, notes)
     decimal = _decimal_of(text, notes)
     try:
         table = pyarrow.csv.read_csv(
@@ -419,6 +422,14 @@ def _as_wide_as_rows(text: _Text) -> list[str]:
     while names and not names[-1] and 0 < cells < len(names):
         names.pop()
     return names
+
+
+def _plain_minus(text: _Text, notes: list[str]) -> None:
+    """Numbers with the minus that a typesetter or a spreadsheet put there have a plain one."""
+    if _MINUS.search(text.data, text.at):
+        text.data = bytearray(_MINUS.sub(b"-", bytes(text.data[text.at :])))
+        text.at = 0
+        notes.append("the numbers have minus signs of typesetting: read as such")
 
 
 def _decimal_of(text: _Text, notes: list[str]) -> str:

@@ -146,6 +146,50 @@ def test_a_turned_gyro_is_told_by_the_accelerometer() -> None:
     assert fact.where.frame == "gyro"
 
 
+@pytest.mark.parametrize(
+    ("turn_deg", "about"),
+    [
+        ((0.0, 0.0, 45.0), "45.0 deg about its z"),
+        ((-20.0, 0.0, 0.0), "20.0 deg about its x"),
+        ((0.0, 140.0, 0.0), "140.0 deg about its y"),
+        ((30.0, -30.0, 30.0), "52.0 deg ("),
+    ],
+)
+def test_a_magnetometer_that_is_askew_is_told_with_its_angle(
+    turn_deg: tuple[float, float, float], about: str
+) -> None:
+    """R_mg from the gyro's axes to the magnetometer's; the advice puts its readings right."""
+    whole = track_of(experiment("mam", samples=6000, seed=3))
+    R_mg = so3.exp(np.radians([turn_deg]))[0]
+    turned = replace(whole, mag_b_gauss=whole.mag_b_gauss @ R_mg.T)
+    fact = _only(hygiene(turned))
+    assert fact.effect == "mag_gyro_misalignment"
+    assert fact.stops
+    found = np.degrees([value.value for value in fact.parameters])
+    assert np.abs(found - turn_deg).max() < 0.6
+    by = f"{np.linalg.norm(found):.1f} deg"
+    assert fact.words.startswith(f"the magnetometer is turned against the gyro by {by}")
+    assert about.partition(" deg")[2] in fact.words
+    assert "times its readings" in fact.words
+    assert ("out of the ground" in fact.words) == (
+        np.mean(np.sum(turned.mag_b_gauss @ R_mg * -whole.accel_b_m_s2, axis=1)) < 0
+    )
+
+
+def test_without_gravity_either_sensor_may_be_askew() -> None:
+    whole = track_of(experiment("mam", samples=6000, seed=3))
+    R_mg = so3.exp(np.radians([[0.0, 0.0, 45.0]]))[0]
+    turned = replace(whole, mag_b_gauss=whole.mag_b_gauss @ R_mg.T, accel_b_m_s2=None)
+    assert "or the gyro is the one that is turned" in _only(hygiene(turned)).words
+
+
+def test_a_crooked_mount_of_five_degrees_is_no_wrong_frame() -> None:
+    """The search names it with its deviation, and what is fitted beside it means something."""
+    whole = track_of(experiment("mam", samples=6000, seed=3))
+    R_mg = so3.exp(np.radians([[0.0, 5.0, 0.0]]))[0]
+    assert as_recorded(replace(whole, mag_b_gauss=whole.mag_b_gauss @ R_mg.T)) == []
+
+
 def test_iron_that_deforms_favours_no_other_frame() -> None:
     """A slow turn of half a period; the frames' fit leaves out iron that deforms by a fifth."""
     made = experiment("wam", motion="slow", seed=0, samples=10_000, rate_hz=100.0, sigma_gyro=5e-3)

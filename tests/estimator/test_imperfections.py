@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pieces
 import pytest
+from scipy.signal import lfilter
 
 from ahrsd import so3
 from ahrsd.diagnosis.ordinary import TABLE
@@ -186,7 +187,33 @@ def test_what_no_motion_has_told_is_not_blamed_on_the_field():
         names[name] = found.widened_by
     assert "the motion so far tells too little: roll by 30 deg" in names["level"]
     assert "the motion so far tells too little: " in names["straight"]
-    assert "the field differs with place or attitude" in names["rolling"]
+    assert "or places that were passed by" in names["rolling"]
+
+
+def slowly_noisy(made, size_gauss, forgets_s, *, at_rest):
+    """With noise of the magnetometer that forgets, one of its own on each axis."""
+    time_s = made.block.time_s
+    keep = np.exp(-np.median(np.diff(time_s)) / forgets_s)
+    drawn = np.random.default_rng(2).normal(0.0, size_gauss, (len(time_s), 3))
+    slow = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], drawn, axis=0)
+    moves = np.linalg.norm(made.rate_b_rad_s, axis=1) > 1e-3
+    slow = slow if at_rest else slow * moves[:, None]
+    return replace(made, block=replace(made.block, raw_b_gauss=made.block.raw_b_gauss + slow))
+
+
+PAUSED = (("circles", 60.0), ("roll", 40.0), ("rest", 60.0), ("pitch", 40.0), ("roll", 60.0))
+
+
+def test_noise_that_is_not_white_is_no_place():
+    """It goes on at rest, where no place is passed by; what stops there may be one."""
+    noisy = answer(slowly_noisy(pieces.drive(PAUSED, 1), 0.006, 1.0, at_rest=True))
+    assert noisy.heading_sigma_deg > 0.5
+    assert "the magnetometer's noise is not white" in noisy.widened_by
+    assert "another place changes nothing" in noisy.widened_by
+    placed = answer(slowly_noisy(pieces.drive(PAUSED, 1), 0.006, 1.0, at_rest=False))
+    assert "the field differs with place or attitude" in placed.widened_by
+    moving = answer(slowly_noisy(pieces.drive(RICH, 1), 0.006, 1.0, at_rest=True))
+    assert "a minute at rest tells" in moving.widened_by
 
 
 def test_shares_of_motion_and_misfit_by_hand():
