@@ -27,6 +27,8 @@ DELAYS = (LAG, "gyro_time_lag", "gyro_integration", "mag_low_pass")
 _ALIKE = 1e-3
 #: parts in which the transition of a step is free
 PIECES = 20
+#: s between the times at which a logged cause is tried
+LATE_STEP_S = priors.LOGGED_LATE_S[-1] - priors.LOGGED_LATE_S[-2]
 #: parts of a recording's length, and factors, to which onsets and scales are sought
 _FINE = (1 / 40, 1 / 120, 1 / 400, 1 / 1200)
 
@@ -38,10 +40,35 @@ def library_components(
     out = {}
     for name, effect in library.items():
         settings = () if name in DELAYS or effect.quick else effect.settings(context)
+        settings = tuple(late for one in settings for late in in_time(context, effect, one))
         found = [component(context, effect, one, len(settings)) for one in settings]
         if found:
             out[name] = found
     return out
+
+
+def in_time(context: Context, effect: Effect, setting: Setting) -> tuple[Setting, ...]:
+    """The setting with its logged cause as it came, and earlier and later where that matters.
+
+    A current that is averaged in the logger, or stamped when it is written, is some tenths of a
+    second off, and held against the field as it is logged it explains nothing.
+    """
+    if "covariate" not in setting:
+        return (setting,)
+    logged = _flat(effect.columns(context, setting))
+    most = _flat(effect.columns(context, {**setting, "late_s": max(priors.LOGGED_LATE_S)}))
+    if float(np.sum((most - logged) ** 2)) < _ALIKE * float(np.sum(logged**2)):
+        return (setting,)
+    return (setting, *({**setting, "late_s": late_s} for late_s in priors.LOGGED_LATE_S))
+
+
+def _flat(columns: Columns) -> Array:
+    """(N, 3 p) columns about their means: a constant is the calibration's."""
+    side = columns.gyro if columns.mag is None else columns.mag
+    if side is None:
+        raise ValueError("an effect without columns has no setting")
+    flat = side.reshape(len(side), -1)
+    return np.asarray(flat - flat.mean(axis=0))
 
 
 def causes(context: Context, library: Mapping[str, Effect]) -> list[Component]:
@@ -138,6 +165,9 @@ def neighbours(setting: Setting, duration_s: float, round_: int) -> list[Setting
         steps = (-2, -1, 1, 2)
         moved = [onset + k * share * duration_s / 2 for k in steps]
         out += [{**setting, "onset_s": t} for t in moved if t > 0.0]
+    if "late_s" in setting:
+        late_s, step_s = float(setting["late_s"]), LATE_STEP_S / 2 ** (1 + round_)
+        out += [{**setting, "late_s": round(late_s + way * step_s, 4)} for way in (-1, 1)]
     for name in ("length_s", "time_constant_s", "radius_gauss"):
         if name in setting:
             factor = 1.5 ** (1.0 / (1 + round_))

@@ -87,6 +87,9 @@ DRIFT_CORNER = 3.0
 EFFECT_SIZES = (1e-2, 10.0)
 #: the same where candidates are only ranked
 EFFECT_GRID = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
+#: s by which a logged cause may come late into the log, or early;  source: averages of loggers; the
+#: motor's current of a flight came 0.32 s late
+LOGGED_LATE_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
 #: relative size of what an effect leaves of its form, its second order
 FORM = 0.03
 
