@@ -101,8 +101,8 @@ NOISE_STEP_CLEAN, NOISE_STEP_REAL, NOISE_STEP_FREE, NOISE_TOP = 0.25, 0.6, 1.5, 
 LOUD = 2.0
 #: log powers between which a band stays
 NOISE_RANGE = (-9.0, 9.0)
-#: deviations from which a reading that is off alone counts no more
-WILD = 4.0
+#: degrees of freedom of readings beyond their level, beside normal ones;  source: 3 on a flight
+FREEDOMS = (3.0, 5.0, 8.0, 15.0)
 #: seconds over which the noise's level is taken;  powers between which it stays, of the median's
 LEVEL_S, LEVELS = 10.0, (0.02, 50.0)
 #: octaves of the noise's spectrum, at most

@@ -89,8 +89,8 @@ def _at_recorded_rate(slow: Point) -> Point:
     mag, gyro = drawn(slow.terms_mag), drawn(slow.terms_gyro)
     filtered = run_filter(track, model_at_rate(slow.filtered.model, problem), mag, gyro)
     fast = replace(problem, track=track, thin=1, averaged=1.0)
-    level = noise_model.amplitude(filtered.whitened, filtered.used, fast.rate_hz)
-    return Point(fast, filtered, {}, mag, gyro, level)
+    loud = noise_model.loudness(filtered.whitened, filtered.used, fast.rate_hz)
+    return Point(fast, filtered, {}, mag, gyro, loud)
 
 
 def _without(fast: Problem, slow: Problem, made: Linearised, best: Hypothesis) -> Problem:
