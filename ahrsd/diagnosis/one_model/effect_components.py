@@ -15,6 +15,7 @@ from ahrsd.diagnosis.locate import Frame, unit_columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
 from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.samples import Array
 
 #: the delay that stands for all delays: which of them it is, is asked at the end
 LAG = "mag_time_lag"
@@ -53,7 +54,7 @@ def in_time(context: Context, effect: Effect, setting: Setting) -> tuple[Setting
     A current that is averaged in the logger, or stamped when it is written, is some tenths of a
     second off, and held against the field as it is logged it explains nothing.
     """
-    if "covariate" not in setting:
+    if setting.get("covariate") not in context.track.covariates:
         return (setting,)
     logged = _flat(effect.columns(context, setting))
     most = _flat(effect.columns(context, {**setting, "late_s": max(priors.LOGGED_LATE_S)}))
@@ -175,24 +176,44 @@ def neighbours(setting: Setting, duration_s: float, round_: int) -> list[Setting
     return out
 
 
-def form_of(known: Component, context: Context) -> Component | None:
+def form_of(known: Component, context: Context, library: Mapping[str, Effect]) -> Component | None:
     """What an effect leaves of its form; None where nothing is known of that.
 
-    A step takes its time: within some seconds of its onset the source may be at any size.
+    A step takes its time: within some seconds of its onset the source may be at any size.  A cause
+    that changes quickly is logged late, or as a mean of some time: its change in time.
     """
-    frame = STEPS.get(known.effect or "")
-    if frame is None:
+    law = known.law
+    if not isinstance(law, Sized):
         return None
+    frame = STEPS.get(known.effect or "")
+    if frame is not None:
+        return _way_of(known, law, context, cast("Frame", frame))
+    effect = library.get(known.effect or "")
+    if effect is None or len(in_time(context, effect, known.setting)) == 1:
+        return None
+    late_s, step_s = float(known.setting.get("late_s", 0.0)), LATE_STEP_S / 2
+    before, behind = (
+        effect.columns(context, {**known.setting, "late_s": late_s + way * step_s})
+        for way in (-1, 1)
+    )
+    columns = Columns(_change(before.mag, behind.mag), _change(before.gyro, behind.gyro))
+    blurred = Sized(law.scale * (priors.LOGGED_BLUR_S / LATE_STEP_S), law.low, law.high)
+    return Component(f"form of {known.key}", known.frame, columns, blurred)
+
+
+def _change(before: Array | None, behind: Array | None) -> Array | None:
+    return None if before is None or behind is None else behind - before
+
+
+def _way_of(known: Component, law: Sized, context: Context, frame: Frame) -> Component:
+    """Of a step: pieces of time round its onset, each along each axis of its frame."""
     onset_s, width_s = float(known.setting["onset_s"]), 2 * priors.APPROACH_S / PIECES
     edges = onset_s - priors.APPROACH_S + width_s * np.arange(PIECES + 1)
     piece = np.searchsorted(edges, context.track.time_s, side="right") - 1
     inside = (piece[:, None] == np.arange(PIECES)).astype(float)
-    axes = unit_columns(context, cast("Frame", frame))
+    axes = unit_columns(context, frame)
     flat = np.einsum("nk,nia->nika", inside, axes).reshape(len(piece), 3, -1)
     columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
-    law = known.law
-    if not isinstance(law, Sized):
-        return None
     sized = Sized(np.full(columns.width, float(law.scale[0])), law.low, law.high)
     setting = {"onset_s": onset_s}
     return Component(f"form of {known.key}", frame, columns, sized, setting=setting)

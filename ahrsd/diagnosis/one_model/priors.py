@@ -57,8 +57,9 @@ STILL_RAD_S, STILL_PART, MOSTLY = 0.05, 0.2, 0.8
 SMOOTHED_S, STILL_S, MOST_SPELLS = 0.5, 3.0, 4
 
 # --- what may be there besides ------------------------------------------------------------------
-#: deviations of a reading by which the way of a step's source is off a step for it to be unread
-MOVED = 10.0
+#: deviations of a reading by which the way of a step's source is off a step for it to be unread,
+#: and those to which it then is
+MOVED, MOVED_LEAST = 10.0, 2.0
 #: probability of any one effect of the library;  source: the brief of the engine, 1 in 60
 EFFECT = 1.0 / 60.0
 #: of effects that recordings ordinarily have: a delay of the magnetometer's pipeline
@@ -90,6 +91,8 @@ EFFECT_GRID = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
 #: s by which a logged cause may come late into the log, or early;  source: averages of loggers; the
 #: motor's current of a flight came 0.32 s late
 LOGGED_LATE_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
+#: s over which a logger ordinarily takes its mean: a battery's monitor filters over a tenth
+LOGGED_BLUR_S = 0.05
 #: relative size of what an effect leaves of its form, its second order
 FORM = 0.03
 

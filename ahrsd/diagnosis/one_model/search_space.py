@@ -63,7 +63,7 @@ def space_at(
         listed = effects.setdefault(one.effect or one.key, [])
         if one.key not in listed:
             listed.append(one.key)
-        form = form_of(one, context)
+        form = form_of(one, context, library)
         if form is not None:
             made.add([form])
             forms[one.key] = form.key
@@ -85,5 +85,5 @@ def space_at(
         asked = [name for name in STEPS if name in library]
         return [component(context, library[name], setting, _ONSETS) for name in asked]
 
-    space = Space(effects, COURSES, finer, lambda one: form_of(one, context), steps_at)
+    space = Space(effects, COURSES, finer, lambda one: form_of(one, context, library), steps_at)
     return all_sets, space
