@@ -107,7 +107,7 @@ NOISE_RANGE = (-9.0, 9.0)
 #: degrees of freedom of readings beyond their level, beside normal ones;  source: 3 on a flight
 FREEDOMS = (3.0, 5.0, 8.0, 15.0)
 #: seconds over which the noise's level is taken;  powers between which it stays, of the median's
-LEVEL_S, LEVELS = 10.0, (0.02, 50.0)
+LEVEL_S, LEVELS = 4.0, (0.02, 50.0)
 #: octaves of the noise's spectrum, at most
 BANDS = 7
 

@@ -78,7 +78,7 @@ def test_a_wild_reading_counts_less_and_rows_that_are_normal_count_alike():
     residual = rng.normal(size=(2000, 3))
     used = np.ones(2000, dtype=bool)
     calm = noise_model.loudness(residual, used, 10.0)
-    assert np.ptp(np.log(calm.amplitude)) < 0.6  # the level alone
+    assert np.ptp(np.log(calm.amplitude)) < 0.9  # the level alone, a median of forty
     residual[500:2000:50] = 30.0
     weight = noise_model.loudness(residual, used, 10.0).amplitude
     assert np.all(weight[500:2000:50] > 5.0)
