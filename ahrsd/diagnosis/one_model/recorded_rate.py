@@ -32,7 +32,6 @@ from ahrsd.diagnosis.problem import Problem, model_at_rate
 from ahrsd.diagnosis.thin import thinned
 from ahrsd.samples import Array
 
-
 #: how often rows are weighed anew beside what was found
 LEVELLED = 2
 
