@@ -70,10 +70,14 @@ def window_rows(track: Track) -> int:
     return max(4, round(_WINDOW_S / track.step_s))
 
 
-def windows(track: Track) -> Windows | None:
-    """Normal equations of the windows that turn most; None where there is too little."""
+def windows(track: Track, part: slice | None = None) -> Windows | None:
+    """Normal equations of the windows that turn most; None where there is too little.
+
+    part: rows of the track, None: all
+    """
     length = window_rows(track)
-    blocks = list(_blocks(track, length))
+    whole = part or slice(0, len(track))
+    blocks = [one for one in _blocks(track, length) if whole.start <= one.start < whole.stop]
     if len(blocks) < 12:
         return None
     turn = np.array([np.sum(np.abs(track.gyro_b_rad_s[rows]), axis=0).max() for rows in blocks])

@@ -7,6 +7,7 @@ track as it would be without what was found.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -32,6 +33,7 @@ _FAST_RAD_S, _NEAR = 3.0, 1.1  # rates that no vehicle has for long; a factor th
 _SURE = 0.99  # of a finding that was counted and compared
 _SAME_UNIT = 1.2  # factor from a unit's own within which the gyro's scale is that unit
 _NOISE_SHARE = 0.05  # of the rates' variance, for a factor that is no unit's to be believed
+_PARTS, _CLEARLY = 4, 0.1  # of a recording; cost below which a part of it is explained
 _UNIT = 2.0  # factor of the gyro's scale beyond which it is another unit
 #: median readings in gauss of the Earth's field (0.2 to 0.7 G) taken in other units
 MAG_UNITS = (
@@ -189,7 +191,7 @@ def _gyro_unit(track: Track, best: Frame) -> list[Fact]:
     large = best.scale < 1
     off = f"{1 / best.scale:.3g} times too large" if large else f"{best.scale:.3g} times too small"
     if abs(np.log(best.scale / factor)) > np.log(_SAME_UNIT):
-        if _hidden(track):
+        if _hidden(track) or _right_in_part(track):
             return []
         usual = 1 / factor if large else factor
         words = (
@@ -216,6 +218,19 @@ def _hidden(track: Track) -> bool:
     means = np.nan_to_num(track.gyro_b_rad_s[:whole]).reshape(-1, rows, 3).mean(axis=1)
     noise = 3 * noise_of(track)[1] ** 2 / rows
     return bool(noise > _NOISE_SHARE * np.sum(np.var(means, axis=0)))
+
+
+def _right_in_part(track: Track) -> bool:
+    """Whether the rates have the field's turns at their own unit in some part of the recording.
+
+    A unit holds all along.  While a magnet is put on, the field's changes are none of a turn.
+    """
+    edges = np.linspace(0, len(track), _PARTS + 1).astype(int)
+    found = [windows(track, slice(int(a), int(b))) for a, b in itertools.pairwise(edges)]
+    order = [frame for one in found if one is not None for frame in ranked(one)]
+    return any(
+        one.is_identity and one.cost < _CLEARLY and 1 / _UNIT < one.scale < _UNIT for one in order
+    )
 
 
 def _unit_error(

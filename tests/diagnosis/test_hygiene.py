@@ -601,6 +601,16 @@ def test_rates_that_are_off_by_the_factor_of_no_unit_may_be_the_time(
     assert np.abs(right / track.gyro_b_rad_s - 1).max() < 0.1
 
 
+def test_a_magnet_that_is_put_on_and_off_is_no_unit_of_the_gyro(track: Track) -> None:
+    """While a hand moves it the field changes by more than any turn: rates look too large."""
+    t = track.time_s - track.time_s[0]
+    middle, end = 0.4 * t[-1], 0.7 * t[-1]
+    put = np.clip((t - middle) / 2.0, 0.0, 1.0) - np.clip((t - end) / 2.0, 0.0, 1.0)
+    near = replace(track, mag_b_gauss=track.mag_b_gauss + 3.0 * put[:, None] * [0.6, -0.64, 0.48])
+    assert not 0.5 < ranked(windows(near))[0].scale < 2.0
+    assert [one for one in hygiene(near) if one.effect == "unit_error"] == []
+
+
 def test_a_turn_about_one_axis_tells_that_axes_are_wrong_and_not_which() -> None:
     """A finding all the same: that none of the axes is as recorded is sure."""
     t = np.arange(2400) / 20.0

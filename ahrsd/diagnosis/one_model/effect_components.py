@@ -15,6 +15,7 @@ from ahrsd.diagnosis.locate import Frame, unit_columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
 from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.samples import Array
 
 #: the delay that stands for all delays: which of them it is, is asked at the end
 LAG = "delay"
@@ -23,6 +24,8 @@ LAG_FORM = "form of the delay"
 _ALIKE = 1e-3
 #: parts in which the transition of a step is free
 PIECES = 20
+#: s between the times at which a logged cause is tried
+LATE_STEP_S = priors.LOGGED_LATE_S[-1] - priors.LOGGED_LATE_S[-2]
 #: parts of a recording's length, and factors, to which onsets and scales are sought
 _FINE = (1 / 40, 1 / 120, 1 / 400, 1 / 1200)
 
@@ -34,10 +37,35 @@ def library_components(
     out = {}
     for name, effect in library.items():
         settings = () if effect.delay or effect.quick else effect.settings(context)
+        settings = tuple(late for one in settings for late in in_time(context, effect, one))
         found = [component(context, effect, one, len(settings)) for one in settings]
         if found:
             out[name] = found
     return out
+
+
+def in_time(context: Context, effect: Effect, setting: Setting) -> tuple[Setting, ...]:
+    """The setting with its logged cause as it came, and earlier and later where that matters.
+
+    A current that is averaged in the logger, or stamped when it is written, is some tenths of a
+    second off, and held against the field as it is logged it explains nothing.
+    """
+    if setting.get("covariate") not in context.track.covariates:
+        return (setting,)
+    logged = _flat(effect.columns(context, setting))
+    most = _flat(effect.columns(context, {**setting, "late_s": max(priors.LOGGED_LATE_S)}))
+    if float(np.sum((most - logged) ** 2)) < _ALIKE * float(np.sum(logged**2)):
+        return (setting,)
+    return (setting, *({**setting, "late_s": late_s} for late_s in priors.LOGGED_LATE_S))
+
+
+def _flat(columns: Columns) -> Array:
+    """(N, 3 p) columns about their means: a constant is the calibration's."""
+    side = columns.gyro if columns.mag is None else columns.mag
+    if side is None:
+        raise ValueError("an effect without columns has no setting")
+    flat = side.reshape(len(side), -1)
+    return np.asarray(flat - flat.mean(axis=0))
 
 
 def causes(context: Context, library: Mapping[str, Effect]) -> list[Component]:
@@ -139,6 +167,9 @@ def neighbours(setting: Setting, duration_s: float, round_: int) -> list[Setting
         steps = (-2, -1, 1, 2)
         moved = [onset + k * share * duration_s / 2 for k in steps]
         out += [{**setting, "onset_s": t} for t in moved if t > 0.0]
+    if "late_s" in setting:
+        late_s, step_s = float(setting["late_s"]), LATE_STEP_S / 2 ** (1 + round_)
+        out += [{**setting, "late_s": round(late_s + way * step_s, 4)} for way in (-1, 1)]
     for name in ("length_s", "time_constant_s", "radius_gauss"):
         if name in setting:
             factor = 1.5 ** (1.0 / (1 + round_))
@@ -146,14 +177,36 @@ def neighbours(setting: Setting, duration_s: float, round_: int) -> list[Setting
     return out
 
 
-def form_of(known: Component, context: Context) -> Component | None:
+def form_of(known: Component, context: Context, library: Mapping[str, Effect]) -> Component | None:
     """What an effect leaves of its form; None where nothing is known of that.
 
-    A step takes its time: within some seconds of its onset the source may be at any size.
+    A step takes its time: within some seconds of its onset the source may be at any size.  A cause
+    that changes quickly is logged late, or as a mean of some time: its change in time.
     """
-    if not known.jumps:
+    law = known.law
+    if not isinstance(law, Sized):
         return None
-    frame = cast("Frame", known.frame)
+    if known.jumps:
+        return _way_of(known, law, context, cast("Frame", known.frame))
+    effect = library.get(known.effect or "")
+    if effect is None or len(in_time(context, effect, known.setting)) == 1:
+        return None
+    late_s, step_s = float(known.setting.get("late_s", 0.0)), LATE_STEP_S / 2
+    before, behind = (
+        effect.columns(context, {**known.setting, "late_s": late_s + way * step_s})
+        for way in (-1, 1)
+    )
+    columns = Columns(_change(before.mag, behind.mag), _change(before.gyro, behind.gyro))
+    blurred = Sized(law.scale * (priors.LOGGED_BLUR_S / LATE_STEP_S), law.low, law.high)
+    return Component(f"form of {known.key}", known.frame, columns, blurred)
+
+
+def _change(before: Array | None, behind: Array | None) -> Array | None:
+    return None if before is None or behind is None else behind - before
+
+
+def _way_of(known: Component, law: Sized, context: Context, frame: Frame) -> Component:
+    """Of a step: pieces of time round its onset, each along each axis of its frame."""
     onset_s, width_s = float(known.setting["onset_s"]), 2 * priors.APPROACH_S / PIECES
     edges = onset_s - priors.APPROACH_S + width_s * np.arange(PIECES + 1)
     piece = np.searchsorted(edges, context.track.time_s, side="right") - 1
@@ -161,9 +214,6 @@ def form_of(known: Component, context: Context) -> Component | None:
     axes = unit_columns(context, frame)
     flat = np.einsum("nk,nia->nika", inside, axes).reshape(len(piece), 3, -1)
     columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
-    law = known.law
-    if not isinstance(law, Sized):
-        return None
     sized = Sized(np.full(columns.width, float(law.scale[0])), law.low, law.high)
     setting = {"onset_s": onset_s}
     return Component(f"form of {known.key}", frame, columns, sized, setting=setting)

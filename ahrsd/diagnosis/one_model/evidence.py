@@ -43,6 +43,8 @@ from ahrsd.samples import Array
 _ROUNDED = 1e-10
 #: a maximum is reached where a step would gain less, nats; steps; and the longest, of a logarithm
 _FLAT, _STEPS, _LONGEST = 0.02, 40, 2.0
+#: how many times what a step foretells the rest of a climb may gain
+_HOPED = 5.0
 #: parts of a step that are tried
 _PARTS = (1.0, 0.3, 0.1, 0.02)
 #: curvature of a logarithm that nothing tells of
@@ -199,21 +201,33 @@ def _laws(laws: Sequence[Law], psi: Array) -> _Prior:
     return _Prior(np.concatenate(phi), slopes, nats, gradient, stiffness)
 
 
-def maximised(products: Products, laws: Sequence[Law], starts: Sequence[tuple[Array, Array]]) -> At:
-    """The likeliest hyperparameters found from any of the starts (log noise, psi)."""
-    return max((_climbed(products, laws, *start) for start in starts), key=lambda one: one.nats)
+def maximised(products: Products, laws: Sequence[Law], start: tuple[Array, Array]) -> At:
+    """The likeliest hyperparameters, climbed to from a start (log noise, psi)."""
+    found = reached(products, laws, start, -np.inf)
+    if found is None:
+        raise ValueError("a climb that nothing ends has an end")
+    return found
 
 
-def _climbed(products: Products, laws: Sequence[Law], log_noise: Array, psi: Array) -> At:
-    """Newton's steps with the average information, between the ends of what is allowed."""
+def reached(
+    products: Products, laws: Sequence[Law], start: tuple[Array, Array], asked: float
+) -> At | None:
+    """The same, None as soon as the climb will surely not reach so many nats.
+
+    Newton's steps with the average information, between the ends of what is allowed.
+    """
     count = len(products.rows)
     low, high = noise_model.bounds(count)
     low = np.concatenate([low, *(law.low for law in laws)])
     high = np.concatenate([high, *(law.high for law in laws)])
-    x = np.clip(np.concatenate([log_noise, psi]), low, high)
+    x = np.clip(np.concatenate(start), low, high)
     at = evaluated(products, laws, x[:count], x[count:])
     for _ in range(_STEPS):
         step = _newton(at, x, low, high)
+        gain = 0.5 * float(at.gradient @ step)
+        if at.nats + _HOPED * max(gain, _FLAT) < asked:
+            return None
+        step *= min(1.0, _LONGEST / max(float(np.max(np.abs(step))), 1e-300))
         if 0.5 * float(at.gradient @ step) < _FLAT:
             break
         for part in _PARTS:
@@ -242,4 +256,4 @@ def _newton(at: At, x: Array, low: Array, high: Array) -> Array:
         if not np.any(beyond):
             break
         free &= ~beyond
-    return np.asarray(step * min(1.0, _LONGEST / max(float(np.max(np.abs(step))), 1e-300)))
+    return step

@@ -124,7 +124,7 @@ class HeldOut:
     def _rms_gauss(self, names: Names) -> float:
         """Root mean square of what is not foretold, gauss."""
         found, filtered = self.of(names), self.all_sets.made.point.filtered
-        used, level = filtered.used, self.all_sets.made.point.amplitude[:, None]
+        used, level = filtered.used, self.all_sets.made.point.loud.amplitude[:, None]
         own = float(np.mean(filtered.innovation[used] ** 2))
         per_unit = own / max(float(np.mean((filtered.whitened / level)[used] ** 2)), 1e-300)
         return float(np.sqrt(found.square * per_unit))
@@ -132,7 +132,7 @@ class HeldOut:
     def _moved(self, key: str, without: Names) -> float:
         """Nats of the best of a member's copies at other times, beside the set without it."""
         rows, one = self.rows(without), self.all_sets.component(key)
-        count = len(self.all_sets.made.point.amplitude)
+        count = len(self.all_sets.made.point.loud.amplitude)
         steps = [round(share * count) for share in priors.SHIFTS]
         copies = rows.passed([_rolled(one.columns, step) for step in steps])
         parts = _beside(self.parts(without), rows, copies)

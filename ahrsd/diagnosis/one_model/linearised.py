@@ -53,7 +53,7 @@ class Point:
     """Where everything is linearised.
 
     values: coefficients by component that are taken out of the readings
-    terms_mag, terms_gyro: (N, 3) what they add;  amplitude (N,): of the noise
+    terms_mag, terms_gyro: (N, 3) what they add;  loud: rows of the noise
     exact: components that are taken out of the track itself: the delay
     misread: (N, 3) rad/s of terms_gyro that a name stands for.  Columns are made of rates without
              it, but with all that has none: of rates less their own squares, squares run away
@@ -64,7 +64,7 @@ class Point:
     values: Mapping[str, Array]
     terms_mag: Array | None
     terms_gyro: Array | None
-    amplitude: Array
+    loud: noise_model.Loudness
     exact: tuple[str, ...] = ()
     misread: Array | None = None
 
@@ -110,7 +110,7 @@ class Linearised:
         parts = [one.columns for one in new]
         for batch in batches(parts, _BATCH):
             cube = sensitivities(self.regressing, joined([parts[k] for k in batch]))
-            self.batches.append(by_frequency(cube / self.point.amplitude[:, None, None]))
+            self.batches.append(by_frequency(cube / self.point.loud.amplitude[:, None, None]))
             at = 0
             for k in batch:
                 columns = slice(at, at + new[k].width)
@@ -169,9 +169,9 @@ class Linearised:
     @property
     def log_whitening(self) -> float:
         """By how much the rows are denser than readings, nats: makes points comparable."""
-        done, used = self.point.filtered, self.point.filtered.used
+        done, used, loud = self.point.filtered, self.point.filtered.used, self.point.loud
         own = done.log_likelihood + 0.5 * np.sum(done.whitened**2, axis=1) + 1.5 * np.log(2 * np.pi)
-        return float(np.sum(own[used]) - 3.0 * np.sum(np.log(self.point.amplitude[used])))
+        return float(loud.tails + np.sum(own[used]) - 3.0 * np.sum(np.log(loud.amplitude[used])))
 
     def candidates(
         self, keys: Sequence[str], others: Sequence[str], inverse: Array
@@ -207,8 +207,8 @@ class Linearised:
             begin += width
         for (a, b), level in zip(self._bands(), at.log_noise, strict=True):
             rows[a:b] *= np.exp(-0.5 * level)
-        white = idct(rows.reshape(-1, 3), axis=0, norm="ortho")[: len(self.point.amplitude)]
-        return np.asarray(white * self.point.amplitude[:, None])
+        white = idct(rows.reshape(-1, 3), axis=0, norm="ortho")[: len(self.point.loud.amplitude)]
+        return np.asarray(white * self.point.loud.amplitude[:, None])
 
 
 def by_frequency(cube: Array) -> Array:
@@ -274,7 +274,8 @@ def linearised(point: Point, context: Context) -> Linearised:
     """
     smooth = regressing(point.filtered, context.rate_b_rad_s)
     count = length(len(point.filtered.whitened))
-    white = by_frequency(point.filtered.whitened[:, :, None] / point.amplitude[:, None, None])[:, 0]
+    scaled = point.filtered.whitened / point.loud.amplitude[:, None]
+    white = by_frequency(scaled[:, :, None])[:, 0]
     made = Linearised(point, context, smooth, noise_model.octaves(count), white)
     prior = prior_of(point.problem.track)
     law = Fixed(prior.deviation**2)
@@ -308,7 +309,7 @@ def first_point(problem: Problem, filtered: Filtered, exact: tuple[str, ...]) ->
     own = noise_fit.first_guess(problem.track, problem.spec)
     quiet = _no_louder(replace(filtered.model, sigma_mag_gauss=own.sigma_mag_gauss), filtered.model)
     again = run_filter(problem.track, quiet)
-    return Point(problem, again, {}, None, None, np.ones(len(again.whitened)), exact)
+    return Point(problem, again, {}, None, None, noise_model.even(len(again.whitened)), exact)
 
 
 def moved(
@@ -341,14 +342,14 @@ def moved(
     filtered = run_filter(problem.track, model, mag, gyro, held=point.filtered)
     named = {key: value for key, value in out.items() if known[key].effect is not None}
     _, misread = added(len(made.context.track), known, named)
-    return Point(problem, filtered, values, mag, gyro, point.amplitude, point.exact, misread)
+    return Point(problem, filtered, values, mag, gyro, point.loud, point.exact, misread)
 
 
 def relevelled(made: Linearised, keys: Sequence[str], at: At) -> Point:
     """The same point with the noise's level that a model leaves."""
     left, point = made.left_by(keys, at), made.point
-    level = noise_model.amplitude(left, point.filtered.used, point.problem.rate_hz)
-    return replace(point, amplitude=level)
+    loud = noise_model.loudness(left, point.filtered.used, point.problem.rate_hz)
+    return replace(point, loud=loud)
 
 
 def step_of(made: Linearised, keys: Sequence[str], at: At) -> tuple[Array, Array]:

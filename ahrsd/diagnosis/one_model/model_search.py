@@ -16,7 +16,7 @@ from scipy.linalg import cholesky, solve_triangular
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import LAG
-from ahrsd.diagnosis.one_model.evidence import At, maximised
+from ahrsd.diagnosis.one_model.evidence import At, reached
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, Linearised
 from ahrsd.samples import Array
 
@@ -67,7 +67,16 @@ class Hypotheses:
         return self.made.seen[key].component
 
     def judge(self, names: Iterable[str], near: Hypothesis | None = None) -> Hypothesis:
-        """The set with these members beside the calibration.
+        """The set with these members beside the calibration."""
+        found = self.compared(names, near, -np.inf)
+        if found is None:
+            raise ValueError("a set that is asked for has a score")
+        return found
+
+    def compared(
+        self, names: Iterable[str], near: Hypothesis | None, asked: float
+    ) -> Hypothesis | None:
+        """The same; None where its score will surely not be so large.
 
         near: a set of the same class from whose noise and sizes the climb begins, which is short;
         else it begins where the richest model is; where either is loud, in quiet noise: from loud
@@ -88,11 +97,12 @@ class Hypotheses:
             start = np.concatenate([*psi, np.zeros(0)])
             if np.max(noise) > noise[-1] + priors.LOUD:
                 noise = np.minimum(noise, noise[-1])
-            at = maximised(products, laws, [(noise, start)])
-            score = at.nats + sum(self.component(key).prior for key in members)
-            score += self._again(members)
-            score += self._of_class(members)
-            self.judged[members] = Hypothesis(members, keys, at, score)
+            odds = sum(self.component(key).prior for key in members)
+            odds += self._again(members) + self._of_class(members)
+            at = reached(products, laws, (noise, start), asked - odds)
+            if at is None:
+                return None
+            self.judged[members] = Hypothesis(members, keys, at, at.nats + odds)
         return self.judged[members]
 
     def without(self, members: Names, key: str) -> Names:
@@ -215,8 +225,8 @@ def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> lis
     Sets with the ordinary remainder and without are moved in turn, each kind with a beam of its
     own: where a simulation has two effects, the remainder is likelier than either of them alone.
     """
-    found = [all_sets.judge(one) for one in starts]
-    beams = {real: _best(all_sets, found, real=real) for real in (False, True)}
+    first = [all_sets.judge(one) for one in starts]
+    beams = {real: _best(all_sets, first, real=real) for real in (False, True)}
     done: set[Names] = set()
     for k in range(2 * MOST_MOVES):
         beam = beams[bool(k % 2)]
@@ -225,9 +235,12 @@ def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> lis
             continue
         here = todo[0]
         done.add(here.names)
-        reached = [all_sets.judge(names, here) for names in moves(all_sets, space, here)]
-        kept = [*beams[False], *beams[True], *reached]
-        beams = {real: _best(all_sets, kept, real=real) for real in beams}
+        for names in moves(all_sets, space, here):
+            real = all_sets.is_real(names)
+            asked_for = beams[real][-1].score if len(beams[real]) == BEAM else -np.inf
+            found = all_sets.compared(names, here, asked_for)
+            if found is not None:
+                beams[real] = _best(all_sets, [*beams[real], found], real=real)
     return sorted((*beams[False], *beams[True]), key=lambda one: -one.score)
 
 

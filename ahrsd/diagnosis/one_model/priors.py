@@ -59,8 +59,9 @@ STILL_RAD_S, STILL_PART, MOSTLY = 0.05, 0.2, 0.8
 SMOOTHED_S, STILL_S, MOST_SPELLS = 0.5, 3.0, 4
 
 # --- what may be there besides ------------------------------------------------------------------
-#: deviations of a reading by which the way of a step's source is off a step for it to be unread
-MOVED = 10.0
+#: deviations of a reading by which the way of a step's source is off a step for it to be unread,
+#: and those to which it then is
+MOVED, MOVED_LEAST = 10.0, 2.0
 #: probability of any one effect of the library;  source: the brief of the engine, 1 in 60
 EFFECT = 1.0 / 60.0
 #: of a delay between the sensors, which recordings ordinarily have
@@ -89,6 +90,11 @@ DRIFT_CORNER = 3.0
 EFFECT_SIZES = (1e-2, 10.0)
 #: the same where candidates are only ranked
 EFFECT_GRID = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
+#: s by which a logged cause may come late into the log, or early;  source: averages of loggers; the
+#: motor's current of a flight came 0.32 s late
+LOGGED_LATE_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
+#: s over which a logger ordinarily takes its mean: a battery's monitor filters over a tenth
+LOGGED_BLUR_S = 0.05
 #: relative size of what an effect leaves of its form, its second order
 FORM = 0.03
 
@@ -100,10 +106,10 @@ NOISE_STEP_CLEAN, NOISE_STEP_REAL, NOISE_STEP_FREE, NOISE_TOP = 0.25, 0.6, 1.5, 
 LOUD = 2.0
 #: log powers between which a band stays
 NOISE_RANGE = (-9.0, 9.0)
-#: deviations from which a reading that is off alone counts no more
-WILD = 4.0
+#: degrees of freedom of readings beyond their level, beside normal ones;  source: 3 on a flight
+FREEDOMS = (3.0, 5.0, 8.0, 15.0)
 #: seconds over which the noise's level is taken;  powers between which it stays, of the median's
-LEVEL_S, LEVELS = 10.0, (0.02, 50.0)
+LEVEL_S, LEVELS = 4.0, (0.02, 50.0)
 #: octaves of the noise's spectrum, at most
 BANDS = 7
 

@@ -25,11 +25,15 @@ from ahrsd.diagnosis.one_model.linearised import (
     by_key,
     linearised,
     moved,
+    relevelled,
 )
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, searched
 from ahrsd.diagnosis.problem import Problem, model_at_rate
 from ahrsd.diagnosis.thin import thinned
 from ahrsd.samples import Array
+
+#: how often rows are weighed anew beside what was found
+LEVELLED = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +60,21 @@ def quick(
           alternating fields of its own
     """
     point = at_recorded_rate(moved(made, best.keys, best.at))
+    fast, all_sets, space, found = _searched(point, library, real=real)
+    for _ in range(LEVELLED if found.names else 0):  # rows far off for what is found are not now
+        point = relevelled(fast, found.keys, found.at)
+        fast, all_sets, space, found = _searched(point, library, real=real)
+    answer = decision.decided(all_sets, space, found, library)
+    slower = None
+    if answer.findings:
+        slower = _without(point.problem, made.point.problem, fast, answer.best)
+    return Quick(answer, point, slower, all_sets, space)
+
+
+def _searched(
+    point: Point, library: Mapping[str, Effect], *, real: bool
+) -> tuple[Linearised, Hypotheses, Space, Hypothesis]:
+    """The likeliest set of quick effects at a point."""
     fast = linearised(point, point.context)
     candidates = {}
     for name, effect in library.items():
@@ -69,12 +88,7 @@ def quick(
     noise = rich.fitted(fast, (CALIBRATION,), step).log_noise
     all_sets = Hypotheses(fast, (), noise, {}, real=real)
     space = Space(candidates, (), lambda *_: [], lambda _: None, lambda _: [])
-    found = searched(all_sets, space, [frozenset()])[0]
-    answer = decision.decided(all_sets, space, found, library)
-    slower = None
-    if answer.findings:
-        slower = _without(point.problem, made.point.problem, fast, answer.best)
-    return Quick(answer, point, slower, all_sets, space)
+    return fast, all_sets, space, searched(all_sets, space, [frozenset()])[0]
 
 
 def at_recorded_rate(slow: Point) -> Point:
@@ -91,8 +105,8 @@ def at_recorded_rate(slow: Point) -> Point:
     mag, gyro = drawn(slow.terms_mag), drawn(slow.terms_gyro)
     filtered = run_filter(track, model_at_rate(slow.filtered.model, problem), mag, gyro)
     fast = replace(problem, track=track, thin=1, averaged=1.0)
-    level = noise_model.amplitude(filtered.whitened, filtered.used, fast.rate_hz)
-    return Point(fast, filtered, {}, mag, gyro, level)
+    loud = noise_model.loudness(filtered.whitened, filtered.used, fast.rate_hz)
+    return Point(fast, filtered, {}, mag, gyro, loud)
 
 
 def _without(fast: Problem, slow: Problem, made: Linearised, best: Hypothesis) -> Problem:

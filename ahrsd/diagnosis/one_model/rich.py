@@ -94,11 +94,10 @@ def fitted(made: Linearised, keys: Sequence[str], step: float, near: At | None =
     products = made.products(keys, step)
     laws = [made.seen[key].component.law for key in keys]
     if near is not None:
-        return maximised(products, laws, [(near.log_noise, near.psi)])
+        return maximised(products, laws, (near.log_noise, near.psi))
     psi = np.concatenate([law.start for law in laws])
     top = float(np.log(products.square[-1] / products.rows[-1]))
-    starts = [(np.full(len(products.rows), top), psi)]
-    return maximised(products, laws, starts)
+    return maximised(products, laws, (np.full(len(products.rows), top), psi))
 
 
 def psi_by_key(made: Linearised, keys: Sequence[str], at: At) -> dict[str, np.ndarray]:

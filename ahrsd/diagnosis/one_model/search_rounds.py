@@ -6,15 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.one_model import decision, priors, rich
+from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import LAG, PIECES
 from ahrsd.diagnosis.one_model.linearised import unread
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.one_model.search_space import best_at
 from ahrsd.diagnosis.problem import Problem
+from ahrsd.samples import Array
 
 #: linearisations with a search each, at most
 ROUNDS = 3
@@ -52,24 +55,56 @@ def answered(problem: Problem, start: NullFit, library: Mapping[str, Effect]) ->
 
 
 def moved_in(all_sets: Hypotheses, best: Hypothesis) -> list[tuple[float, float]]:
-    """When something was moved, (from, to) s: where the forms of steps are far beyond the noise.
+    """When something was moved, (from, to) s: where the way of a step's source is far off a step.
 
     A step has its two levels right, but a form of some pieces is not the way from one to the other:
-    what it leaves is louder than all else, and other names are told for it.
+    what it leaves is louder than all else, and other names are told for it.  Of names that begin
+    within a hand's time of each other all but the levels is the way.
     """
-    point = all_sets.made.point
+    point, half_s = all_sets.made.point, priors.APPROACH_S / 2 / PIECES
     track, sigma = point.filtered.track, point.filtered.model.sigma_mag_gauss
     read = np.isfinite(track.mag_b_gauss).all(axis=1)
+    starting = [one for key in best.names if "onset_s" in (one := all_sets.component(key)).setting]
     out = []
-    for key, form in all_sets.forms.items():
-        one = all_sets.component(form)
-        if key not in best.names or one.columns.mag is None or "onset_s" not in one.setting:
+    for step in starting:
+        form = all_sets.forms.get(step.key)
+        if form is None or step.columns.mag is None:
             continue
-        value, _ = decision.coefficients(all_sets, best, form)
-        added = np.linalg.norm(one.columns.mag @ value, axis=1)
-        loud = np.flatnonzero(read & (added > priors.MOVED * sigma))
-        if len(loud):
-            half_s = priors.APPROACH_S / 2 / PIECES
-            begin, end = float(track.time_s[loud[0]]), float(track.time_s[loud[-1]])
-            out.append((begin - half_s, end + half_s))
-    return out
+        onset_s = float(step.setting["onset_s"])
+        beside = [one for one in starting if one is not step and _is_of_way(one, onset_s)]
+        if beside:
+            edges = [onset_s, *(time_s for one in beside for time_s in _lasting(one))]
+            out.append((min(edges) - 2 * half_s, max(edges) + 2 * half_s))
+        near = read & (np.abs(track.time_s - onset_s) <= priors.APPROACH_S)
+        way = np.where(near, np.linalg.norm(_put(all_sets, best, form), axis=1) / sigma, 0.0)
+        loud = _runs(way > priors.MOVED_LEAST, way > priors.MOVED)
+        out += [(track.time_s[a] - half_s, track.time_s[b - 1] + half_s) for a, b in loud]
+    at_s = track.time_s[read]
+    return [(float(a), float(b)) for a, b in out if np.any((at_s >= a) & (at_s <= b))]
+
+
+def _is_of_way(one: Component, onset_s: float) -> bool:
+    """Whether a member begins beside a step and does not outlast what a hand does there."""
+    begin, end = _lasting(one)
+    near = abs(begin - onset_s) <= priors.APPROACH_S
+    return near and end - begin <= 2 * priors.APPROACH_S and one.columns.mag is not None
+
+
+def _lasting(one: Component) -> tuple[float, float]:
+    """From when to when a member changes, s."""
+    begin = float(one.setting["onset_s"])
+    return begin, begin + float(one.setting.get("length_s", 0.0))
+
+
+def _runs(wide: NDArray[np.bool], high: NDArray[np.bool]) -> list[tuple[int, int]]:
+    """Runs of rows of the first kind that have one of the second, first and behind the last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], wide.astype(int), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if np.any(high[a:b])]
+
+
+def _put(all_sets: Hypotheses, best: Hypothesis, key: str) -> Array:
+    """(N, 3) gauss that a member puts on the magnetometer."""
+    columns = all_sets.component(key).columns.mag
+    if columns is None:
+        return np.zeros((len(all_sets.made.context.track), 3))
+    return np.asarray(columns @ decision.coefficients(all_sets, best, key)[0])

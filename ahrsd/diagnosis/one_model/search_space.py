@@ -62,7 +62,7 @@ def space_at(
         listed = effects.setdefault(one.effect or one.key, [])
         if one.key not in listed:
             listed.append(one.key)
-        form = form_of(one, context)
+        form = form_of(one, context, library)
         if form is not None:
             made.add([form])
             forms[one.key] = form.key
@@ -84,5 +84,5 @@ def space_at(
         jumping = [row for row in library.values() if row.jumps]
         return [component(context, row, setting, _ONSETS) for row in jumping]
 
-    space = Space(effects, COURSES, finer, lambda one: form_of(one, context), steps_at)
+    space = Space(effects, COURSES, finer, lambda one: form_of(one, context, library), steps_at)
     return all_sets, space

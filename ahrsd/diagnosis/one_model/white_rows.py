@@ -58,7 +58,7 @@ class WhiteRows:
         made, found = self.made, []
         for batch in batches(columns, _BATCH):
             cube = sensitivities(made.regressing, joined([columns[k] for k in batch]))
-            cube = by_frequency(cube / made.point.amplitude[:, None, None])
+            cube = by_frequency(cube / made.point.loud.amplitude[:, None, None])
             found.append((batch, self.like(cube)))
         cut = {
             number: part
@@ -69,7 +69,7 @@ class WhiteRows:
 
     def in_track(self, values: Array) -> Array:
         """(rows of the track, ...) with nothing where there is no reading."""
-        out = np.zeros((len(self.made.point.amplitude), *values.shape[1:]))
+        out = np.zeros((len(self.made.point.loud.amplitude), *values.shape[1:]))
         out[self.rows] = values
         return out
 
@@ -129,7 +129,7 @@ def _in_time(made: Linearised, rows: Array, log_noise: Array) -> Array:
     """(N, 3, p) of rows by frequency (3 M, p), the noise's powers taken out."""
     scale = np.exp(-0.5 * np.repeat(log_noise, 3 * np.diff(made.edges)))
     cube = (rows * scale[:, None]).reshape(-1, 3, rows.shape[1])
-    return np.asarray(idct(cube, axis=0, norm="ortho")[: len(made.point.amplitude)])
+    return np.asarray(idct(cube, axis=0, norm="ortho")[: len(made.point.loud.amplitude)])
 
 
 def _cut(cube: Array, columns: Sequence[Columns]) -> list[Array]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_t
 
 from ahrsd.diagnosis import one_model
 from ahrsd.diagnosis.effects.library import EFFECTS
@@ -77,23 +78,37 @@ def test_the_noise_prior_has_the_slope_of_its_differences():
         assert gradient[k] == pytest.approx(slope, abs=1e-6)
 
 
-def test_a_wild_reading_counts_less_and_a_step_does_not():
+def test_a_wild_reading_counts_less_and_rows_that_are_normal_count_alike():
     rng = np.random.default_rng(2)
     residual = rng.normal(size=(2000, 3))
     used = np.ones(2000, dtype=bool)
-    residual[500] = 60.0
-    residual[1200:1300] += 20.0
-    weight = noise_model.amplitude(residual, used, 10.0)
-    assert weight[500] > 10.0
-    assert np.all(weight[1190:1310] < 1.5)
-    assert np.median(weight) == pytest.approx(1.0, abs=0.1)
+    calm = noise_model.loudness(residual, used, 10.0)
+    assert np.ptp(np.log(calm.amplitude)) < 0.9  # the level alone, a median of forty
+    residual[500:2000:50] = 30.0
+    weight = noise_model.loudness(residual, used, 10.0).amplitude
+    assert np.all(weight[500:2000:50] > 5.0)
+    assert np.median(weight) == pytest.approx(1.0, abs=0.15)
+
+
+def test_rows_of_students_law_are_as_likely_as_that_law_says():
+    """The tangent at the residual of which they were made, in its density's own units."""
+    rng = np.random.default_rng(5)
+    scale = np.sqrt(rng.chisquare(3.0, size=4000) / 3.0)
+    residual = rng.normal(size=(4000, 3)) / scale[:, None]
+    loud = noise_model.loudness(residual, np.ones(4000, dtype=bool), 20.0)
+    rows = residual / loud.amplitude[:, None]
+    nats = loud.tails - 0.5 * np.sum(rows**2) - 3.0 * np.sum(np.log(loud.amplitude))
+    nats -= 1.5 * len(rows) * np.log(2 * np.pi)
+    law = multivariate_t(np.zeros(3), np.eye(3), df=3.0)
+    # a level of its own every few seconds costs some nats
+    assert nats == pytest.approx(law.logpdf(residual).sum(), abs=150.0)
 
 
 def test_the_level_follows_noise_that_is_louder_for_long():
     rng = np.random.default_rng(3)
     residual = rng.normal(size=(4000, 3))
     residual[2500:] *= 4.0
-    weight = noise_model.amplitude(residual, np.ones(4000, dtype=bool), 10.0)
+    weight = noise_model.loudness(residual, np.ones(4000, dtype=bool), 10.0).amplitude
     assert np.median(weight[3000:]) / np.median(weight[:2000]) == pytest.approx(4.0, rel=0.15)
 
 

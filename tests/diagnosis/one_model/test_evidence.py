@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from ahrsd.diagnosis.one_model import noise_model
 from ahrsd.diagnosis.one_model.component import Fixed, Sized
-from ahrsd.diagnosis.one_model.evidence import Products, evaluated, maximised
+from ahrsd.diagnosis.one_model.evidence import Products, evaluated, maximised, reached
 from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw
 
 ROWS, STEP = (20, 20, 40, 80), 0.7
@@ -115,7 +115,7 @@ def test_adding_and_dropping_agree_on_200_hypotheses():
             even = (np.array([np.log(0.01)]), np.array([np.log(10.0)]))
             own = [Sized(np.ones(width), *even) for _ in chosen]
             begin = start or (np.full(4, 1.0), np.zeros(len(chosen)))
-            return maximised(products(B[:, columns], y), own, [begin])
+            return maximised(products(B[:, columns], y), own, begin)
 
         rich = of(whole)
         dropped = of(few, (rich.log_noise, rich.psi[few]))
@@ -134,11 +134,22 @@ def test_what_is_not_there_is_small_and_what_is_there_is_found():
     found = maximised(
         products(B, y),
         [Sized(np.ones(8), *even), Sized(np.ones(8), *even)],
-        [(np.zeros(4), np.zeros(2))],
+        (np.zeros(4), np.zeros(2)),
     )
     assert np.exp(found.psi[0]) == pytest.approx(2.0, rel=0.5)
     assert np.exp(found.psi[1]) < 0.15
     np.testing.assert_allclose(np.exp(found.log_noise), 1.0, rtol=0.6)
+
+
+def test_a_climb_is_given_up_only_where_it_would_not_reach_what_is_asked():
+    for seed in range(30):
+        B, y = design(60 + seed, WIDTHS)
+        start = (np.full(4, 1.5), np.full(len(PSI), -0.5))
+        top = maximised(products(B, y), laws(), start)
+        found = reached(products(B, y), laws(), start, top.nats - 0.1)
+        assert found is not None
+        assert found.nats == top.nats
+        assert reached(products(B, y), laws(), start, top.nats + 1e3) is None
 
 
 def test_the_curvature_is_the_average_information_and_no_less_than_the_expected():
@@ -174,7 +185,7 @@ def test_the_maximum_is_that_of_another_climb():
     """Newton's steps against a quasi-Newton search of the same function, from far away."""
     for seed in range(10):
         B, y = design(20 + seed, WIDTHS)
-        found = maximised(products(B, y), laws(), [(np.full(4, 1.5), np.zeros(4))])
+        found = maximised(products(B, y), laws(), (np.full(4, 1.5), np.zeros(4)))
 
         of_all = products(B, y)
 

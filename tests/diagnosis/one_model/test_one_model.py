@@ -167,3 +167,35 @@ def test_a_delay_of_any_kind_is_in_the_repaired_model_as_it_was(name, strength):
         assert np.median(np.linalg.norm(mag, axis=1)) == pytest.approx(np.median(late), rel=0.2)
     else:
         assert np.max(np.abs(gyro)) > 1e-3
+
+
+def test_a_current_that_comes_late_into_the_log_is_named_and_moved_to_its_time():
+    """Held against the field as it was logged it explains nothing."""
+    track = track_of(experiment("wam", seed=10, samples=4000))
+    rng = np.random.default_rng(4)
+    changes = np.sort(rng.uniform(track.time_s[0], track.time_s[-1], size=160))
+    levels = rng.uniform(0.0, 12.0, size=161)
+    level = levels[np.searchsorted(changes, track.time_s)]
+    true_a, logged_a = (np.interp(track.time_s - by, track.time_s, level) for by in (0.0, 0.3))
+    per_ampere = np.array([1.2e-3, -0.7e-3, 0.5e-3])
+    mag = track.mag_b_gauss + true_a[:, None] * per_ampere
+    logged = {**track.covariates, "motor_current_a": logged_a}
+    found = diagnose(replace(track, mag_b_gauss=mag, covariates=logged))
+    assert [one.effect for one in found.findings] == ["motor_current_field"]
+    (one,) = found.findings
+    assert one.setting["late_s"] == pytest.approx(0.3, abs=0.03)
+    np.testing.assert_allclose([p.value for p in one.parameters], per_ampere, rtol=0.1)
+    assert not found.unexplained.detected
+
+
+def test_the_way_of_a_hand_with_a_magnet_is_no_name_beside_its_step():
+    track = track_of(experiment("wam", seed=11, samples=4000))
+    t = track.time_s - track.time_s[0]
+    near = 0.3 * np.exp(-0.5 * ((t - 65.5) / 0.5) ** 2)  # it passes the sensor, and is put on
+    put = near[:, None] * [0.5, 0.8, -0.3] + (t > 66.5)[:, None] * [0.04, -0.03, 0.02]
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + put))
+    assert [one.effect for one in found.findings] == ["hard_iron_step"]
+    (one,) = found.findings
+    assert one.setting["onset_s"] == pytest.approx(track.time_s[0] + 66.0, abs=2.0)
+    np.testing.assert_allclose([p.value for p in one.parameters], [0.04, -0.03, 0.02], atol=2e-3)
+    assert not found.unexplained.detected
