@@ -296,8 +296,10 @@ def _squares(
 # What an instrument may have besides iron and bias: turned axes, a lag, a wrong scale of angles.
 #
 # Turn: the magnetometer's axes are taken to be the gyro's. If they are not, the rate in the
-# magnetometer's frame is R w with R = Exp(theta), and a step's rotation is R phi. Derivative:
-# dq/dtheta = dq/dphi dphi/dtheta = (dq/dw_b / dt) [phi]x.
+# magnetometer's frame is R w with R = Exp(theta), and a step's rotation is R phi, phi without the
+# bias: what rests tell of the bias in the readings is then nothing of the gyro's matrix, and the
+# bias is in the gyro's own axes. Derivative: dq/dtheta = dq/dphi dphi/dtheta = (dq/dw_b / dt)
+# [phi]x.
 #
 # Lag: a reading of the field that is tau late is that of the direction u(t - tau). With du/dt = -w
 # x u its derivative is dr/dtau = -M (w x u) / s_m.
@@ -778,7 +780,8 @@ def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationSta
         [chain.Chain(e.data, e.u, graph.nodes[e.a].bias, e.used, e.weights) for e in epochs]
     )
     field, motion = chain.parts(rows, graph.c)
-    turn = _of_angle(motion.by_bias / rows.dt_s, rows.angle_b_rad)
+    turned = rows.angle_b_rad - rows.bias * rows.dt_s
+    turn = _of_angle(motion.by_bias / rows.dt_s, turned)
     seen = np.concatenate([e.data.seen(e.u) for e in epochs])
     rate = np.concatenate([rates(e.data) for e in epochs])
     swept = chain.symmetric(graph.c[:6]) @ np.cross(rate, seen).T
