@@ -113,6 +113,8 @@ class Estimate:
     place_gauss:     by how much the field differs with the heading, as it does where it differs
                      from place to place: rms of what is expected; it is in `covariance`. nan where
                      nobody can tell
+    gyro_correction: (3, 3) by which the gyro's reading less its bias is multiplied to turn as the
+                     field does; 1 where the data do not ask for another
     """
 
     soft_iron: Array
@@ -135,6 +137,7 @@ class Estimate:
     contradicted_s: float | None = None
     widened_by: str = ""
     place_gauss: float = math.nan
+    gyro_correction: Array = field(default_factory=lambda: np.eye(3))
 
     @property
     def correction(self) -> Affine:

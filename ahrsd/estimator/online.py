@@ -730,4 +730,5 @@ class Estimator:
             contradicted_s=self._doubted_s,
             widened_by=advice.widened_by(parts, covariance, turned),
             place_gauss=place_gauss,
+            gyro_correction=window.taken.gyro,
         )

@@ -17,11 +17,12 @@ filter (`innovation`) takes a loop over samples; beside a running estimator that
 a block the same whitened innovations come without one: the gyro carries every reading into the
 frame of the block's first one, where the field stands still,
 
-    y_k = R_k C (m_k - b) = h + noise,   R_k = R_k-1 Exp((w_k - w_b) dt)
+    y_k = R_k C (m_k - b) = h + noise,   R_k = R_k-1 Exp(G (w_k - w_b) dt)
 
 and the noise is white (magnetometer) plus, across the field, a random walk (gyro). The inverse of
 the Cholesky factor of its covariance gives the innovations of the filter that starts knowing
-nothing of h; it is the same for every block. The field h of the block is projected out, so a block
+nothing of h; it is the same for every block. G is what the estimator takes out of the gyro's angles
+(`Estimate.gyro_correction`): wrong scales are a bias that changes with the sense of turning. The field h of the block is projected out, so a block
 says nothing while the vehicle stands, whatever is the matter with the field around it; so is a lag
 between the two sensors, which nearly every stream has and no calibration knows of.
 """
@@ -50,13 +51,17 @@ _KEEP_ROOT = 1.2  # the whitening is kept while the ratio of the noises is withi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceCalibration:
-    """A calibration to test: theta (12,) and a root (12, 12) of its covariance, and the noises."""
+    """A calibration to test: theta (12,) and a root (12, 12) of its covariance, and the noises.
+
+    gyro_correction (3, 3): on the gyro's reading less its bias
+    """
 
     theta: Array
     root: Array
     correction: Array
     offset: Array
     gyro_bias_rad_s: Array
+    gyro_correction: Array
     noise_mag_gauss: float
     noise_gyro_rad_s: float
 
@@ -71,6 +76,7 @@ class ReferenceCalibration:
             np.asarray(np.linalg.inv(A), float),
             estimate.hard_iron_gauss,
             estimate.gyro_bias_rad_s,
+            estimate.gyro_correction,
             max(estimate.noise_mag_gauss, 1e-5),
             max(estimate.noise_gyro_rad_s, 1e-6),
         )
@@ -114,7 +120,7 @@ class Scorer:
         n = len(rows.time_s)
         dt_s = np.diff(rows.time_s, prepend=rows.time_s[:1])
         turn = np.diff(rows.angle_b_rad, axis=0, prepend=rows.angle_b_rad[:1])
-        turn -= dt_s[:, None] * reference.gyro_bias_rad_s
+        turn = (turn - dt_s[:, None] * reference.gyro_bias_rad_s) @ reference.gyro_correction.T
         R = carried(so3.exp(turn))
         lever = R @ reference.correction
         y = (lever @ (rows.raw_b_gauss - reference.offset)[:, :, None])[:, :, 0]
@@ -122,7 +128,8 @@ class Scorer:
         Z = np.zeros((n, 3, 20))
         Z[:, :, SOFT] = lever @ _soft(h @ R)
         Z[:, :, IRON] = lever
-        Z[:, :, GYRO] = -so3.skew(h) @ np.cumsum(R * dt_s[:, None, None], axis=0)
+        gone = np.cumsum(R * dt_s[:, None, None], axis=0) @ reference.gyro_correction
+        Z[:, :, GYRO] = -so3.skew(h) @ gone
         Z[:, [0, 1, 2], [12, 13, 14]] = np.linspace(-1.0, 1.0, n)[:, None]
         Z[:, [0, 1, 2], [15, 16, 17]] = 1.0
         Z[:, :, 18] = np.cross(h, (R @ _rate(turn, dt_s)[:, :, None])[:, :, 0])

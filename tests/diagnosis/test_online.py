@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
+import pieces
 import pytest
 from tracks import RECORDINGS, experiment
 
@@ -146,6 +147,57 @@ def test_an_hour_without_a_change_is_silent(scenario, seed):
     assert watched(made.blocks(512), estimate_of(made, seed), detector) is None
     assert detector.armed
     assert detector.scored == 45000 // 128
+
+
+def turning(seed: int, wrong: Array) -> tuple[SampleBlock, Estimate, Estimate]:
+    """Circles to one side and then to the other, and a gyro that is wrong by this matrix; what is
+    known of it, and what whoever took it for perfect found in the first circles: another bias."""
+    made = pieces.drive((("circles", 300.0), ("roll", 60.0), ("circles", 300.0)), seed)
+    rate = made.rate_b_rad_s
+    gyro = made.block.gyro_b_rad_s + rate @ (wrong - np.eye(3)).T
+    known = Estimate(
+        soft_iron=pieces.SOFT_IRON,
+        hard_iron_gauss=pieces.HARD_IRON_GAUSS,
+        gyro_bias_rad_s=pieces.GYRO_BIAS_RAD_S,
+        field_gauss=0.49,
+        field_known=False,
+        covariance=np.diag(SIGMA**2),
+        noise_mag_gauss=pieces.MAG_GAUSS,
+        noise_gyro_rad_s=pieces.GYRO_RAD_S,
+        misfit=1.0,
+        heading_sigma_deg=0.3,
+        observability=Observability(np.zeros(12), (), 2.0),
+        samples=5000,
+        duration_s=200.0,
+        converged=True,
+        gyro_correction=np.linalg.inv(wrong),
+    )
+    passes = (wrong - np.eye(3)) @ rate[made.block.time_s < 200.0].mean(axis=0)
+    perfect = replace(
+        known, gyro_correction=np.eye(3), gyro_bias_rad_s=known.gyro_bias_rad_s + passes
+    )
+    return replace(made.block, gyro_b_rad_s=gyro), known, perfect
+
+
+def test_a_wrong_scale_that_the_estimator_took_out_is_no_step_of_the_bias():
+    """Where the sense of turning changes, a scale of 1 % is another bias."""
+    wrong = np.eye(3) + np.array([[0.004, 0.0, 0.01], [0.0, -0.006, 0.0], [0.0, 0.005, 0.01]])
+    jump = np.array([0.0, 0.004, -0.006])
+    told = 0
+    for seed in (4, 5):
+        block, known, perfect = turning(seed, wrong)
+        parts = [block.part(slice(a, a + 40), gap_before=a == 0) for a in range(0, len(block), 40)]
+        assert watched(parts, known) is None
+        step = watched(parts, perfect)
+        told += step is not None and step.what == "gyro bias"
+        on = (block.time_s > 200.0)[:, None]
+        other = replace(block, gyro_b_rad_s=block.gyro_b_rad_s + on * jump)
+        parts = [other.part(slice(a, a + 40), gap_before=a == 0) for a in range(0, len(block), 40)]
+        step = watched(parts, known)
+        assert step is not None
+        assert step.what == "gyro bias"
+        assert np.all(np.abs(step.size - jump) < 4 * step.sigma + 3e-4)
+    assert told == 2
 
 
 def test_heavy_tails_colour_and_a_lag_are_no_steps():
