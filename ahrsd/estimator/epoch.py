@@ -390,6 +390,10 @@ class TakenOut:
         return replace(self, gyro=(np.eye(3) + more) @ self.gyro)
 
 
+#: (9, 3, 3) matrices of one of each of turn, scale and shape, on the gyro's angles
+GYRO_WAYS = np.array([TakenOut.nothing().with_gyro(one).gyro - np.eye(3) for one in np.eye(9)])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Instrument:
     """Step (17,) from the answer in [M (6), b (3), w_b (3), theta (3), tau, s], and its covariance.
@@ -694,10 +698,30 @@ class Weighed:
         return int(np.argmax(others)), float(others.max() - self.evidence[plain].max())
 
 
-def considered(weighed: Weighed) -> tuple[Array, dict[str, Array], float]:
-    """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12); what each
-    of `IMPERFECTIONS` alone adds, which together may be more or less; and by how much the field
-    differs with the heading, rms of what is expected of its six numbers [gauss].
+@dataclass(frozen=True, slots=True, eq=False)
+class Widening:
+    """What imperfections of the instrument and the place do to an answer.
+
+    added: to the covariance (12, 12) of [M, b, w_b]; parts: what each of `IMPERFECTIONS` alone
+    adds, which together may be more or less; place_gauss: by how much the field differs with the
+    heading, rms of what is expected of its six numbers; gyro (9, 9): covariance of turn, scale and
+    shape of the gyro's angles beyond what is taken out; with_gyro (12, 9): and with [M, b, w_b]
+    """
+
+    added: Array
+    parts: dict[str, Array]
+    place_gauss: float
+    gyro: Array
+    with_gyro: Array
+
+    @staticmethod
+    def nothing() -> Widening:
+        """Of a perfect instrument, or where nobody can tell."""
+        return Widening(np.zeros((12, 12)), {}, float("nan"), np.zeros((9, 9)), np.zeros((12, 9)))
+
+
+def considered(weighed: Weighed) -> Widening:
+    """What imperfections of the instrument do to the answer.
 
     The answer takes the instrument to be perfect. It is one of `instruments`, each as likely as
     the data make it. Of each, what the data leave open of the imperfections spreads the answer, and
@@ -709,8 +733,13 @@ def considered(weighed: Weighed) -> tuple[Array, dict[str, Array], float]:
     mean = np.tensordot(likely, weighed.spread, 1) + (likely * rest.T) @ rest
     added = by_rest @ mean @ by_rest.T
     each = [by_rest[:, i] @ mean[np.ix_(i, i)] @ by_rest[:, i].T for i in _EACH]
-    place = float(np.sqrt(np.mean(np.diag(mean)[_PLACE])))
-    return np.asarray((added + added.T) / 2), dict(zip(IMPERFECTIONS, each, strict=True)), place
+    return Widening(
+        (added + added.T) / 2,
+        dict(zip(IMPERFECTIONS, each, strict=True)),
+        float(np.sqrt(np.mean(np.diag(mean)[_PLACE]))),
+        mean[np.ix_(GYRO_OF_ALL, GYRO_OF_ALL)],
+        by_rest @ mean[:, GYRO_OF_ALL],
+    )
 
 
 def walk_asked(weighed: Weighed, span_s: float) -> float:

@@ -28,6 +28,7 @@ from ahrsd.estimator.epoch import (
     InstrumentInformations,
     TakenOut,
     Weighed,
+    Widening,
     considered,
     gyro_asked,
     instrument,
@@ -88,7 +89,7 @@ def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float
     J = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], axis=2)
     row = (along[:, None, :] @ J)[:, 0]
     variance = np.sum((row @ covariance[:9, :9]) * row, axis=1)
-    return float(np.degrees(np.sqrt(max(float(np.max(variance)), 0.0))))
+    return float(np.degrees(np.sqrt(np.maximum(np.max(variance), 0.0))))
 
 
 def turned_heading_deg(turn_rad: Array, down_b: Array, dip_rad: float) -> float:
@@ -648,13 +649,10 @@ class Estimator:
         known = window.lag_known() if window.taken.lag_s != 0.0 else None
         return np.zeros((12, 12)) if known is None else np.outer(known.spread, known.spread)
 
-    def _by_imperfections(self, window: Window) -> tuple[Array, dict[str, Array], float]:
-        """What an instrument that is not perfect adds to the covariance (12, 12), and each part;
-        by how much the field differs with the heading, gauss, nan where nobody can tell."""
+    def _by_imperfections(self, window: Window) -> Widening:
+        """What an instrument that is not perfect does to the answer."""
         weighed = self._weighed(window)
-        if weighed is None:
-            return np.zeros((12, 12)), {}, float("nan")
-        return considered(weighed)
+        return Widening.nothing() if weighed is None else considered(weighed)
 
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
@@ -688,12 +686,14 @@ class Estimator:
         observed = observability(covariance, self._whitening)
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
-        by_instrument, parts, place_gauss = self._by_imperfections(window)
+        widening = self._by_imperfections(window)
         tempered = window.covariance()
         divided = tempered * self._parted
-        parts |= motion_and_misfit(window.explained_covariance(), divided, self._whitening)
+        parts = widening.parts | motion_and_misfit(
+            window.explained_covariance(), divided, self._whitening
+        )
         covariance = divided * (1.0 + doubt**2)
-        covariance = covariance + self._by_lag(window) + by_instrument
+        covariance = covariance + self._by_lag(window) + widening.added
         covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = unit_volume(graph.c)
         K = np.eye(12)
@@ -701,6 +701,8 @@ class Estimator:
         down, dip = attitude(self._down, [(e.u, e.data.down_b) for e in window.epochs])
         turned = turned_heading_deg(window.taken.numbers[:3], down, dip)
         heading = float(np.hypot(heading_sigma_deg(graph.c, covariance, down, dip), turned))
+        # a field that differs by place, and not with the heading, is misfit
+        place = parts["place"] + parts["misfit"] if "place" in parts else np.full((12, 12), np.nan)
         advice = HeadingAdvice(graph.c, down, dip, window.usual.mag_gauss)
         averaged = self._builder.averaged
         return Estimate(
@@ -729,6 +731,13 @@ class Estimator:
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,
             widened_by=advice.widened_by(parts, covariance, turned),
-            place_gauss=place_gauss,
+            place_gauss=widening.place_gauss,
+            place_deg=heading_sigma_deg(graph.c, place, down, dip),
             gyro_correction=window.taken.gyro,
+            gyro_covariance=np.block(
+                [
+                    [K @ covariance @ K.T, K @ widening.with_gyro],
+                    [widening.with_gyro.T @ K.T, widening.gyro],
+                ]
+            ),
         )

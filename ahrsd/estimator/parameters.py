@@ -45,9 +45,9 @@ AS_SPECIFIED = Imperfections(
 ASSEMBLED = Imperfections(
     turn_rad=0.02, lag_s=0.015, scale=0.01, shape=0.01, bias_rad_s=2e-3, iron_gauss=3e-3
 )
-#: as its maker calibrated it, and on for some minutes: its gyro's bias still moves by as much as lies
-#: in the middle of the two. Between them are factors of 25 to 33 in all else and of 200 in this, and
-#: what is never believed to be of a size is taken for none where the data cannot tell it from none
+#: as its maker calibrated it, and on for some minutes: its gyro's bias still moves, by as much as
+#: lies in the middle of the two. Between them are factors of 25 to 33 in all else and of 200 in
+#: this, and what is never believed to be of a size is taken for none where the data cannot tell
 SETTLING = replace(AS_SPECIFIED, bias_rad_s=1.4e-4)
 
 
