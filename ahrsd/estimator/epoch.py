@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import is_not
 
 import numpy as np
 
@@ -51,11 +50,17 @@ class EpochContent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstrumentInformation:
-    """Quadratic of an epoch in iron and instrument (see `instrument`): H (28, 28), g (28,) at c."""
+    """Quadratic of an epoch in iron, gyro's bias and instrument (see `instrument`): H (28, 28), and
+    g (28,) at c (9,) and bias (3,), where the epoch was linearised."""
 
     H: Array
     g: Array
     c: Array
+    bias: Array
+
+    def at(self, c: Array, bias: Array) -> Array:
+        """Gradient (28,) there."""
+        return self.g + self.H[:, :12] @ np.r_[c - self.c, bias - self.bias]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -427,27 +432,27 @@ InformationStack = tuple[Array, Array]
 """H (N, 17, 17) and gradient (N, 17) of epochs, all directions eliminated."""
 
 
-class InstrumentInformations:
-    """Quadratics of the epochs with motion around the present estimate, computed once."""
+def informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+    """Quadratics of the epochs with motion around the present estimate.
 
-    def __init__(self) -> None:
-        self._kept: tuple[list[object], InformationStack] | None = None
+    LinAlgError where none has motion, or its directions are not determined.
+    """
+    H, g = whole_informations(epochs, graph)
+    return H[:, :_ASKED, :_ASKED], g[:, :_ASKED]
 
-    def of(self, epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
-        """LinAlgError where none has motion, or its directions are not determined."""
-        H, g = self.whole(epochs, graph)
-        return H[:, :_ASKED, :_ASKED], g[:, :_ASKED]
 
-    def whole(self, epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
-        """The same with the gyro's shape and the place: H (N, 28, 28) and gradient (N, 28)."""
-        at: list[object] = [graph.c, *epochs, *graph.nodes.values()]
-        kept = self._kept
-        if kept is None or len(kept[0]) != len(at) or any(map(is_not, kept[0], at)):
-            moving = [epoch for epoch in epochs if epoch.turned]
-            if not moving:
-                raise np.linalg.LinAlgError("no epoch with motion")
-            kept = self._kept = (at, _informations(moving, graph))
-        return kept[1]
+def whole_informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+    """The same with the gyro's shape and the place: H (N, 28, 28) and gradient (N, 28).
+
+    Each as it was where the epoch was linearised, so that it is computed once for each.
+    """
+    linearise_instrument(epochs)
+    told = [(e.instrument, graph.nodes[e.a].bias) for e in epochs if e.turned]
+    if not told:
+        raise np.linalg.LinAlgError("no epoch with motion")
+    known = [(one, bias) for one, bias in told if one is not None]
+    H = np.array([one.H for one, _ in known])
+    return H, np.array([one.at(graph.c, bias) for one, bias in known])
 
 
 def of_rests(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
@@ -522,11 +527,12 @@ def _place(c: Array, taken: TakenOut) -> Array:
     return x
 
 
-def linearise_instrument(epochs: Sequence[WindowEpoch], graph: Graph) -> None:
-    """Compute `WindowEpoch.instrument` of the epochs with motion that do not have it yet."""
+def linearise_instrument(epochs: Sequence[WindowEpoch]) -> None:
+    """Compute `WindowEpoch.instrument` of the epochs with motion that do not have it yet, together
+    those that were linearised at one calibration."""
     silent = [epoch for epoch in epochs if epoch.turned and epoch.instrument is None]
-    if silent:
-        _informations(silent, graph)
+    for place in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in silent}.values():
+        _informations([epoch for epoch in silent if epoch.factor.point.c is place], place)
 
 
 def lag_known(
@@ -537,7 +543,7 @@ def lag_known(
     The iron is estimated with that lag. Its errors at the true lag do not correlate with that of
     the lag, so what both make adds up.
     """
-    linearise_instrument(epochs, graph)
+    linearise_instrument(epochs)
     H = past.at(graph.c, TakenOut.nothing())[0]
     H = H + sum(epoch.instrument.H for epoch in epochs if epoch.instrument is not None)
     H = believed(graph, sigma_bias)[0] + H[:_ASKED, :_ASKED]
@@ -804,16 +810,17 @@ def disagreement(H: Array, g: Array, steps: Array) -> float:
     return float(np.sum(asked[good] ** 2 / values[good]) / max(count - H.shape[1], 0.2 * count))
 
 
-def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+def _informations(epochs: Sequence[WindowEpoch], c: Array) -> None:
+    """`WindowEpoch.instrument` of epochs that were linearised at c."""
     rows = chain.Rows.of(
-        [chain.Chain(e.data, e.u, graph.nodes[e.a].bias, e.used, e.weights) for e in epochs]
+        [chain.Chain(e.data, e.u, e.factor.point.a.bias, e.used, e.weights) for e in epochs]
     )
-    field, motion = chain.parts(rows, graph.c)
+    field, motion = chain.parts(rows, c)
     turned = rows.angle_b_rad - rows.bias * rows.dt_s
     turn = _of_angle(motion.by_bias / rows.dt_s, turned)
     seen = np.concatenate([e.data.seen(e.u) for e in epochs])
     rate = np.concatenate([rates(e.data) for e in epochs])
-    swept = chain.symmetric(graph.c[:6]) @ np.cross(rate, seen).T
+    swept = chain.symmetric(c[:6]) @ np.cross(rate, seen).T
     late = field.by_x[0, 6] * swept  # by_x holds - sqrt(weight) / s_m in that place
     diag, upper, border = chain.interior(field, motion)
     columns = np.zeros((2, _SIZE + 1, len(rate)))
@@ -821,7 +828,7 @@ def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationSta
     columns[:, _OF_ANGLE] = -motion.scale * turn
     columns[:, _OF_ANGLE, :-1] += np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], turn[:, :, 1:])
     columns[:, LAG] = np.einsum("rn,rin->in", late, field.own)
-    place = _by_place(field, seen, np.concatenate([e.data.down_b for e in epochs]), graph.c)
+    place = _by_place(field, seen, np.concatenate([e.data.down_b for e in epochs]), c)
     columns[:, PLACE] = np.einsum("rjn,rin->ijn", place, field.own)
     _, half = halfway(diag, upper, np.ascontiguousarray(columns.transpose(1, 2, 0)))
     J = np.concatenate([field.by_x, late[:, None], place, field.r[:, None]], axis=1)
@@ -834,8 +841,8 @@ def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationSta
         H[k][_MOTION] += chain.squares(K[:, :, a:b])
     for epoch, own in zip(epochs, H, strict=True):
         own[_SCALES, _SIZE] -= _by_noise(epoch)
-        epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], graph.c)
-    return H[:, :_SIZE, :_SIZE], H[:, :_SIZE, _SIZE]
+        at = c, epoch.factor.point.a.bias
+        epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], *at)
 
 
 def _by_place(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Array:

@@ -25,15 +25,16 @@ from ahrsd.estimator.epoch import (
     TOLD,
     Considered,
     Instrument,
-    InstrumentInformations,
     TakenOut,
     Weighed,
     Widening,
     considered,
     gyro_asked,
+    informations,
     instrument,
     of_rests,
     walk_asked,
+    whole_informations,
 )
 from ahrsd.estimator.epoch_data import EpochBuilder, check_samples, with_border
 from ahrsd.estimator.graph import BLIND, Node, SingularError, curvature, whitening
@@ -352,7 +353,6 @@ class Estimator:
         self._strange = 0
         self._doubted_s: float | None = None  # since when the newest motion contradicts the answer
         self._parted = 1.0  # variance over the expected of what earlier and later data ask for
-        self._informations = InstrumentInformations()
         self._misscaled = 0.0  # share of themselves by which the gyro's angles are too small
         self.restarted_s: float | None = None  # when the iron changed, if it did
 
@@ -462,10 +462,8 @@ class Estimator:
             return window
         p = self.parameters
         try:
-            informations = self._informations.of(window.epochs, window.graph)
-            found = divided(
-                informations, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss
-            )
+            told = informations(window.epochs, window.graph)
+            found = divided(told, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss)
         except np.linalg.LinAlgError:
             return window
         self._parted = 1.0 if found is None else found.parted
@@ -536,7 +534,6 @@ class Estimator:
                 self._misscaled = misscaled
                 if not window.left_over:
                     break
-        self._informations = InstrumentInformations()  # nobody else asks before they are others
         return window, late
 
     def _explained(self, trial: Window, before: Window, told: float) -> bool:
@@ -586,10 +583,10 @@ class Estimator:
 
     def _instrument(self, window: Window) -> Instrument | None:
         try:
-            informations = self._informations.of(window.epochs, window.graph)
+            told = informations(window.epochs, window.graph)
             before = window.past.at(window.graph.c, window.taken)
             sigma_bias, scaled = self.parameters.prior_gyro_bias_rad_s, window.taken.numbers[3]
-            return instrument(informations, window.graph, sigma_bias, before, scaled)
+            return instrument(told, window.graph, sigma_bias, before, scaled)
         except np.linalg.LinAlgError:
             return None
 
@@ -599,7 +596,7 @@ class Estimator:
             return None
         before = window.folded_information.at(window.graph.c, window.taken)
         try:
-            moving = self._informations.whole(window.epochs, window.graph)
+            moving = whole_informations(window.epochs, window.graph)
             rests = of_rests(window.epochs, window.graph)
             said = np.concatenate([moving[0], rests[0]]), np.concatenate([moving[1], rests[1]])
             apart = sorted(window.epochs, key=lambda e: not e.turned)
@@ -660,16 +657,16 @@ class Estimator:
         if window is None or not self._agreed:
             return None
         try:
-            informations = self._informations.of(window.epochs, window.graph)
+            told = informations(window.epochs, window.graph)
             sigma_bias, taken = self.parameters.prior_gyro_bias_rad_s, window.taken.numbers[:3]
-            return misalignment(informations, window.graph, sigma_bias, taken)
+            return misalignment(told, window.graph, sigma_bias, taken)
         except np.linalg.LinAlgError:
             return None
 
     def _copy(self) -> Estimator:
         other = copy(self)
         other._builder, other._down = self._builder.copy(), self._down.copy()
-        other._new, other._informations = list(self._new), InstrumentInformations()
+        other._new = list(self._new)
         other._window = None if self._window is None else self._window.copy()
         return other
 
