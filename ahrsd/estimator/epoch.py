@@ -720,6 +720,11 @@ class Widening:
     gyro: Array
     with_gyro: Array
 
+    def joint(self, covariance: Array, K: Array) -> Array:
+        """(21, 21) of K (12, 12) times [M, b, w_b], whose covariance is given, and the gyro's."""
+        beside = K @ self.with_gyro
+        return np.block([[covariance, beside], [beside.T, self.gyro]])
+
     @staticmethod
     def nothing() -> Widening:
         """Of a perfect instrument, or where nobody can tell."""

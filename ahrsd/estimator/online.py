@@ -181,6 +181,13 @@ class HeadingAdvice:
             return _MOTION.format(self.manoeuvre(covariance))
         return _WIDENED[most]
 
+    def by_place_deg(self, parts: Mapping[str, Array]) -> float:
+        """What a field that differs by place makes of the heading, 1 sigma; nan: unknown.
+
+        Where it does not differ with the heading it is misfit.
+        """
+        return self._sigma_deg(parts["place"] + parts["misfit"]) if "place" in parts else np.nan
+
     def manoeuvre(self, covariance: Array) -> str:
         """The easiest of a turn, a roll and a pitch after which the heading is known as well as
         after any of them."""
@@ -679,8 +686,7 @@ class Estimator:
             covariance = graph.covariance()
         except SingularError:
             return None
-        covariance = covariance * graph.temper
-        observed = observability(covariance, self._whitening)
+        observed = observability(covariance * graph.temper, self._whitening)
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
         widening = self._by_imperfections(window)
@@ -698,8 +704,6 @@ class Estimator:
         down, dip = attitude(self._down, [(e.u, e.data.down_b) for e in window.epochs])
         turned = turned_heading_deg(window.taken.numbers[:3], down, dip)
         heading = float(np.hypot(heading_sigma_deg(graph.c, covariance, down, dip), turned))
-        # a field that differs by place, and not with the heading, is misfit
-        place = parts["place"] + parts["misfit"] if "place" in parts else np.full((12, 12), np.nan)
         advice = HeadingAdvice(graph.c, down, dip, window.usual.mag_gauss)
         averaged = self._builder.averaged
         return Estimate(
@@ -729,12 +733,7 @@ class Estimator:
             contradicted_s=self._doubted_s,
             widened_by=advice.widened_by(parts, covariance, turned),
             place_gauss=widening.place_gauss,
-            place_deg=heading_sigma_deg(graph.c, place, down, dip),
+            place_deg=advice.by_place_deg(parts),
             gyro_correction=window.taken.gyro,
-            gyro_covariance=np.block(
-                [
-                    [K @ covariance @ K.T, K @ widening.with_gyro],
-                    [widening.with_gyro.T @ K.T, widening.gyro],
-                ]
-            ),
+            gyro_covariance=widening.joint(K @ covariance @ K.T, K),
         )

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
-from itertools import chain, product
+from itertools import product
 
 import numpy as np
 
@@ -45,10 +45,6 @@ AS_SPECIFIED = Imperfections(
 ASSEMBLED = Imperfections(
     turn_rad=0.02, lag_s=0.015, scale=0.01, shape=0.01, bias_rad_s=2e-3, iron_gauss=3e-3
 )
-#: as its maker calibrated it, and on for some minutes: its gyro's bias still moves, by as much as
-#: lies in the middle of the two. Between them are factors of 25 to 33 in all else and of 200 in
-#: this, and what is never believed to be of a size is taken for none where the data cannot tell
-SETTLING = replace(AS_SPECIFIED, bias_rad_s=1.4e-4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,16 +84,19 @@ def instruments(kinds: tuple[Imperfections, ...], places: tuple[float, ...]) -> 
 
     Its axes are of one of the kinds, its lag is, its gyro's scales and its gyro's bias are, each
     whatever the others are: a sensor that was mounted askew need not be late. And so is the place
-    where it was driven. A size that two kinds share counts once.
+    where it was driven.
     """
-    sizes = (
-        dict.fromkeys((kind.turn_rad,) * 3 for kind in kinds),
-        dict.fromkeys((kind.lag_s,) for kind in kinds),
-        dict.fromkeys((kind.scale, *[kind.shape] * 5) for kind in kinds),
-        dict.fromkeys((place,) * 6 for place in places),
-        dict.fromkeys((kind.bias_rad_s,) * 3 for kind in kinds),
-    )
-    every = [tuple(chain.from_iterable(each)) for each in product(*sizes)]
+    every = [
+        (
+            *[axes.turn_rad] * 3,
+            late.lag_s,
+            gyro.scale,
+            *[gyro.shape] * 5,
+            *[place] * 6,
+            *[bias.bias_rad_s] * 3,
+        )
+        for (axes, late, gyro, bias), place in product(product(kinds, repeat=4), places)
+    ]
     found = np.array(every)
     found.flags.writeable = False
     return found
@@ -139,7 +138,7 @@ class EstimatorParameters:
     outlier_sigma: float = 4.6
     mag_noise_floor_gauss: float = 1e-5
     gyro_noise_floor_rad_s: float = 1e-6
-    imperfections: tuple[Imperfections, ...] = (AS_SPECIFIED, SETTLING, ASSEMBLED)
+    imperfections: tuple[Imperfections, ...] = (AS_SPECIFIED, ASSEMBLED)
     places: tuple[float, ...] = PLACES
 
     @property

@@ -22,13 +22,7 @@ from ahrsd.estimator.online import (
     motion_and_misfit,
     turned_heading_deg,
 )
-from ahrsd.estimator.parameters import (
-    AS_SPECIFIED,
-    ASSEMBLED,
-    PLACES,
-    EstimatorParameters,
-    instruments,
-)
+from ahrsd.estimator.parameters import AS_SPECIFIED, ASSEMBLED, PLACES, EstimatorParameters
 from ahrsd.montecarlo import nuisances
 from ahrsd.montecarlo.cramer_rao import Trajectory
 from ahrsd.simulation import ScenarioSettings, simulate
@@ -273,17 +267,6 @@ def test_the_price_where_the_instrument_is_perfect_and_the_motion_rich(motion):
     ratio = ours.sigma / ideal.sigma
     assert ratio.min() >= 1.0 - 1e-9
     assert np.median(ratio) <= 1.03
-
-
-def test_all_instruments_that_may_be_at_all_places():
-    """A size that two kinds share counts once, so that none is believed more for that."""
-    kinds = EstimatorParameters().imperfections
-    every = instruments(kinds, PLACES)
-    assert every.shape == (2 * 2 * 2 * 4 * 3, 19)
-    assert len(np.unique(every, axis=0)) == len(every)
-    of_bias, count = np.unique(every[:, -1], return_counts=True)
-    assert list(of_bias) == [kind.bias_rad_s for kind in kinds]
-    assert len(set(count)) == 1
 
 
 def test_the_widening_is_a_covariance():
