@@ -60,7 +60,7 @@ class InstrumentInformation:
 
     def at(self, c: Array, bias: Array) -> Array:
         """Gradient (28,) there."""
-        return self.g + self.H[:, :12] @ np.r_[c - self.c, bias - self.bias]
+        return np.asarray(self.g + self.H[:, :12] @ np.r_[c - self.c, bias - self.bias])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
