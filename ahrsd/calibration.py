@@ -113,6 +113,13 @@ class Estimate:
     place_gauss:     by how much the field differs with the heading, as it does where it differs
                      from place to place: rms of what is expected; it is in `covariance`. nan where
                      nobody can tell
+    place_deg:       what that and all that the model leaves over make of the calibration's heading,
+                     worst of the headings at the tilts that were driven, 1 sigma; it is in
+                     `heading_sigma_deg`. nan as above
+    gyro_correction: (3, 3) by which the gyro's reading less its bias is multiplied to turn as the
+                     field does; 1 where the data do not ask for another
+    gyro_covariance: (21, 21) of `covariance`'s numbers and of what else that matrix may be: turn
+                     (3), scale, shape (5), as `estimator.epoch` has them. None: it is known
     """
 
     soft_iron: Array
@@ -135,6 +142,9 @@ class Estimate:
     contradicted_s: float | None = None
     widened_by: str = ""
     place_gauss: float = math.nan
+    place_deg: float = math.nan
+    gyro_correction: Array = field(default_factory=lambda: np.eye(3))
+    gyro_covariance: Array | None = None
 
     @property
     def correction(self) -> Affine:

@@ -44,7 +44,7 @@ class GateLimits:
     field_spread_ram_percent: float = 2.0
     field_spread_flash_percent: float = 1.0
     max_inclination_error_deg: float = 3.0
-    max_place_gauss: float = 2e-4
+    max_place_deg: float = 0.1
     holdout_segments: float = 2.0
     min_holdout_excursion_deg: float = 280.0
     holdout_rms_deg: float = 1.5
@@ -404,14 +404,16 @@ FIELD = (
     most(
         "field.place",
         "G4",
-        "estimate.place_gauss",
-        "gauss",
-        "max_place_gauss",
+        "estimate.place_deg",
+        "deg",
+        "max_place_deg",
         Level.FLASH,
-        meaning="by how much the field differs with the heading, as it does from place to place",
-        advice="the field may differ by {v:.2g} gauss with where the vehicle heads (limit "
-        "{l:.2g}), and what is alike of that on all headings is taken for iron: repeat it in the "
-        "open; `ahrsd diagnose` of the recording says what it is",
+        meaning="what a field that differs from place to place, and all else that the model leaves "
+        "over, may make of the heading, 1 sigma",
+        advice="what the field does beside iron may make {v:.2f} deg of heading (limit {l:.2f}): "
+        "it differs from place to place, or the iron changes, and what is alike of that on all "
+        "headings is taken for iron; repeat it in the open; `ahrsd diagnose` of the recording says "
+        "what it is",
         missing="gravity is needed to tell where the vehicle heads",
     ),
 )

@@ -337,8 +337,9 @@ class GatesSection(Section):
         default=_LIMITS.max_inclination_error_deg, ge=0.0, le=180.0
     )
     """Dip of the corrected field against the world model. [deg]"""
-    max_place_gauss: float = Field(default=_LIMITS.max_place_gauss, ge=0.0, le=2.5)
-    """By how much the field differs with the heading, as it does from place to place. [gauss]"""
+    max_place_deg: float = Field(default=_LIMITS.max_place_deg, ge=0.0, le=180.0)
+    """What a field that differs from place to place, and all else that is left over, may make of
+    the heading, 1 sigma. [deg]"""
     holdout_segments: float = Field(default=_LIMITS.holdout_segments, ge=0.0, le=100.0)
     """Held-out segments that turned by 60 deg and more. [segments]"""
     min_holdout_excursion_deg: float = Field(

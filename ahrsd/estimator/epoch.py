@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import is_not
 
 import numpy as np
 
@@ -51,11 +50,17 @@ class EpochContent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstrumentInformation:
-    """Quadratic of an epoch in iron and instrument (see `instrument`): H (28, 28), g (28,) at c."""
+    """Quadratic of an epoch in iron, gyro's bias and instrument (see `instrument`): H (28, 28), and
+    g (28,) at c (9,) and bias (3,), where the epoch was linearised."""
 
     H: Array
     g: Array
     c: Array
+    bias: Array
+
+    def at(self, c: Array, bias: Array) -> Array:
+        """Gradient (28,) there."""
+        return np.asarray(self.g + self.H[:, :12] @ np.r_[c - self.c, bias - self.bias])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,8 +301,10 @@ def _squares(
 # What an instrument may have besides iron and bias: turned axes, a lag, a wrong scale of angles.
 #
 # Turn: the magnetometer's axes are taken to be the gyro's. If they are not, the rate in the
-# magnetometer's frame is R w with R = Exp(theta), and a step's rotation is R phi. Derivative:
-# dq/dtheta = dq/dphi dphi/dtheta = (dq/dw_b / dt) [phi]x.
+# magnetometer's frame is R w with R = Exp(theta), and a step's rotation is R phi, phi without the
+# bias: what rests tell of the bias in the readings is then nothing of the gyro's matrix, and the
+# bias is in the gyro's own axes. Derivative: dq/dtheta = dq/dphi dphi/dtheta = (dq/dw_b / dt)
+# [phi]x.
 #
 # Lag: a reading of the field that is tau late is that of the direction u(t - tau). With du/dt = -w
 # x u its derivative is dr/dtau = -M (w x u) / s_m.
@@ -388,6 +395,10 @@ class TakenOut:
         return replace(self, gyro=(np.eye(3) + more) @ self.gyro)
 
 
+#: (9, 3, 3) matrices of one of each of turn, scale and shape, on the gyro's angles
+GYRO_WAYS = np.array([TakenOut.nothing().with_gyro(one).gyro - np.eye(3) for one in np.eye(9)])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Instrument:
     """Step (17,) from the answer in [M (6), b (3), w_b (3), theta (3), tau, s], and its covariance.
@@ -421,27 +432,27 @@ InformationStack = tuple[Array, Array]
 """H (N, 17, 17) and gradient (N, 17) of epochs, all directions eliminated."""
 
 
-class InstrumentInformations:
-    """Quadratics of the epochs with motion around the present estimate, computed once."""
+def informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+    """Quadratics of the epochs with motion around the present estimate.
 
-    def __init__(self) -> None:
-        self._kept: tuple[list[object], InformationStack] | None = None
+    LinAlgError where none has motion, or its directions are not determined.
+    """
+    H, g = whole_informations(epochs, graph)
+    return H[:, :_ASKED, :_ASKED], g[:, :_ASKED]
 
-    def of(self, epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
-        """LinAlgError where none has motion, or its directions are not determined."""
-        H, g = self.whole(epochs, graph)
-        return H[:, :_ASKED, :_ASKED], g[:, :_ASKED]
 
-    def whole(self, epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
-        """The same with the gyro's shape and the place: H (N, 28, 28) and gradient (N, 28)."""
-        at: list[object] = [graph.c, *epochs, *graph.nodes.values()]
-        kept = self._kept
-        if kept is None or len(kept[0]) != len(at) or any(map(is_not, kept[0], at)):
-            moving = [epoch for epoch in epochs if epoch.turned]
-            if not moving:
-                raise np.linalg.LinAlgError("no epoch with motion")
-            kept = self._kept = (at, _informations(moving, graph))
-        return kept[1]
+def whole_informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+    """The same with the gyro's shape and the place: H (N, 28, 28) and gradient (N, 28).
+
+    Each as it was where the epoch was linearised, so that it is computed once for each.
+    """
+    linearise_instrument(epochs)
+    told = [(e.instrument, graph.nodes[e.a].bias) for e in epochs if e.turned]
+    if not told:
+        raise np.linalg.LinAlgError("no epoch with motion")
+    known = [(one, bias) for one, bias in told if one is not None]
+    H = np.array([one.H for one, _ in known])
+    return H, np.array([one.at(graph.c, bias) for one, bias in known])
 
 
 def of_rests(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
@@ -516,11 +527,12 @@ def _place(c: Array, taken: TakenOut) -> Array:
     return x
 
 
-def linearise_instrument(epochs: Sequence[WindowEpoch], graph: Graph) -> None:
-    """Compute `WindowEpoch.instrument` of the epochs with motion that do not have it yet."""
+def linearise_instrument(epochs: Sequence[WindowEpoch]) -> None:
+    """Compute `WindowEpoch.instrument` of the epochs with motion that do not have it yet, together
+    those that were linearised at one calibration."""
     silent = [epoch for epoch in epochs if epoch.turned and epoch.instrument is None]
-    if silent:
-        _informations(silent, graph)
+    for place in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in silent}.values():
+        _informations([epoch for epoch in silent if epoch.factor.point.c is place], place)
 
 
 def lag_known(
@@ -531,7 +543,7 @@ def lag_known(
     The iron is estimated with that lag. Its errors at the true lag do not correlate with that of
     the lag, so what both make adds up.
     """
-    linearise_instrument(epochs, graph)
+    linearise_instrument(epochs)
     H = past.at(graph.c, TakenOut.nothing())[0]
     H = H + sum(epoch.instrument.H for epoch in epochs if epoch.instrument is not None)
     H = believed(graph, sigma_bias)[0] + H[:_ASKED, :_ASKED]
@@ -692,10 +704,35 @@ class Weighed:
         return int(np.argmax(others)), float(others.max() - self.evidence[plain].max())
 
 
-def considered(weighed: Weighed) -> tuple[Array, dict[str, Array], float]:
-    """What imperfections of the instrument add to the covariance of [M, b, w_b] (12, 12); what each
-    of `IMPERFECTIONS` alone adds, which together may be more or less; and by how much the field
-    differs with the heading, rms of what is expected of its six numbers [gauss].
+@dataclass(frozen=True, slots=True, eq=False)
+class Widening:
+    """What imperfections of the instrument and the place do to an answer.
+
+    added: to the covariance (12, 12) of [M, b, w_b]; parts: what each of `IMPERFECTIONS` alone
+    adds, which together may be more or less; place_gauss: by how much the field differs with the
+    heading, rms of what is expected of its six numbers; gyro (9, 9): covariance of turn, scale and
+    shape of the gyro's angles beyond what is taken out; with_gyro (12, 9): and with [M, b, w_b]
+    """
+
+    added: Array
+    parts: dict[str, Array]
+    place_gauss: float
+    gyro: Array
+    with_gyro: Array
+
+    def joint(self, covariance: Array, K: Array) -> Array:
+        """(21, 21) of K (12, 12) times [M, b, w_b], whose covariance is given, and the gyro's."""
+        beside = K @ self.with_gyro
+        return np.block([[covariance, beside], [beside.T, self.gyro]])
+
+    @staticmethod
+    def nothing() -> Widening:
+        """Of a perfect instrument, or where nobody can tell."""
+        return Widening(np.zeros((12, 12)), {}, float("nan"), np.zeros((9, 9)), np.zeros((12, 9)))
+
+
+def considered(weighed: Weighed) -> Widening:
+    """What imperfections of the instrument do to the answer.
 
     The answer takes the instrument to be perfect. It is one of `instruments`, each as likely as
     the data make it. Of each, what the data leave open of the imperfections spreads the answer, and
@@ -707,8 +744,13 @@ def considered(weighed: Weighed) -> tuple[Array, dict[str, Array], float]:
     mean = np.tensordot(likely, weighed.spread, 1) + (likely * rest.T) @ rest
     added = by_rest @ mean @ by_rest.T
     each = [by_rest[:, i] @ mean[np.ix_(i, i)] @ by_rest[:, i].T for i in _EACH]
-    place = float(np.sqrt(np.mean(np.diag(mean)[_PLACE])))
-    return np.asarray((added + added.T) / 2), dict(zip(IMPERFECTIONS, each, strict=True)), place
+    return Widening(
+        (added + added.T) / 2,
+        dict(zip(IMPERFECTIONS, each, strict=True)),
+        float(np.sqrt(np.mean(np.diag(mean)[_PLACE]))),
+        mean[np.ix_(GYRO_OF_ALL, GYRO_OF_ALL)],
+        by_rest @ mean[:, GYRO_OF_ALL],
+    )
 
 
 def walk_asked(weighed: Weighed, span_s: float) -> float:
@@ -773,15 +815,17 @@ def disagreement(H: Array, g: Array, steps: Array) -> float:
     return float(np.sum(asked[good] ** 2 / values[good]) / max(count - H.shape[1], 0.2 * count))
 
 
-def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+def _informations(epochs: Sequence[WindowEpoch], c: Array) -> None:
+    """`WindowEpoch.instrument` of epochs that were linearised at c."""
     rows = chain.Rows.of(
-        [chain.Chain(e.data, e.u, graph.nodes[e.a].bias, e.used, e.weights) for e in epochs]
+        [chain.Chain(e.data, e.u, e.factor.point.a.bias, e.used, e.weights) for e in epochs]
     )
-    field, motion = chain.parts(rows, graph.c)
-    turn = _of_angle(motion.by_bias / rows.dt_s, rows.angle_b_rad)
+    field, motion = chain.parts(rows, c)
+    turned = rows.angle_b_rad - rows.bias * rows.dt_s
+    turn = _of_angle(motion.by_bias / rows.dt_s, turned)
     seen = np.concatenate([e.data.seen(e.u) for e in epochs])
     rate = np.concatenate([rates(e.data) for e in epochs])
-    swept = chain.symmetric(graph.c[:6]) @ np.cross(rate, seen).T
+    swept = chain.symmetric(c[:6]) @ np.cross(rate, seen).T
     late = field.by_x[0, 6] * swept  # by_x holds - sqrt(weight) / s_m in that place
     diag, upper, border = chain.interior(field, motion)
     columns = np.zeros((2, _SIZE + 1, len(rate)))
@@ -789,7 +833,7 @@ def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationSta
     columns[:, _OF_ANGLE] = -motion.scale * turn
     columns[:, _OF_ANGLE, :-1] += np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], turn[:, :, 1:])
     columns[:, LAG] = np.einsum("rn,rin->in", late, field.own)
-    place = _by_place(field, seen, np.concatenate([e.data.down_b for e in epochs]), graph.c)
+    place = _by_place(field, seen, np.concatenate([e.data.down_b for e in epochs]), c)
     columns[:, PLACE] = np.einsum("rjn,rin->ijn", place, field.own)
     _, half = halfway(diag, upper, np.ascontiguousarray(columns.transpose(1, 2, 0)))
     J = np.concatenate([field.by_x, late[:, None], place, field.r[:, None]], axis=1)
@@ -802,8 +846,8 @@ def _informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationSta
         H[k][_MOTION] += chain.squares(K[:, :, a:b])
     for epoch, own in zip(epochs, H, strict=True):
         own[_SCALES, _SIZE] -= _by_noise(epoch)
-        epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], graph.c)
-    return H[:, :_SIZE, :_SIZE], H[:, :_SIZE, _SIZE]
+        at = c, epoch.factor.point.a.bias
+        epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], *at)
 
 
 def _by_place(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Array:

@@ -59,7 +59,7 @@ def divided(
 ) -> Division | None:
     """Whether a second hard iron is asked for from some epoch on; None for too few epochs.
 
-    epochs: what they say (`InstrumentInformations`) at a settled calibration, linear around it.
+    epochs: what they say (`epoch.informations`) at a settled calibration, linear around it.
     sigma_bias (rad/s) and sigma_b (gauss): what is believed of gyro bias and of a change
     without data.
     """

@@ -25,14 +25,16 @@ from ahrsd.estimator.epoch import (
     TOLD,
     Considered,
     Instrument,
-    InstrumentInformations,
     TakenOut,
     Weighed,
+    Widening,
     considered,
     gyro_asked,
+    informations,
     instrument,
     of_rests,
     walk_asked,
+    whole_informations,
 )
 from ahrsd.estimator.epoch_data import EpochBuilder, check_samples, with_border
 from ahrsd.estimator.graph import BLIND, Node, SingularError, curvature, whitening
@@ -88,7 +90,7 @@ def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float
     J = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], axis=2)
     row = (along[:, None, :] @ J)[:, 0]
     variance = np.sum((row @ covariance[:9, :9]) * row, axis=1)
-    return float(np.degrees(np.sqrt(max(float(np.max(variance)), 0.0))))
+    return float(np.degrees(np.sqrt(np.maximum(np.max(variance), 0.0))))
 
 
 def turned_heading_deg(turn_rad: Array, down_b: Array, dip_rad: float) -> float:
@@ -184,6 +186,13 @@ class HeadingAdvice:
         if most == "misfit" and (left := slow()) is not None and left.words:
             return left.words
         return _WIDENED[most]
+
+    def by_place_deg(self, parts: Mapping[str, Array]) -> float:
+        """What a field that differs by place makes of the heading, 1 sigma; nan: unknown.
+
+        Where it does not differ with the heading it is misfit.
+        """
+        return self._sigma_deg(parts["place"] + parts["misfit"]) if "place" in parts else np.nan
 
     def manoeuvre(self, covariance: Array) -> str:
         """The easiest of a turn, a roll and a pitch after which the heading is known as well as
@@ -357,7 +366,6 @@ class Estimator:
         self._strange = 0
         self._doubted_s: float | None = None  # since when the newest motion contradicts the answer
         self._parted = 1.0  # variance over the expected of what earlier and later data ask for
-        self._informations = InstrumentInformations()
         self._misscaled = 0.0  # share of themselves by which the gyro's angles are too small
         self.restarted_s: float | None = None  # when the iron changed, if it did
 
@@ -467,10 +475,8 @@ class Estimator:
             return window
         p = self.parameters
         try:
-            informations = self._informations.of(window.epochs, window.graph)
-            found = divided(
-                informations, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss
-            )
+            told = informations(window.epochs, window.graph)
+            found = divided(told, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss)
         except np.linalg.LinAlgError:
             return window
         self._parted = 1.0 if found is None else found.parted
@@ -541,7 +547,6 @@ class Estimator:
                 self._misscaled = misscaled
                 if not window.left_over:
                     break
-        self._informations = InstrumentInformations()  # nobody else asks before they are others
         return window, late
 
     def _explained(self, trial: Window, before: Window, told: float) -> bool:
@@ -591,10 +596,10 @@ class Estimator:
 
     def _instrument(self, window: Window) -> Instrument | None:
         try:
-            informations = self._informations.of(window.epochs, window.graph)
+            told = informations(window.epochs, window.graph)
             before = window.past.at(window.graph.c, window.taken)
             sigma_bias, scaled = self.parameters.prior_gyro_bias_rad_s, window.taken.numbers[3]
-            return instrument(informations, window.graph, sigma_bias, before, scaled)
+            return instrument(told, window.graph, sigma_bias, before, scaled)
         except np.linalg.LinAlgError:
             return None
 
@@ -604,7 +609,7 @@ class Estimator:
             return None
         before = window.folded_information.at(window.graph.c, window.taken)
         try:
-            moving = self._informations.whole(window.epochs, window.graph)
+            moving = whole_informations(window.epochs, window.graph)
             rests = of_rests(window.epochs, window.graph)
             said = np.concatenate([moving[0], rests[0]]), np.concatenate([moving[1], rests[1]])
             apart = sorted(window.epochs, key=lambda e: not e.turned)
@@ -654,13 +659,10 @@ class Estimator:
         known = window.lag_known() if window.taken.lag_s != 0.0 else None
         return np.zeros((12, 12)) if known is None else np.outer(known.spread, known.spread)
 
-    def _by_imperfections(self, window: Window) -> tuple[Array, dict[str, Array], float]:
-        """What an instrument that is not perfect adds to the covariance (12, 12), and each part;
-        by how much the field differs with the heading, gauss, nan where nobody can tell."""
+    def _by_imperfections(self, window: Window) -> Widening:
+        """What an instrument that is not perfect does to the answer."""
         weighed = self._weighed(window)
-        if weighed is None:
-            return np.zeros((12, 12)), {}, float("nan")
-        return considered(weighed)
+        return Widening.nothing() if weighed is None else considered(weighed)
 
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
@@ -668,16 +670,16 @@ class Estimator:
         if window is None or not self._agreed:
             return None
         try:
-            informations = self._informations.of(window.epochs, window.graph)
+            told = informations(window.epochs, window.graph)
             sigma_bias, taken = self.parameters.prior_gyro_bias_rad_s, window.taken.numbers[:3]
-            return misalignment(informations, window.graph, sigma_bias, taken)
+            return misalignment(told, window.graph, sigma_bias, taken)
         except np.linalg.LinAlgError:
             return None
 
     def _copy(self) -> Estimator:
         other = copy(self)
         other._builder, other._down = self._builder.copy(), self._down.copy()
-        other._new, other._informations = list(self._new), InstrumentInformations()
+        other._new = list(self._new)
         other._window = None if self._window is None else self._window.copy()
         return other
 
@@ -690,16 +692,17 @@ class Estimator:
             covariance = graph.covariance()
         except SingularError:
             return None
-        covariance = covariance * graph.temper
-        observed = observability(covariance, self._whitening)
+        observed = observability(covariance * graph.temper, self._whitening)
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
-        by_instrument, parts, place_gauss = self._by_imperfections(window)
+        widening = self._by_imperfections(window)
         tempered = window.covariance()
         divided = tempered * self._parted
-        parts |= motion_and_misfit(window.explained_covariance(), divided, self._whitening)
+        parts = widening.parts | motion_and_misfit(
+            window.explained_covariance(), divided, self._whitening
+        )
         covariance = divided * (1.0 + doubt**2)
-        covariance = covariance + self._by_lag(window) + by_instrument
+        covariance = covariance + self._by_lag(window) + widening.added
         covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = unit_volume(graph.c)
         K = np.eye(12)
@@ -735,5 +738,8 @@ class Estimator:
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,
             widened_by=advice.widened_by(parts, covariance, turned, window.slow_residual),
-            place_gauss=place_gauss,
+            place_gauss=widening.place_gauss,
+            place_deg=advice.by_place_deg(parts),
+            gyro_correction=window.taken.gyro,
+            gyro_covariance=widening.joint(K @ covariance @ K.T, K),
         )

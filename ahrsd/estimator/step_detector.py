@@ -17,13 +17,16 @@ filter (`innovation`) takes a loop over samples; beside a running estimator that
 a block the same whitened innovations come without one: the gyro carries every reading into the
 frame of the block's first one, where the field stands still,
 
-    y_k = R_k C (m_k - b) = h + noise,   R_k = R_k-1 Exp((w_k - w_b) dt)
+    y_k = R_k C (m_k - b) = h + noise,   R_k = R_k-1 Exp(G (w_k - w_b) dt)
 
 and the noise is white (magnetometer) plus, across the field, a random walk (gyro). The inverse of
 the Cholesky factor of its covariance gives the innovations of the filter that starts knowing
 nothing of h; it is the same for every block. The field h of the block is projected out, so a block
 says nothing while the vehicle stands, whatever is the matter with the field around it; so is a lag
-between the two sensors, which nearly every stream has and no calibration knows of.
+between the two sensors, which nearly every stream has and no calibration knows of. G is what the
+estimator takes out of the gyro's angles (`Estimate.gyro_correction`): wrong scales are a bias that
+changes with the sense of turning. What is not known of it yet is considered, as an error of the
+calibration.
 """
 
 from __future__ import annotations
@@ -35,13 +38,16 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.calibration import Estimate
+from ahrsd.estimator.epoch import GYRO_WAYS, TakenOut
 from ahrsd.samples import Array, SampleBlock
 
 ROWS = 128  # thinned samples in a block
 LAG_S = 0.05  # 1-sigma of a lag between magnetometer and gyro
 LEAST_ROWS = 64  # in a piece before a gap that is worth scoring
-#: columns of a block: those of `Estimate.covariance`, then a drift of the field in the world
-SOFT, IRON, GYRO, DRIFT = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 15)
+#: columns of a block: those of `Estimate.gyro_covariance`, then a drift of the field in the world
+SOFT, IRON, GYRO, MATRIX = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 21)
+DRIFT, _LAG, _RESIDUAL = slice(21, 24), 27, 28
+_KNOWN, _OWN = 21, slice(24, 28)  # and a block's own field (3) and lag
 _ENTRIES = np.triu_indices(3)
 # 1-sigma that no calibration is believed to fall below: what moves by itself from minute to minute
 _FLOOR = np.r_[np.full(6, 1e-3), np.full(3, 5e-4), np.full(3, 2e-4)]
@@ -50,13 +56,18 @@ _KEEP_ROOT = 1.2  # the whitening is kept while the ratio of the noises is withi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceCalibration:
-    """A calibration to test: theta (12,) and a root (12, 12) of its covariance, and the noises."""
+    """A calibration to test: theta (21,) and a root (21, 21) of its covariance, and the noises.
+
+    theta: as `Estimate.covariance` has them, then turn, scale and shape of the gyro's correction
+    gyro_correction (3, 3): on the gyro's reading less its bias
+    """
 
     theta: Array
     root: Array
     correction: Array
     offset: Array
     gyro_bias_rad_s: Array
+    gyro_correction: Array
     noise_mag_gauss: float
     noise_gyro_rad_s: float
 
@@ -64,13 +75,22 @@ class ReferenceCalibration:
     def of(estimate: Estimate) -> ReferenceCalibration:
         """The estimate, in the order of its covariance."""
         A = estimate.soft_iron
-        values, vectors = np.linalg.eigh(estimate.covariance + np.diag(_FLOOR**2))
+        covariance = np.zeros((_KNOWN, _KNOWN))
+        covariance[:12, :12] = estimate.covariance
+        if estimate.gyro_covariance is not None:
+            covariance = estimate.gyro_covariance.copy()
+        covariance[:12, :12] += np.diag(_FLOOR**2)
+        # so different are their units that the small ones would be lost
+        size = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
+        values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
+        gyro = replace(TakenOut.nothing(), gyro=estimate.gyro_correction)
         return ReferenceCalibration(
-            np.r_[A[_ENTRIES], estimate.hard_iron_gauss, estimate.gyro_bias_rad_s],
-            vectors * np.sqrt(np.maximum(values, 0.0)),
+            np.r_[A[_ENTRIES], estimate.hard_iron_gauss, estimate.gyro_bias_rad_s, gyro.numbers],
+            size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)),
             np.asarray(np.linalg.inv(A), float),
             estimate.hard_iron_gauss,
             estimate.gyro_bias_rad_s,
+            estimate.gyro_correction,
             max(estimate.noise_mag_gauss, 1e-5),
             max(estimate.noise_gyro_rad_s, 1e-6),
         )
@@ -90,7 +110,7 @@ class Thinned:
 class ScoredBlock:
     """A scored block.
 
-    information (15, 15), score (15,): of the columns, the block's own field and lag projected out
+    information (24, 24), score (24,): of the columns, the block's own field and lag projected out
     residual (n, 3), lever (n, 3, 3): y - h and how it moves with the hard iron, carried frame
     """
 
@@ -115,22 +135,27 @@ class Scorer:
         dt_s = np.diff(rows.time_s, prepend=rows.time_s[:1])
         turn = np.diff(rows.angle_b_rad, axis=0, prepend=rows.angle_b_rad[:1])
         turn -= dt_s[:, None] * reference.gyro_bias_rad_s
+        turn = turn @ reference.gyro_correction.T
         R = carried(so3.exp(turn))
         lever = R @ reference.correction
         y = (lever @ (rows.raw_b_gauss - reference.offset)[:, :, None])[:, :, 0]
         h = y.mean(axis=0)
-        Z = np.zeros((n, 3, 20))
+        Z = np.zeros((n, 3, _RESIDUAL + 1))
+        across = so3.skew(h)
         Z[:, :, SOFT] = lever @ _soft(h @ R)
         Z[:, :, IRON] = lever
-        Z[:, :, GYRO] = -so3.skew(h) @ np.cumsum(R * dt_s[:, None, None], axis=0)
-        Z[:, [0, 1, 2], [12, 13, 14]] = np.linspace(-1.0, 1.0, n)[:, None]
-        Z[:, [0, 1, 2], [15, 16, 17]] = 1.0
-        Z[:, :, 18] = np.cross(h, (R @ _rate(turn, dt_s)[:, :, None])[:, :, 0])
-        Z[:, :, 19] = y - h
+        gone = np.cumsum(R * dt_s[:, None, None], axis=0) @ reference.gyro_correction
+        Z[:, :, GYRO] = -across @ gone
+        ways = np.einsum("nij,kjl,nl->nik", R, GYRO_WAYS, turn, optimize=True)
+        Z[:, :, MATRIX] = across @ np.cumsum(ways, axis=0)
+        Z[:, [0, 1, 2], [21, 22, 23]] = np.linspace(-1.0, 1.0, n)[:, None]
+        Z[:, [0, 1, 2], [24, 25, 26]] = 1.0
+        Z[:, :, _LAG] = np.cross(h, (R @ _rate(turn, dt_s)[:, :, None])[:, :, 0])
+        Z[:, :, _RESIDUAL] = y - h
         G = self._gram(Z, h, reference, float(dt_s[1:].mean()), rows.averaged)
-        own = G[15:19, 15:19] + np.diag([0.0, 0.0, 0.0, LAG_S**-2])
-        G = G - G[:, 15:19] @ np.linalg.solve(own, G[15:19])
-        return ScoredBlock(reference, rows.time_s, G[:15, :15], G[:15, 19], y - h, lever)
+        own = G[_OWN, _OWN] + np.diag([0.0, 0.0, 0.0, LAG_S**-2])
+        G = G - G[:, _OWN] @ np.linalg.solve(own, G[_OWN])
+        return ScoredBlock(reference, rows.time_s, G[:24, :24], G[:24, _RESIDUAL], y - h, lever)
 
     def _gram(
         self, Z: Array, h: Array, reference: ReferenceCalibration, dt_s: float, averaged: int
@@ -414,15 +439,17 @@ def _informative(block: ScoredBlock) -> bool:
 
 
 def _believed(blocks: list[ScoredBlock], reference: ReferenceCalibration) -> tuple[Array, Array]:
-    """Information (12, 12) and score (12,) of what departs from it, less its own error."""
-    total = sum((b.information[:12, :12] for b in blocks), np.zeros((12, 12)))
-    score = np.zeros(12)
+    """Information (21, 21) and score (21,) of what departs from it, less its own error."""
+    known = slice(0, _KNOWN)
+    total = sum((b.information[known, known] for b in blocks), np.zeros((_KNOWN, _KNOWN)))
+    score = np.zeros(_KNOWN)
     for b in blocks:
-        score += b.score[:12] + b.information[:12, :12] @ (b.reference.theta - reference.theta)
+        moved = b.reference.theta - reference.theta
+        score += b.score[known] + b.information[known, known] @ moved
     K = total @ reference.root
-    inner = np.eye(12) + reference.root.T @ K
+    inner = np.eye(_KNOWN) + reference.root.T @ K
     solved = np.linalg.solve(inner, np.column_stack([K.T, reference.root.T @ score]))
-    return total - K @ solved[:, :12], score - K @ solved[:, 12]
+    return total - K @ solved[:, known], score - K @ solved[:, _KNOWN]
 
 
 def _gains(
@@ -449,12 +476,13 @@ def _share(block: ScoredBlock, reference: ReferenceCalibration, what: str, size:
 
 def _drift_gain(block: ScoredBlock, reference: ReferenceCalibration) -> float:
     """T of a field that changes in the world during the block."""
-    score = block.score + block.information[:, :12] @ (block.reference.theta - reference.theta)
-    G, K = block.information, block.information[:, :12] @ reference.root
-    inner = np.eye(12) + reference.root.T @ K[:12]
-    solved = np.linalg.solve(inner, np.column_stack([K.T, reference.root.T @ score[:12]]))
-    J = (G - K @ solved[:, :15])[DRIFT, DRIFT] + np.eye(3) * 1e-6
-    s = (score - K @ solved[:, 15])[DRIFT]
+    known = slice(0, _KNOWN)
+    score = block.score + block.information[:, known] @ (block.reference.theta - reference.theta)
+    G, K = block.information, block.information[:, known] @ reference.root
+    inner = np.eye(_KNOWN) + reference.root.T @ K[known]
+    solved = np.linalg.solve(inner, np.column_stack([K.T, reference.root.T @ score[known]]))
+    J = (G - K @ solved[:, : len(G)])[DRIFT, DRIFT] + np.eye(3) * 1e-6
+    s = (score - K @ solved[:, len(G)])[DRIFT]
     return float(s @ np.linalg.solve(J, s))
 
 

@@ -208,7 +208,7 @@ class Window:
         if not old.turned:
             return
         if old.instrument is None:  # the others will be asked soon; together it is cheaper
-            linearise_instrument([old, *self.epochs], self.graph)
+            linearise_instrument([old, *self.epochs])
         if old.instrument is not None:
             sigma_bias = self.parameters.prior_gyro_bias_rad_s
             told = old.instrument, self.taken, sigma_bias

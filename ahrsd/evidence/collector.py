@@ -357,5 +357,5 @@ def _facts(estimate: Estimate) -> EstimateFacts:
         float(estimate.observability.score),
         float(estimate.heading_sigma_deg),
         estimate.widened_by,
-        float(estimate.place_gauss),
+        float(estimate.place_deg),
     )

@@ -53,7 +53,8 @@ class EstimateFacts:
     """What the estimator says about itself.
 
     widened_by: what makes the most of the heading's sigma and what would shrink it; empty: nothing
-    place_gauss: by how much the field differs with the heading; nan: unknown
+    place_deg: what a field that differs by place, and all that is left over, makes of the heading,
+        1 sigma; nan: unknown
     """
 
     converged: bool
@@ -61,7 +62,7 @@ class EstimateFacts:
     score: float
     heading_sigma_deg: float
     widened_by: str = ""
-    place_gauss: float = math.nan
+    place_deg: float = math.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
+import pieces
 import pytest
 from tracks import RECORDINGS, experiment
 
@@ -14,6 +15,7 @@ from ahrsd.config.config import Config, core_settings
 from ahrsd.core.core import Core
 from ahrsd.core.estimation import Calibrator
 from ahrsd.core.settings import CalibratorSettings
+from ahrsd.estimator.epoch import GYRO_WAYS, TakenOut
 from ahrsd.estimator.step_detector import (
     KEPT,
     ReferenceCalibration,
@@ -148,6 +150,66 @@ def test_an_hour_without_a_change_is_silent(scenario, seed):
     assert detector.scored == 45000 // 128
 
 
+def turning(seed: int, wrong: Array) -> tuple[SampleBlock, Estimate, Estimate, Estimate]:
+    """Circles to one side and then to the other, and a gyro that is wrong by this matrix; what is
+    known of it, what whoever took it for perfect found in the first circles: another bias, and
+    what one says to whom they do not tell a bias from a matrix."""
+    made = pieces.drive((("circles", 300.0), ("roll", 60.0), ("circles", 300.0)), seed)
+    rate = made.rate_b_rad_s
+    gyro = made.block.gyro_b_rad_s + rate @ (wrong - np.eye(3)).T
+    known = Estimate(
+        soft_iron=pieces.SOFT_IRON,
+        hard_iron_gauss=pieces.HARD_IRON_GAUSS,
+        gyro_bias_rad_s=pieces.GYRO_BIAS_RAD_S,
+        field_gauss=0.49,
+        field_known=False,
+        covariance=np.diag(SIGMA**2),
+        noise_mag_gauss=pieces.MAG_GAUSS,
+        noise_gyro_rad_s=pieces.GYRO_RAD_S,
+        misfit=1.0,
+        heading_sigma_deg=0.3,
+        observability=Observability(np.zeros(12), (), 2.0),
+        samples=5000,
+        duration_s=200.0,
+        converged=True,
+        gyro_correction=np.linalg.inv(wrong),
+    )
+    mean = rate[made.block.time_s < 200.0].mean(axis=0)
+    passes = (wrong - np.eye(3)) @ mean
+    perfect = replace(
+        known, gyro_correction=np.eye(3), gyro_bias_rad_s=known.gyro_bias_rad_s + passes
+    )
+    # of bias and matrix only the sum at that rate is known
+    own = np.r_[np.full(3, 0.02), np.full(6, 0.01)] ** 2
+    spread = np.vstack([np.zeros((9, 9)), (GYRO_WAYS @ mean).T, np.eye(9)])
+    covariance = spread @ np.diag(own) @ spread.T
+    covariance[:12, :12] += known.covariance
+    doubting = replace(perfect, gyro_covariance=covariance)
+    return replace(made.block, gyro_b_rad_s=gyro), known, perfect, doubting
+
+
+def test_a_wrong_scale_that_the_estimator_took_out_is_no_step_of_the_bias():
+    """Where the sense of turning changes, a scale of 1 % is another bias."""
+    wrong = np.eye(3) + np.array([[0.004, 0.0, 0.01], [0.0, -0.006, 0.0], [0.0, 0.005, 0.01]])
+    jump = np.array([0.0, 0.004, -0.006])
+    told = 0
+    for seed in (4, 5):
+        block, known, perfect, doubting = turning(seed, wrong)
+        parts = [block.part(slice(a, a + 40), gap_before=a == 0) for a in range(0, len(block), 40)]
+        assert watched(parts, known) is None
+        assert watched(parts, doubting) is None
+        step = watched(parts, perfect)
+        told += step is not None and step.what == "gyro bias"
+        on = (block.time_s > 200.0)[:, None]
+        other = replace(block, gyro_b_rad_s=block.gyro_b_rad_s + on * jump)
+        parts = [other.part(slice(a, a + 40), gap_before=a == 0) for a in range(0, len(block), 40)]
+        step = watched(parts, known)
+        assert step is not None
+        assert step.what == "gyro bias"
+        assert np.all(np.abs(step.size - jump) < 4 * step.sigma + 3e-4)
+    assert told == 2
+
+
 def test_heavy_tails_colour_and_a_lag_are_no_steps():
     made = experiment("mam", samples=45000, rate_hz=12.5, seed=3)
     rng, raw = np.random.default_rng(3), made.samples.raw_b_gauss.copy()
@@ -250,15 +312,22 @@ def test_a_block_says_what_the_model_says():
     right = replace(estimate_of(made), covariance=np.diag(SIGMA**2))
     scorer = Scorer()
     base = scorer.score(rows, ReferenceCalibration.of(right))
-    theta = np.r_[np.zeros(6), 2e-4, -1e-4, 1e-4, 3e-5, -2e-5, 4e-5]
+    theta = np.r_[np.zeros(6), 2e-4, -1e-4, 1e-4, 3e-5, -2e-5, 4e-5, np.zeros(9)]
     theta[[1, 3]] = 3e-4, -2e-4
+    theta[12:] = 1e-4 * np.array([3.0, -2.0, 4.0, 2.0, -3.0, 1.0, 2.0, -2.0, 1.0])
     off = ReferenceCalibration.of(right).theta - theta
     A = np.zeros((3, 3))
     A[np.triu_indices(3)] = off[:6]
     A = A + A.T - np.diag(np.diag(A))
-    moved = replace(right, soft_iron=A, hard_iron_gauss=off[6:9], gyro_bias_rad_s=off[9:])
-    found = scorer.score(rows, ReferenceCalibration.of(moved)).score[:12] - base.score[:12]
-    expected = base.information[:12, :12] @ theta
+    moved = replace(
+        right,
+        soft_iron=A,
+        hard_iron_gauss=off[6:9],
+        gyro_bias_rad_s=off[9:12],
+        gyro_correction=TakenOut.nothing().with_gyro(off[12:]).gyro,
+    )
+    found = scorer.score(rows, ReferenceCalibration.of(moved)).score[:21] - base.score[:21]
+    expected = base.information[:21, :21] @ theta
     assert np.allclose(found, expected, atol=0.02 * np.abs(expected).max())
 
 

@@ -359,6 +359,14 @@ def test_where_the_field_is_the_same_everywhere_the_data_say_so(motion):
         assert found.place_gauss < 2e-4
 
 
+def test_a_field_that_differs_otherwise_than_with_the_heading_is_misfit_and_counts_as_a_place():
+    """In degrees of heading: nothing where the field is the same everywhere."""
+    made = pieces.drive(LEVEL_AND_LEANING, 2)
+    assert answer(made).place_deg < 0.01
+    found = answer(wandering(made, 2e-3))
+    assert 0.1 < found.place_deg < found.heading_sigma_deg
+
+
 def test_what_no_motion_tells_of_a_place_is_as_large_as_places_are():
     """Without gravity nobody knows where the sensor heads."""
     made = pieces.drive(LEVEL, 1)

@@ -161,13 +161,20 @@ def _tilted_over_level(run, estimate):
 
 
 def test_a_planar_turn_is_not_converged_and_its_sigmas_say_so():
-    run = bench.simulate("planar", "", 0, samples=6000)
-    estimate, _ = calibrated(run)
-    assert not estimate.converged
-    assert estimate.observability.prior_ratio[-1] > 0.4  # named from 0.5 on, as chance has it
-    assert estimate.sigma[8] > 0.1
-    error = np.abs(_heading_errors(run, estimate)).max()
-    assert error < 4 * estimate.heading_sigma_deg
+    """What is known to no better than half of what is believed is named: the vertical, in most."""
+    named = 0
+    for seed in range(4):
+        run = bench.simulate("planar", "", seed, samples=6000)
+        estimate, _ = calibrated(run)
+        assert not estimate.converged
+        seen = estimate.observability
+        assert seen.prior_ratio[-1] > 0.4
+        assert ("soft iron zz" in " ".join(seen.unobservable)) == (seen.prior_ratio[-1] > 0.5)
+        named += len(seen.unobservable)
+        assert estimate.sigma[8] > 0.1
+        error = np.abs(_heading_errors(run, estimate)).max()
+        assert error < 4 * estimate.heading_sigma_deg
+    assert named >= 2
 
 
 def test_rest_leaves_everything_where_the_device_has_it():

@@ -104,7 +104,7 @@ def estimate(correction: Affine | None = None, **changes: Any) -> Estimate:
         samples=10000,
         duration_s=300.0,
         converged=True,
-        place_gauss=1e-5,
+        place_deg=0.01,
     )
     return replace(value, **changes)
 

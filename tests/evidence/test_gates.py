@@ -167,13 +167,13 @@ def test_a_gyro_bias_that_is_not_determined_never_passes_and_is_not_called_wrong
 
 
 def test_a_room_is_never_saved_for_good(good) -> None:
-    told = red(put(good, "estimate.place_gauss", 3.3e-4))
+    told = red(put(good, "estimate.place_deg", 0.3))
     assert set(told) == {"field.place"}
     assert (
-        "may differ by 0.00033 gauss with where the vehicle heads (limit 0.0002)"
+        "what the field does beside iron may make 0.30 deg of heading (limit 0.10)"
         in (told["field.place"])
     )
-    assert "gravity is needed" in red(put(good, "estimate.place_gauss", math.nan))["field.place"]
+    assert "gravity is needed" in red(put(good, "estimate.place_deg", math.nan))["field.place"]
 
 
 LEVEL_TOO_FEW = "the motion so far tells too little: turn through all headings"
