@@ -65,8 +65,8 @@ def doubts(told: Sequence[Finding]) -> tuple[str, ...]:
         held = one.heldout
         if held is not None and held.nll_gain_per_sample <= max(held.placebo_gain, 0.0):
             out.append(
-                f"{one.effect}: readings that it was not fitted to are foretold no better by it than "
-                "by its own copies at other times: doubt it"
+                f"{one.effect}: other readings than it was fitted to are foretold no better by it "
+                "than by its own copies at other times: doubt it"
             )
         elif one.priors is not None and not one.priors.stays:
             least = min(one.priors.assumed, key=lambda each: min(each.half_nats, each.double_nats))
