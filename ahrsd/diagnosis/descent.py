@@ -1,16 +1,7 @@
 """Descent of calibration and named terms to what explains a recording best, noise as it is.
 
-Gauss-Newton on the whitened innovations.  The columns of terms are built from the context of the
-point before; where nothing lower is found so, from the point's own.
-
-What the gyro's noise turns up lies across the field of the model, whatever that is: iron that moves
-takes it along, and the gains and the frame of the whitening with it.  With the gains held it would
-stand out of that frame: the iron looks much better known than it is (five times and more where the
-sensor hardly tilts), and the descent goes, and stops, beside the lowest point.  So the derivatives
-by the iron are of what the filter whitens with the gains of its own, as differences.
-
-Where the gyro turns up next to nothing the gains stay within a step: there the squares alone, with
-gains of their own, would favour whatever makes the innovations' covariance large.
+Gauss-Newton on the whitened innovations, the gains held within a step.  The columns of terms are
+built from the context of the point before; where nothing lower is found so, from the point's own.
 """
 
 from __future__ import annotations
@@ -30,20 +21,15 @@ from ahrsd.diagnosis.innovation import (
     run_filter,
     sensitivities,
 )
-from ahrsd.diagnosis.prior import PRIOR, Prior
-from ahrsd.diagnosis.thin import turned_up
+from ahrsd.diagnosis.prior import Prior
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Columns, Context, NullModel
 from ahrsd.samples import Array
 
 _DONE = 0.05  # largest step in standard deviations
-_NEAR = 3.0  # largest step in standard deviations behind which the gains move as before it
-#: field that the gyro's noise of a step turns up over the magnetometer's, from which gains move
-_TURNED_UP = 0.1
-_BESIDE = 1e-3  # standard deviations by which the iron is moved to see how
+_NEAR = 3.0  # largest step in standard deviations behind which the gains are as before it
 _STALE = 1.0  # nats that a point costs more with columns of its own context, to go on from there
 _HALVINGS = 3
-_IRON = 8  # of the calibration's columns: soft and hard iron
 _SMALLEST_EIGENVALUE = 0.05  # of the soft iron: beyond, no calibration
 
 
@@ -146,24 +132,19 @@ def descended(problem: FitProblem, model: NullModel, steps: int) -> NullFit:
     converged = False
     count = 0
     own: _Point | None = None
-    lever: Array | None = None
-    loud = turned_up(problem.track, model) > _TURNED_UP
     covariance: Array = np.zeros((11 + len(values), 11 + len(values)))
     while count < steps and not converged:
         count += 1
-        if loud and lever is None:
-            lever = _of_gains(point.filtered, point.terms_mag, point.terms_gyro)
-        gradient, data, prior = _normal(problem, point, lever)
+        gradient, data, prior = _normal(problem, point)
         covariance = np.asarray(np.linalg.inv(data + np.diag(prior)), dtype=np.float64)
         if not np.all(np.diag(covariance) > 0.0):  # singular to rounding: no step is to be trusted
             break
         step = covariance @ gradient
         largest = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
-        new = _taken(problem, point, step, cost, near=largest < _NEAR, loud=loud)
+        new = _taken(problem, point, step, cost, largest < _NEAR)
         afresh = _with_own_columns(problem, point, cost, own) if new is None else None
         if afresh is not None:
             point = own = afresh
-            lever = None
             cost = _cost(problem, afresh)
             continue
         if new is None:
@@ -171,7 +152,6 @@ def descended(problem: FitProblem, model: NullModel, steps: int) -> NullFit:
             break
         gained = cost - _cost(problem, new)
         point, cost = new, cost - gained
-        lever = lever if largest < _NEAR else None
         repetition = problem.prior.repetition
         converged = bool(largest < _DONE * np.sqrt(repetition) or gained < _DONE**2 * repetition)
     return NullFit(
@@ -251,14 +231,9 @@ def _contributions(
     return mag, gyro
 
 
-def _normal(problem: FitProblem, point: _Point, lever: Array | None) -> tuple[Array, Array, Array]:
-    """Gradient (11 + p,) downhill, information of the data (11 + p, 11 + p), of the prior.
-
-    lever: of `_of_gains`, here or near; None where the gains stay
-    """
+def _normal(problem: FitProblem, point: _Point) -> tuple[Array, Array, Array]:
+    """Gradient (11 + p,) downhill, information of the data (11 + p, 11 + p), of the prior."""
     X = sensitivities(point.filtered, nuisance_columns(point.filtered))
-    if lever is not None:
-        X[:, :, :_IRON] += lever
     parts = [X, *(sensitivities(point.filtered, mine) for mine in point.columns)]
     flat = np.concatenate(parts, axis=2).reshape(-1, 11 + len(point.values))
     prior = problem.weight
@@ -280,44 +255,27 @@ def _cost(problem: FitProblem, point: _Point) -> float:
 
 
 def _taken(
-    problem: FitProblem, point: _Point, step: Array, cost: float, *, near: bool, loud: bool
+    problem: FitProblem, point: _Point, step: Array, cost: float, near: bool
 ) -> _Point | None:
     """The longest of step, step / 4 and step / 16 that lowers the cost; None where none does.
 
-    near: the step is so short that the gains stay as they are, but where the gyro is `loud`
+    near: the step is so short that the gains stay as they are
     """
-    gains = point.filtered if near and not loud else None
     for halving in range(_HALVINGS):
         part = step / 4**halving
+        model = moved(point.model, part)
         if not np.isfinite(part).all():
             continue
+        if np.linalg.eigvalsh(model.soft_iron)[0] < _SMALLEST_EIGENVALUE:
+            continue
+        held = point.filtered if near else None
         try:
-            model = (moved_along if loud else moved)(point.model, part)
-            if np.linalg.eigvalsh(model.soft_iron)[0] < _SMALLEST_EIGENVALUE:
-                continue
-            new = _at(problem, model, point.values + part[11:], point, gains)
+            new = _at(problem, model, point.values + part[11:], point, held)
         except np.linalg.LinAlgError:  # a step too far
             continue
         if _cost(problem, new) <= cost * (1 + 1e-9):
             return new
     return None
-
-
-def _of_gains(
-    filtered: Filtered, terms_mag: Array | None = None, terms_gyro: Array | None = None
-) -> Array:
-    """(N, 3, 8) what gains that move with the iron add to the sensitivities by it.
-
-    terms_*: that the run was made with
-    """
-    X = sensitivities(filtered, nuisance_columns(filtered))[:, :, :_IRON]
-    known = np.maximum(np.sum(X**2, axis=(0, 1)), PRIOR[:_IRON] ** -2.0)
-    out = np.empty_like(X)
-    for k, size in enumerate(_BESIDE / np.sqrt(known)):
-        model = moved_along(filtered.model, size * np.eye(11)[k])
-        beside = run_filter(filtered.track, model, terms_mag, terms_gyro, sensitive=False)
-        out[:, :, k] = (filtered.whitened - beside.whitened) / size
-    return out - X
 
 
 def moved(model: NullModel, step: Array) -> NullModel:
@@ -326,33 +284,5 @@ def moved(model: NullModel, step: Array) -> NullModel:
         model,
         soft_iron=model.soft_iron + np.einsum("a,aij->ij", step[:5], TRACELESS),
         hard_iron_gauss=model.hard_iron_gauss + step[5:8],
-        gyro_bias_rad_s=model.gyro_bias_rad_s + step[8:11],
-    )
-
-
-def moved_along(model: NullModel, step: Array) -> NullModel:
-    """The same to first order, on a straight line of the iron's quadric.
-
-    (I + q.T, u) = (A^-2, A^-2 b) of trace 3: there the size of the field, |m|^2 + q.(m^T T m) -
-    2 m.u, is linear, and a long step stays in the valley of calibrations under which it is the same
-    all along.  Where that line leaves the ellipsoids, iron moves straight itself.
-    """
-    C = np.linalg.inv(model.soft_iron)
-    quadric = C @ C
-    more = np.einsum("a,aij->ij", step[:5], TRACELESS)
-    bent = -C @ more @ quadric
-    bent = bent + bent.T
-    scale = 3.0 / np.trace(quadric)
-    change = scale * (bent - quadric * np.trace(bent) / np.trace(quadric))
-    quadric = scale * quadric
-    centre = quadric @ (model.hard_iron_gauss + step[5:8]) + change @ model.hard_iron_gauss
-    values, vectors = np.linalg.eigh(quadric + change)
-    if values[0] <= 0.0:
-        return moved(model, step)
-    root = (vectors / np.sqrt(values)) @ vectors.T
-    return replace(
-        model,
-        soft_iron=root * 3.0 / np.trace(root),
-        hard_iron_gauss=np.linalg.solve(quadric + change, centre),
         gyro_bias_rad_s=model.gyro_bias_rad_s + step[8:11],
     )

@@ -125,6 +125,10 @@ def ranked(found: Windows) -> list[Frame]:
     return sorted(out, key=lambda frame: frame.cost)
 
 
+#: relative: what is smaller is nothing but rounding
+_UNSEEN = 1e-12
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeFrame:
     """Any linear map (3, 3) between the two, true rate = matrix @ reading, with its deviation.
@@ -138,12 +142,16 @@ class FreeFrame:
 
 
 def free_frame(found: Windows) -> FreeFrame:
-    """The map with which all 24 unknowns explain most; deviation: the largest of its entries."""
+    """The map with which all 24 unknowns explain most; deviation: the largest of its entries,
+    infinite where one was never seen."""
     constant = np.vstack([np.zeros((18, 6)), np.eye(6)])
     usual = max(found.total - _solved(found, constant)[1], 1e-300)
     solved, gained = _solved(found, np.eye(24))
     left = max(found.total - gained, 0.0)
-    scale = np.sqrt(np.maximum(np.diag(found.gram), 1e-300))
+    scale = np.sqrt(np.maximum(np.diag(found.gram), 0.0))
+    if not np.all(scale[:9] > _UNSEEN * np.max(scale)):
+        return FreeFrame(np.eye(3), np.inf, 1.0)
+    scale = np.maximum(scale, _UNSEEN * np.max(scale))
     spread = np.linalg.inv(found.gram / scale[:, None] / scale + 1e-9 * np.eye(24))
     variance = np.diag(spread)[:9] / scale[:9] ** 2 * left / max(3 * found.count - 24, 1)
     return FreeFrame(solved[:9].reshape(3, 3), float(np.sqrt(variance.max())), left / usual)

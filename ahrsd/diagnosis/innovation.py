@@ -18,11 +18,10 @@ gain held the sensitivities are exact (s: deviation of a turn by those of
 
 Whitened by S = L L^T: under the null L^-1 e = L^-1 X dtheta + white of variance 1.
 
-These are the derivatives of the innovations, to which a descent adds what moves with the gains.
-To regress on (`regressing`) they will not do: turns and foretold fields hold the noise of the gyro
-that the innovations are made of (errors in variables), and of 5 mrad/s beside .1 mG that made a
-field that turns with the heading of 440 nats in nothing.  There F, and h- in the calibration's
-columns, are of the smoothed rate.
+These are the derivatives of the innovations, which a descent needs.  To regress on (`regressing`)
+they will not do: turns and foretold fields hold the noise of the gyro that the innovations are made
+of (errors in variables), and of 5 mrad/s beside .1 mG that made a field that turns with the heading
+of 440 nats in nothing.  There F, and h- in the calibration's columns, are of the smoothed rate.
 
 A run's first row starts the field from its reading (`used` is false there): h+ = A^-1 (m - b).
 Where that row has no reading the field starts from the nominal one, unsure by half of its size: the

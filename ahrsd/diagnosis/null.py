@@ -3,8 +3,9 @@
 `descent` finds the lowest cost from where it is set down.  The cold start descends on a thinned
 track (`coarse`) from two starts, a sphere and a linear fit with the gyro, with the gyro's noise
 inflated 30, 10, 3, 1 times: a short memory forgives a wrong bias and soft iron.  Where that noise
-turns up more field than the magnetometer's own, the size of the field says where the iron is: there
-it begins at the ellipsoid of the readings, as it is.
+turns up more field than the magnetometer's own, the size of the field says where the iron is, by a
+valley too narrow to be followed in straight steps: there it begins at the ellipsoid of the
+readings, as it is.
 
 A Gaussian prior (`prior`) keeps what the motion does not show.
 
