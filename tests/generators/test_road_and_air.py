@@ -161,6 +161,7 @@ def test_absorbed_changes_are_invisible() -> None:
     assert plain < 1e-3 and blind < 1.0
 
 
+@pytest.mark.slow
 def test_command_repeats_itself_and_hides_what_it_must(tmp_path: Path) -> None:
     flags = ["--null", "1", "--single", "1", "--pair", "1", "--withheld", "2", "--outside", "1"]
     for name in ("a", "b"):

@@ -77,6 +77,7 @@ def test_nothing_that_the_rules_tell_is_missing(run, recording, tmp_path, capsys
     assert one["priors"]["log_odds"] == pytest.approx(one["evidence_nats"])
 
 
+@pytest.mark.slow
 def test_what_the_simulation_has_as_well_is_no_difference(run, recording, capsys):
     words = ["diagnose", str(recording), "--simulation", str(recording), "--engine", "one-model"]
     assert run(*words) == 0
