@@ -65,7 +65,8 @@ def calibration_json(
     if estimate is None:
         return base | _nothing(warnings)
     written, refusal = _registers(estimate, registers, gyro_is_raw)
-    widened = [f"most of the heading's sigma: {estimate.widened_by}"] * bool(estimate.widened_by)
+    most = "" if wrong else estimate.widened_by
+    widened = [f"most of the heading's sigma: {most}"] * bool(most)
     not_yet = why_not_converged(estimate, wrong)
     said = [*warnings, *estimate.warnings, *refusal, *not_yet, *widened]
     return (

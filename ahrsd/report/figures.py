@@ -93,7 +93,7 @@ def heading(data: HeadingError, title: str) -> Figure:
         (enlarged, data.after_deg, AFTER, "after"),
     ):
         _dots(axes, turn[shown], error[shown], colour)
-        axes.plot(*_binned(turn, error), color=colour, linewidth=2.0, label=label)
+        axes.plot(*binned(turn, error), color=colour, linewidth=2.0, label=label)
     if data.limit_deg is not None:
         for sign in (-1.0, 1.0):
             enlarged.axhline(sign * data.limit_deg, color=TRUTH, linewidth=1.2, linestyle="--")
@@ -111,7 +111,7 @@ def heading(data: HeadingError, title: str) -> Figure:
     return figure
 
 
-def _binned(turn_deg: Array, error_deg: Array, width_deg: float = 10.0) -> tuple[Array, Array]:
+def binned(turn_deg: Array, error_deg: Array, width_deg: float = 10.0) -> tuple[Array, Array]:
     """Median error in each `width_deg` of heading that has data; nan where it has none."""
     which = np.floor(turn_deg / width_deg).astype(np.int64)
     middles = np.arange(0, int(360 / width_deg))
@@ -182,7 +182,7 @@ def history(data: EstimateHistory) -> Figure:
         )
         if data.truth is not None:
             axes.axhline(data.truth[k], color=colour, linewidth=1.0, linestyle=":")
-    axes.set_ylim(*_settled_range(data))
+    axes.set_ylim(*settled_range(data))
     axes.set_xlabel("time [s]")
     axes.set_ylabel(f"{data.name.lower()} [{data.unit}]" if data.unit else data.name.lower())
     handles = axes.get_legend_handles_labels()[0]
@@ -209,7 +209,7 @@ def legend_above(
 _BANDS = 4.0  # standard deviations at the end that are seen on both sides
 
 
-def _settled_range(data: EstimateHistory) -> tuple[float, float]:
+def settled_range(data: EstimateHistory) -> tuple[float, float]:
     """What the estimate settled to, as wide as its uncertainty at the end lets one see.
 
     First guesses and their standard deviations leave the picture.

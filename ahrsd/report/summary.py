@@ -125,13 +125,13 @@ def summary_lines(core: Core, recording: str, warnings: Sequence[str] = ()) -> l
             f"{counted(stream.restarts, 'restart')} of the device"
         )
     lines += estimate_lines(core.calibrator.estimate)
-    lines += _gate_lines(core.calibrator.gates, core.settings.level)
+    lines += gate_lines(core.calibrator.gates, core.settings.level)
     lines += [f"  warning: {text}" for text in warnings_of(core, warnings)]
     lines.append(f"  state {core.writeback.state.value}; decisions {core.decisions.sha256[:16]}")
     return lines
 
 
-def _gate_lines(gates: Sequence[GateResult], level: Level) -> list[str]:
+def gate_lines(gates: Sequence[GateResult], level: Level) -> list[str]:
     """Gates that are shut: of a write and its save, and of one without a person where that is."""
     guards = [gate for gate in gates if guards_a_write(gate.gate)]
     alone = [gate for gate in gates if not guards_a_write(gate.gate)]
@@ -167,11 +167,12 @@ def estimate_lines(estimate: Estimate | None, wrong: Sequence[str] = ()) -> list
     ]
     lag_ms = 1e3 * estimate.mag_lag_s
     lag = f"the field is {abs(lag_ms):.1f} ms {'late' if lag_ms > 0 else 'early'} against the gyro"
+    most = "" if wrong else estimate.widened_by  # what is wrong is why, whatever followed from it
     return [
         f"  hard iron  {', '.join(values[:3])} mG",
         f"  gyro bias  {', '.join(values[3:])} mrad/s",
         f"  heading    {heading_words(estimate.heading_sigma_deg)}",
-        *([f"             most of it: {estimate.widened_by}"] if estimate.widened_by else []),
+        *([f"             most of it: {most}"] if most else []),
         *([f"  lag        {lag}"] if lag_ms else []),
         *(f"  {text}" for text in why_not_converged(estimate, wrong)),
     ]
@@ -214,7 +215,7 @@ class BatchResult:
 
     def all_warnings(self) -> list[str]:
         """Warnings of recording and stream."""
-        turned = self.misalignment
+        turned = None if self.wrong else self.misalignment  # of axes, units or times that are wrong
         return [
             *(f"{words}: put this right and calibrate again" for words in self._wrong_besides),
             *warnings_of(self.core, self.warnings),

@@ -23,6 +23,20 @@ def test_what_makes_the_most_of_the_sigma_is_told_below_the_heading():
     assert len(estimate_lines(replace(found, widened_by=""))) == 3
 
 
+def test_where_axes_or_units_are_wrong_that_is_all_the_advice():
+    wrong = ("the magnetometer is turned against the gyro by 45.0 deg about its z",)
+    found = estimate(heading_sigma_deg=41.0, widened_by=ADVICE, converged=False)
+    lines = estimate_lines(found, wrong)
+    assert lines[2:] == [
+        "  heading    known to 41.00 deg (1 sigma, worst direction)",
+        f"  not converged: {wrong[0]}: put this right and calibrate again",
+    ]
+    said = calibration_json(
+        "x", found, {}, method="magyc", samples=1, gyro_is_raw=True, wrong=wrong
+    )
+    assert said["warnings"] == [lines[3].strip()]
+
+
 def test_and_is_a_warning_for_programs():
     found = estimate(heading_sigma_deg=1.7, widened_by=ADVICE)
     said = calibration_json("x", found, {}, method="magyc", samples=1, gyro_is_raw=True)

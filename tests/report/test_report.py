@@ -40,7 +40,7 @@ from ahrsd.report import (
     write_report,
 )
 from ahrsd.report.contents import KEPT
-from ahrsd.report.figures import _binned, _settled_range, clouds
+from ahrsd.report.figures import binned, clouds, settled_range
 from ahrsd.report.template import number
 from ahrsd.samples import SampleBlock
 
@@ -342,7 +342,7 @@ def test_collector_stays_bounded_over_a_long_run():
 
 
 def test_medians_by_heading_leave_gaps_where_nobody_went():
-    middle, error = _binned(np.array([1.0, 2.0, 3.0, 359.0]), np.array([1.0, 9.0, 2.0, 4.0]))
+    middle, error = binned(np.array([1.0, 2.0, 3.0, 359.0]), np.array([1.0, 9.0, 2.0, 4.0]))
     assert middle[[0, -1]].tolist() == [5.0, 355.0]
     assert error[[0, -1]].tolist() == [2.0, 4.0]
     assert np.isnan(error[1:-1]).all()
@@ -397,7 +397,7 @@ def test_settling_is_scaled_by_the_end_not_by_the_first_guess():
     value[:8] += 3.0
     sigma = np.full((count, 3), 1e-3)
     sigma[:15] = 2.0
-    low, high = _settled_range(
+    low, high = settled_range(
         EstimateHistory("Hard iron", "gauss", ("x", "y", "z"), np.arange(40.0), value, sigma)
     )
     assert 0.1 - 5e-3 < low < 0.1 - 3e-3

@@ -17,8 +17,8 @@ from ahrsd.gates import GATES, Level, guards_a_write
 from ahrsd.report.contents import ReportData
 from ahrsd.report.page import write_report
 from ahrsd.report.summary import (
-    _gate_lines,
     estimate_lines,
+    gate_lines,
     summary_json,
     summary_lines,
     warnings_of,
@@ -102,13 +102,13 @@ def test_gates_with_one_advice_are_one_line():
         GateResult("b.size", 0.1, 1.0, True, 0.0, "", "not said"),
         GateResult("c.rate", 5.0, 1.0, False, 0.0, "Hz", "slow down"),
     ]
-    assert _gate_lines(gates, Level.RAM) == [
+    assert gate_lines(gates, Level.RAM) == [
         "  3 of 4 gates hold a write back:",
         "    a.rms, a.max: keep turning",
         "    c.rate: slow down",
     ]
-    assert _gate_lines([gates[2]], Level.RAM) == []
-    assert _gate_lines(gates[2:], Level.RAM)[0] == "  1 of 2 gates holds a write back:"
+    assert gate_lines([gates[2]], Level.RAM) == []
+    assert gate_lines(gates[2:], Level.RAM)[0] == "  1 of 2 gates holds a write back:"
 
 
 def test_gates_of_a_write_without_a_person_are_counted_apart_and_only_where_that_is_allowed():
@@ -116,9 +116,9 @@ def test_gates_of_a_write_without_a_person_are_counted_apart_and_only_where_that
         GateResult("field.weakest", 0.5, 1.0, False, 0.0, "", "go outside"),
         GateResult("step.auto", 5.0, 1.0, False, 0.0, "deg", "let a person approve it"),
     ]
-    alone = _gate_lines(gates, Level.RAM)
+    alone = gate_lines(gates, Level.RAM)
     assert alone == ["  1 of 1 gates holds a write back:", "    field.weakest: go outside"]
-    assert _gate_lines(gates, Level.UNATTENDED) == [
+    assert gate_lines(gates, Level.UNATTENDED) == [
         *alone,
         "  1 of 1 gates holds a write without approval back:",
         "    step.auto: let a person approve it",
@@ -135,7 +135,7 @@ def test_the_number_of_gates_is_one_number_everywhere(tmp_path):
     shut = sum(not r.ok for r in counted)
     assert 40 < len(counted) < len(GATES)
     assert (
-        _gate_lines(results, Level.RAM)[0] == f"  {shut} of {len(counted)} gates hold a write back:"
+        gate_lines(results, Level.RAM)[0] == f"  {shut} of {len(counted)} gates hold a write back:"
     )
     assert gate_table(results).startswith(f"**Held back by {shut} of {len(counted)} gates**")
     write_report(tmp_path / "report.html", ReportData(title="t", gates=tuple(results)))
