@@ -17,10 +17,10 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.missing import lost_turns
 from ahrsd.diagnosis.null import fit_null
+from ahrsd.diagnosis.one_model.answer.whole_answer import whole_answer
 from ahrsd.diagnosis.one_model.recorded_rate import Quick, quick
 from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
 from ahrsd.diagnosis.one_model.search_rounds import Searched, answered
-from ahrsd.diagnosis.one_model.whole_answer import whole_answer
 from ahrsd.diagnosis.prepared import prepared
 from ahrsd.diagnosis.problem import Problem, problem_of
 from ahrsd.diagnosis.track import Spec, Track

@@ -15,14 +15,25 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.one_model import priors, rich
-from ahrsd.diagnosis.one_model.held_out import HeldOut, dealt
-from ahrsd.diagnosis.one_model.left_sizes import left_sizes
+from ahrsd.diagnosis.one_model.answer.held_out import HeldOut, dealt
+from ahrsd.diagnosis.one_model.answer.left_sizes import left_sizes
+from ahrsd.diagnosis.one_model.answer.prior_dependence import (
+    COURSE,
+    NAME,
+    NOISE,
+    ORDINARY,
+    on_priors,
+)
+from ahrsd.diagnosis.one_model.answer.residual_checks import (
+    checks,
+    regime_maps,
+    residuals_of,
+    whiteness,
+)
+from ahrsd.diagnosis.one_model.answer.support import doubts
+from ahrsd.diagnosis.one_model.answer.visibility import limits, seen_alone
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Space
-from ahrsd.diagnosis.one_model.prior_dependence import COURSE, NAME, NOISE, ORDINARY, on_priors
-from ahrsd.diagnosis.one_model.residual_checks import checks, regime_maps, residuals_of, whiteness
 from ahrsd.diagnosis.one_model.search_space import space_at
-from ahrsd.diagnosis.one_model.support import doubts
-from ahrsd.diagnosis.one_model.visibility import limits, seen_alone
 from ahrsd.diagnosis.problem import problem_of
 from ahrsd.diagnosis.track import Spec, Track
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ahrsd.diagnosis.diagnosis import Finding, Unexplained, Validation
+from ahrsd.diagnosis.one_model.answer.held_out import HeldOut
+from ahrsd.diagnosis.one_model.answer.prior_dependence import on_priors
 from ahrsd.diagnosis.one_model.decision import Answer, asked_odds
-from ahrsd.diagnosis.one_model.held_out import HeldOut
 from ahrsd.diagnosis.one_model.model_search import Hypotheses
-from ahrsd.diagnosis.one_model.prior_dependence import on_priors
 
 
 def supported(answer: Answer, held: HeldOut, first: int) -> tuple[Finding, ...]:

@@ -20,11 +20,12 @@ from ahrsd.diagnosis.hygiene import would_have_shown
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.noise import level_facts
 from ahrsd.diagnosis.null import baseline
-from ahrsd.diagnosis.one_model import pictures, priors, residual_checks, support, visibility
-from ahrsd.diagnosis.one_model.held_out import HeldOut
-from ahrsd.diagnosis.one_model.left_sizes import told_sizes
+from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.answer import pictures, residual_checks, support, visibility
+from ahrsd.diagnosis.one_model.answer.held_out import HeldOut
+from ahrsd.diagnosis.one_model.answer.left_sizes import told_sizes
+from ahrsd.diagnosis.one_model.answer.repaired_noise import repaired_noise
 from ahrsd.diagnosis.one_model.recorded_rate import Quick
-from ahrsd.diagnosis.one_model.repaired_noise import repaired_noise
 from ahrsd.diagnosis.one_model.search_rounds import Searched
 from ahrsd.diagnosis.prepared import Prepared
 from ahrsd.diagnosis.resting import HARDLY_TURNED, at_rest, resting

@@ -22,8 +22,8 @@ from ahrsd.diagnosis.diagnosis import Check, RegimeMap, Whiteness
 from ahrsd.diagnosis.noise import tails_of
 from ahrsd.diagnosis.omnibus import omnibus
 from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.answer.white_rows import Fit, WhiteRows
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION
-from ahrsd.diagnosis.one_model.white_rows import Fit, WhiteRows
 from ahrsd.diagnosis.predictive import COPIES, bands, scene_of, statistics
 from ahrsd.diagnosis.regime import regime_columns, regimes
 from ahrsd.samples import Array
