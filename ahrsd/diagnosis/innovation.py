@@ -53,6 +53,9 @@ TRACELESS.flags.writeable = False
 _UNSURE_RAD = 0.1
 #: of the field's size, in all directions, where a run's first row has no reading
 _UNSURE = 0.5
+#: gauss; what is left of the nearest reading where it is many hundred rows away: squares of smaller
+#: numbers are none
+_OUT_OF_REACH = 1e-100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,7 +299,10 @@ def _orientation(layout: Layout, turn: Array, opens: NDArray[np.bool]) -> Array:
 def _nominal(
     field: Array, orientation: Array, layout: Layout, model: NullModel, dt_s: Array
 ) -> Array:
-    """The field smoothed by exp(-|k| / memory) in the carried frame, of the runs' median size."""
+    """The field smoothed by exp(-|k| / memory) in the carried frame, of the runs' median size.
+
+    Where the nearest reading is too far away for that, a straight line between readings.
+    """
     seen = _complete(field)
     carried = np.einsum("nij,nj->ni", orientation, np.where(seen[:, None], field, 0.0))
     size = float(np.median(np.linalg.norm(field[seen], axis=1))) if np.any(seen) else 1.0
@@ -306,6 +312,11 @@ def _nominal(
     firsts = layout.starts[layout.opens]
     for first, last in zip(firsts, [*firsts[1:], len(field)], strict=True):
         out[first:last] = both_ways(carried[first:last], 1.0 - forget)
+        near = np.flatnonzero(seen[first:last])
+        far = np.flatnonzero(np.max(np.abs(out[first:last]), axis=1) < _OUT_OF_REACH)
+        if len(near) and len(far):
+            between = [np.interp(far, near, axis) for axis in carried[first + near].T]
+            out[first + far] = np.column_stack(between)
     out *= size / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-300)
     return np.asarray(np.einsum("nji,nj->ni", orientation, out))
 

@@ -30,6 +30,8 @@ _MOVING_SHARE = 0.7  # of the share that repeats in all: where the sensor turns,
 _ORDINARY_PERIOD_S = 0.01
 _CLOCKWORK = 0.3  # variance of the time from one new reading to the next, in that of chance
 _DOUBLED_SHARE = 2e-3
+#: times as many as if each sensor repeated for itself: a slow turn makes it nearly two
+_BEYOND_CHANCE = 5.0
 _TURNING = 5.0  # gyro noise levels
 
 
@@ -172,13 +174,17 @@ def _irregularity(rows: Array) -> float:
 def _doubled(track: Track, again: NDArray[np.bool]) -> list[Fact]:
     """Rows that repeat magnetometer and gyro: a sample that was sent or stored twice.
 
-    Only while the sensor turns: at rest coarse numbers repeat by chance.
+    Only while the sensor turns: at rest coarse numbers repeat by chance. So they do about axes that
+    it does not turn about, each sensor's for itself: a sample that came twice repeats both.
     """
     rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
     turning = np.max(np.abs(rate), axis=1) > _TURNING * noise_of(track)[1]
-    both = again & _again(track, track.gyro_b_rad_s) & turning
-    count = int(np.count_nonzero(both))
-    if count < max(3, _DOUBLED_SHARE * len(track)):
+    mag, gyro = again & turning, _again(track, track.gyro_b_rad_s) & turning
+    both = mag & gyro
+    count, fresh = int(np.count_nonzero(both)), turning & ~mag
+    alone = np.count_nonzero(gyro & fresh) / max(int(np.count_nonzero(fresh)), 1)
+    chance = alone * np.count_nonzero(mag)
+    if count < max(3, _DOUBLED_SHARE * len(track), _BEYOND_CHANCE * chance):
         return []
     share = count / len(track)
     step = track.step_s

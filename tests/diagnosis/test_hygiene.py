@@ -301,6 +301,25 @@ def test_doubled_samples(track: Track) -> None:
     assert abs(_value(fact) - 100 / 6000) < 2e-3
 
 
+def test_coarse_numbers_of_a_vehicle_that_turns_about_one_axis_came_once() -> None:
+    """About the others each sensor's numbers repeat by chance, and now and then at once."""
+    rng = np.random.default_rng(12)
+    time_s = np.arange(16000) / 80.0
+    angle = np.cumsum(0.25 + 0.2 * np.sin(0.3 * time_s)) / 80.0
+    h = np.column_stack([0.2 * np.cos(angle), -0.2 * np.sin(angle), np.full_like(angle, 0.4)])
+    rate = np.column_stack([0 * angle, 0 * angle, np.gradient(angle, time_s)])
+    noise_m, noise_g = 1.6e-3, 1.4e-4
+    coarse_m, coarse_g = 2.1 * noise_m, 2.0 * noise_g
+    mag = np.round((h + noise_m * rng.standard_normal(h.shape)) / coarse_m) * coarse_m
+    gyro = np.round((rate + noise_g * rng.standard_normal(h.shape)) / coarse_g) * coarse_g
+    dt_s = np.full(len(h), 1 / 80.0)
+    dt_s[0] = np.nan
+    spin = Track(time_s, dt_s, mag, gyro, None, {}, (slice(0, len(h)),))
+    again = np.all(mag[1:] == mag[:-1], axis=1) & np.all(gyro[1:] == gyro[:-1], axis=1)
+    assert np.count_nonzero(again) > 2e-3 * len(h)
+    assert "dropped_samples" not in [fact.effect for fact in hygiene(spin)]
+
+
 def test_a_limit_that_the_sensor_stays_near_for_long(track: Track) -> None:
     """A slow and small motion leaves many readings just below the limit, each of another number."""
     rng = np.random.default_rng(5)

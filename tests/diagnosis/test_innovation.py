@@ -110,6 +110,24 @@ def test_rows_without_a_reading_are_passed_over() -> None:
     assert np.linalg.norm(done.predicted_b[220] - made_field(made)[220]) < 2e-3
 
 
+@pytest.mark.parametrize("unread", [slice(500, 660), slice(500, 1100), slice(0, 600)])
+def test_rows_far_from_any_reading_have_the_field_that_lies_between(unread: slice) -> None:
+    """A limit that is stood at, or a sensor that is stuck, for a minute, beside a loud gyro."""
+    made = experiment("wam", samples=1500)
+    track = track_of(made)
+    mag = track.mag_b_gauss.copy()
+    mag[unread] = np.nan
+    loud = replace(true_model(made), sigma_gyro_rad_s=0.3, sigma_mag_gauss=1e-4)
+    found = run_filter(replace(track, mag_b_gauss=mag), loud)
+    whole = run_filter(track, loud)
+    size = np.linalg.norm(found.nominal_b, axis=1)
+    np.testing.assert_allclose(size, size[-1], rtol=1e-9)
+    seen = np.isfinite(mag).all(axis=1)
+    largest = np.abs(found.gains.innovation_covariance).max(axis=(1, 2))
+    assert largest[seen].min() > 0.0
+    assert largest.max() < 1e6 * np.abs(whole.gains.innovation_covariance).max()
+
+
 def test_a_run_that_begins_without_a_reading_begins_with_its_first_one() -> None:
     """A magnetometer at its limit as the recording begins: the field was zero there, and sure."""
     made = experiment(samples=900)
