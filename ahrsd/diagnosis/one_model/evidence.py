@@ -249,7 +249,7 @@ def _newton(at: At, x: Array, low: Array, high: Array) -> Array:
     free = ~(((x <= low) & (g < 0.0)) | ((x >= high) & (g > 0.0)))
     while np.any(free):
         rest = g[free] - H[np.ix_(free, ~free)] @ step[~free]
-        step[free] = linalg.solve(H[np.ix_(free, free)], rest, assume_a="pos")
+        step[free] = _solved(H[np.ix_(free, free)], rest)
         inside = np.clip(step, low - x, high - x)
         beyond = free & (inside != step)
         step = inside
@@ -257,3 +257,14 @@ def _newton(at: At, x: Array, low: Array, high: Array) -> Array:
             break
         free &= ~beyond
     return step
+
+
+def _solved(H: Array, g: Array) -> Array:
+    """H^-1 g of a curvature, each hyperparameter in its own unit.
+
+    Beside something a thousand times louder than the noise some curvatures are 1e12 times others,
+    and unscaled the matrix is singular to rounding.
+    """
+    scale = 1.0 / np.sqrt(np.diag(H))
+    scaled = H * scale * scale[:, None]
+    return np.asarray(scale * linalg.solve(scaled, scale * g, assume_a="pos"))

@@ -128,6 +128,9 @@ NEAR = 0.7
 NAME_ODDS, UNKNOWN_ODDS = 3.0, 3.0
 #: both on a recording with an ordinary remainder: its laws are not exact, a few nats say nothing
 ODDS_REAL = 12.0
+#: odds that what one effect explains is a wider one's in just that form, which no reading tells: one
+#: cause may make a gyro's axes all be off alike, but more often they differ
+SAME_FORM = 0.5
 #: nats that a move of the search must gain
 MOVE = 2.0
 #: how near to all of a delay must be a filter's to be called one
@@ -146,5 +149,7 @@ SHIFTS = (0.236, 0.382, 0.472, 0.618, 0.764, 0.854)
 SHOWN_AT = 6.5
 #: probability that any bin of any regime is outside of its band where nothing is left
 BINS_OUTSIDE = 0.01
+#: s that an object which is passed by shows at most: what it leaves there is no noise
+PASSING_S = 30.0
 #: probability by chance, and correlation, of a logged column that is said to move with a course
 CHANCE, ALIKE = 0.2, 0.5
