@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -25,4 +24,5 @@ def ask(request: pytest.FixtureRequest) -> Callable[..., Diagnosis]:
 @pytest.fixture(params=ENGINES)
 def ask_logged(request: pytest.FixtureRequest) -> Callable[[Track], Diagnosis]:
     """Each engine with what badly logged columns can still say, as users have it."""
-    return partial(diagnosed, request.param, spec=Spec(), recording="", simulated=False)
+    rest = {"spec": Spec(), "recording": "", "simulated": False}
+    return lambda track: diagnosed(request.param, track, **rest)

@@ -12,7 +12,6 @@ from tracks import experiment, track_of
 from ahrsd.diagnosis.cut_out import FEWEST, brief, without
 from ahrsd.diagnosis.delay import delayed_gyro
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.problem import problem_of

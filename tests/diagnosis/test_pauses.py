@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.gram import block_edges
 from ahrsd.diagnosis.pauses import LEFT_S, without_jumps
 from ahrsd.diagnosis.predictive import segments_of

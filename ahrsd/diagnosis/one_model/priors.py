@@ -93,6 +93,8 @@ EFFECT_GRID = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
 #: s by which a logged cause may come late into the log, or early;  source: averages of loggers; the
 #: motor's current of a flight came 0.32 s late
 LOGGED_LATE_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
+#: s by which a column's clock is off from which on it is sought: nearer, its setting is
+ON_TIME_S = 1.0
 #: s over which a logger ordinarily takes its mean: a battery's monitor filters over a tenth
 LOGGED_BLUR_S = 0.05
 #: relative size of what an effect leaves of its form, its second order
@@ -128,8 +130,8 @@ NEAR = 0.7
 NAME_ODDS, UNKNOWN_ODDS = 3.0, 3.0
 #: both on a recording with an ordinary remainder: its laws are not exact, a few nats say nothing
 ODDS_REAL = 12.0
-#: odds that what one effect explains is a wider one's in just that form, which no reading tells: one
-#: cause may make a gyro's axes all be off alike, but more often they differ
+#: odds that what one effect explains is a wider one's in just that form, which no reading tells:
+#: one cause may make a gyro's axes all be off alike, but more often they differ
 SAME_FORM = 0.5
 #: nats that a move of the search must gain
 MOVE = 2.0
