@@ -56,6 +56,7 @@ class Products:
     """What the data say, band by band.
 
     G (B, q, q), s (B, q), square (B,), rows (B,);  step: of the noise's spectrum (`noise_model`)
+    alone: numbers of bands that stand alone in it
     """
 
     G: Array
@@ -63,6 +64,7 @@ class Products:
     square: Array
     rows: Array
     step: float
+    alone: slice | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +115,7 @@ def evaluated(products: Products, laws: Sequence[Law], log_noise: Array, psi: Ar
     by_phi = 0.5 * (m**2 - sure)
     noise = _noise(products, found, m * deviation, deviation)
     by_noise = 0.5 * (noise.expected * inverse - products.rows)
-    of_noise, slope_of_noise = noise_model.log_prior(log_noise, products.step)
+    of_noise, slope_of_noise = noise_model.log_prior(log_noise, products.step, products.alone)
     likelihood = 0.5 * (float(m @ scaled) - log_det)
     likelihood -= 0.5 * float(
         products.rows @ (log_noise + np.log(2 * np.pi)) + products.square @ inverse
@@ -179,7 +181,7 @@ def _curvature(
     own = np.diag_indices_from(H)
     H[own] = np.maximum(H[own], np.concatenate(expected))
     H *= 0.5
-    H[:count, :count] += noise_model.stiffness(count, products.step)
+    H[:count, :count] += noise_model.stiffness(count, products.step, products.alone)
     H[own] += np.concatenate([np.zeros(count), prior.stiffness])
     return H
 

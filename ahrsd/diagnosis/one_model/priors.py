@@ -106,6 +106,8 @@ FORM = 0.03
 NOISE_STEP_CLEAN, NOISE_STEP_REAL, NOISE_STEP_FREE, NOISE_TOP = 0.25, 0.6, 1.5, 3.0
 #: log power by which a band is louder than the highest where the noise has what a model lacks
 LOUD = 2.0
+#: times as loud as its sides that a narrow band is for it to be a source that hums and no colour
+STANDS_OUT = 3.0
 #: log powers between which a band stays
 NOISE_RANGE = (-9.0, 9.0)
 #: degrees of freedom of readings beyond their level, beside normal ones;  source: 3 on a flight

@@ -56,6 +56,8 @@ def whole_answer(
     left = _with_channels(support.what_is_left(answer, held), found, courses)
     remainder_nats = support.nats_of_remainder(all_sets, answer)
     left = told_sizes(all_sets, answer, left, remainder_nats, simulated=simulated)
+    if fast.hum.evidence_nats > left.evidence_nats:
+        left = fast.hum
     loud = _loud(found, fast, asked.facts, told, spec_given=spec_given)
     still = resting(start.context(), library, LIMITS) if at_rest(start) else ()
     named = (*asked.told(library), *told, *(of_fact(fact, library) for fact in loud), *still)
@@ -73,7 +75,8 @@ def whole_answer(
         *pictures.contributions(all_sets, answer),
         *pictures.contributions(fast.all_sets, fast.answer),
     ]
-    surest = max(answer.log_odds, fast.answer.log_odds, remainder_nats, 0.0)
+    hummed = fast.hum.evidence_nats
+    surest = max(answer.log_odds, fast.answer.log_odds, remainder_nats, hummed, 0.0)
     counted = len(named) > len(told)
     said = support.doubts(told) if something else support.nearest(answer, all_sets)
     return Diagnosis(
