@@ -13,7 +13,7 @@ import numpy as np
 
 from ahrsd.diagnosis import locate
 from ahrsd.diagnosis.descent import NullFit
-from ahrsd.diagnosis.diagnosis import Diagnosis, Finding, Suspect, Unexplained
+from ahrsd.diagnosis.diagnosis import Check, Diagnosis, Finding, RegimeMap, Suspect, Unexplained
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.facts import Fact, around, lost_at, of_fact, rounding
 from ahrsd.diagnosis.hygiene import would_have_shown
@@ -25,6 +25,7 @@ from ahrsd.diagnosis.one_model.answer import pictures, residual_checks, support,
 from ahrsd.diagnosis.one_model.answer.held_out import HeldOut
 from ahrsd.diagnosis.one_model.answer.left_sizes import told_sizes
 from ahrsd.diagnosis.one_model.answer.repaired_noise import repaired_noise
+from ahrsd.diagnosis.one_model.decision import Answer
 from ahrsd.diagnosis.one_model.recorded_rate import Quick
 from ahrsd.diagnosis.one_model.search_rounds import Searched
 from ahrsd.diagnosis.prepared import Prepared
@@ -56,27 +57,20 @@ def whole_answer(
     left = _with_channels(support.what_is_left(answer, held), found, courses)
     remainder_nats = support.nats_of_remainder(all_sets, answer)
     left = told_sizes(all_sets, answer, left, remainder_nats, simulated=simulated)
-    if fast.hum.evidence_nats > left.evidence_nats:
-        left = fast.hum
+    left = max(left, fast.hum, key=lambda one: (one.detected, one.evidence_nats))
     loud = _loud(found, fast, asked.facts, told, spec_given=spec_given)
     still = resting(start.context(), library, LIMITS) if at_rest(start) else ()
     named = (*asked.told(library), *told, *(of_fact(fact, library) for fact in loud), *still)
     something = bool(named) or left.detected
     residuals = residual_checks.residuals_of(held.rows(answer.best.names))
     maps = residual_checks.regime_maps(residuals)
-    checked = residual_checks.checks(residuals, maps)
-    if fast.answer.keys:  # the working rate does not show what was found, nor what it leaves
-        quick_rows = quickly.rows(fast.answer.best.names)
-        checked = residual_checks.at_recorded_rate(
-            checked, residual_checks.residuals_of(quick_rows)
-        )
     alone = visibility.seen_alone(all_sets, found.space, held.less(answer.keys))
     contributions = [
         *pictures.contributions(all_sets, answer),
         *pictures.contributions(fast.all_sets, fast.answer),
     ]
-    hummed = fast.hum.evidence_nats
-    surest = max(answer.log_odds, fast.answer.log_odds, remainder_nats, hummed, 0.0)
+    odds = answer.log_odds, fast.answer.log_odds
+    surest = max(*odds, remainder_nats, fast.hum.evidence_nats, 0.0)
     counted = len(named) > len(told)
     said = support.doubts(told) if something else support.nearest(answer, all_sets)
     return Diagnosis(
@@ -86,7 +80,7 @@ def whole_answer(
         p_value=0.0 if counted else float(np.exp(-surest)),
         findings=named,
         unexplained=left,
-        posterior_predictive=checked,
+        posterior_predictive=_checked(residuals, maps, fast.answer, quickly),
         sensitivity=() if something else visibility.limits([*alone, *_seen_quickly(fast)]),
         notes=_notes(asked, found, said, still=at_rest(start), something=something),
         model=fast.left.filtered.model,
@@ -97,6 +91,17 @@ def whole_answer(
         validation=support.validation((answer, held), (fast.answer, quickly), told, left),
         regime_map=maps,
     )
+
+
+def _checked(
+    residuals: residual_checks.Residuals, maps: Sequence[RegimeMap], quick: Answer, held: HeldOut
+) -> dict[str, Check]:
+    """Of the residual, where only the recorded rate shows it at that: what was found and left."""
+    checked = residual_checks.checks(residuals, maps)
+    if not quick.keys:
+        return checked
+    fast = residual_checks.residuals_of(held.rows(quick.best.names))
+    return residual_checks.at_recorded_rate(checked, fast)
 
 
 def _seen_quickly(fast: Quick) -> list[visibility.Seen]:
