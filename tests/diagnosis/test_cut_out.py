@@ -12,6 +12,7 @@ from tracks import experiment, track_of
 from ahrsd.diagnosis.cut_out import FEWEST, brief, without
 from ahrsd.diagnosis.delay import delayed_gyro
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.problem import problem_of
@@ -45,8 +46,8 @@ def state_of(track: Track) -> State:
     return State(problem, fit, tuple(SimpleNamespace(candidate=one) for one in candidates))
 
 
-def test_a_lag_is_named_with_its_value_beside_a_magnet_that_a_hand_puts_on(ask) -> None:
-    found = ask(handled(LAG_S))
+def test_a_lag_is_named_with_its_value_beside_a_magnet_that_a_hand_puts_on() -> None:
+    found = diagnose(handled(LAG_S))
     steps = [one for one in found.findings if one.effect == "hard_iron_step"]
     (lag,) = (one for one in found.findings if one.effect != "hard_iron_step")
     assert len(steps) == 2
