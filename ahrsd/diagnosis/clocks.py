@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -83,39 +84,74 @@ def suspects(course: Located, track: Track) -> list[tuple[float, str]]:
     return [(lag_s, name) for _, lag_s, name in sorted(found, reverse=True)]
 
 
+class Asked(Protocol):
+    """A field in the sensor's axes by one column at other times, against the readings.
+
+    middle_s: time about which a clock drifts;  duration_s: of the recording
+    """
+
+    column: str
+    middle_s: float
+    duration_s: float
+
+    def quieten(self, clock: tuple[float, float]) -> None:
+        """Take the noise from what the column leaves at (lag, drift)."""
+
+    def nats(self, clocks: Sequence[tuple[float, float]]) -> list[float]:
+        """What the column explains at each (lag, drift)."""
+
+
 def clock_of(basis: Base, name: str, around_s: float) -> Late | None:
     """The clock of a column that moves a field in the sensor's axes; None where it is right.
 
     basis: with the calibration known, and nothing that follows the column
     """
-    asked = _Asked(basis, name)
+    return clock_by(_InInnovations(basis, name), around_s)
+
+
+def clock_by(asked: Asked, around_s: float) -> Late | None:
+    """The same by any model's own evidence."""
     coarse = np.arange(around_s - COARSE_S[0], around_s + COARSE_S[0] + 0.1, COARSE_S[1])
-    at, _ = asked.best([(float(lag), 0.0) for lag in coarse])
+    at, _ = _best(asked, [(float(lag), 0.0) for lag in coarse])
     asked.quieten(at)
     none, most = asked.nats([(0.0, 0.0), at])
-    duration_s = basis.context.track.duration_s
-    slopes = [sign * d / duration_s for d in DRIFTS_S for sign in (-1.0, 1.0)]
+    slopes = [sign * d / asked.duration_s for d in DRIFTS_S for sign in (-1.0, 1.0)]
     near = np.arange(-COARSE_S[0], COARSE_S[0] + 0.1, 2.0)
     wider = [(at[0] + float(k), slope) for slope in slopes for k in near]
-    drifting, more = asked.best(wider)
+    drifting, more = _best(asked, wider)
     if more > most + NATS:
         at, most = drifting, more
     for step_s in (0.5, 0.15, 0.05):
-        slope = 2 * step_s / duration_s if at[1] else 0.0
+        slope = 2 * step_s / asked.duration_s if at[1] else 0.0
         slopes = [at[1] + k * slope for k in (-2, -1, 0, 1, 2)] if slope else [0.0]
-        at, most = asked.best([(at[0] + k * step_s, b) for k in range(-3, 4) for b in slopes])
+        at, most = _best(asked, [(at[0] + k * step_s, b) for k in range(-3, 4) for b in slopes])
     if most < none + NATS or (abs(at[0]) < SMALLEST_S and not at[1]):
         return None
-    return Late(name, round(at[0], 3), at[1], asked.middle_s)
+    return Late(asked.column, round(at[0], 3), at[1], asked.middle_s)
 
 
-class _Asked:
+def _best(asked: Asked, clocks: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], float]:
+    """The (lag, drift) that explains most, and its nats."""
+    found = asked.nats(clocks)
+    k = int(np.argmax(found))
+    return clocks[k], found[k]
+
+
+def at_clock(track: Track, column: str, clock: tuple[float, float], middle_s: float) -> Array:
+    """(N,) a column as it would be at a (lag, drift), about its mean."""
+    lag_s, drift = clock
+    at_s = track.time_s + lag_s + drift * (track.time_s - middle_s)
+    course = np.interp(at_s, track.time_s, track.covariates[column])
+    return np.asarray(course - course.mean())
+
+
+class _InInnovations:
     """A field in the sensor's axes by one column at other times, against the innovations."""
 
     def __init__(self, basis: Base, name: str) -> None:
         track = basis.context.track
         self.middle_s = float(track.time_s[0] + track.time_s[-1]) / 2
-        self._basis, self._time_s, self._values = basis, track.time_s, track.covariates[name]
+        self.column, self.duration_s, self._basis = name, track.duration_s, basis
 
     def quieten(self, clock: tuple[float, float]) -> None:
         """Take the noise's colour from what the column leaves at (lag, drift)."""
@@ -123,9 +159,9 @@ class _Asked:
         self._basis = quieter(self._basis, part)
 
     def _columns(self, lag_s: float, drift: float) -> Columns:
-        at_s = self._time_s + lag_s + drift * (self._time_s - self.middle_s)
-        course = np.interp(at_s, self._time_s, self._values)[:, None]
-        return Columns(mag=on_axes(course - course.mean()))
+        track = self._basis.context.track
+        course = at_clock(track, self.column, (lag_s, drift), self.middle_s)
+        return Columns(mag=on_axes(course[:, None]))
 
     def nats(self, clocks: Sequence[tuple[float, float]]) -> list[float]:
         """Half the score statistic at each (lag, drift), in the noise's colour."""
@@ -139,12 +175,6 @@ class _Asked:
             s = score[k : k + 3]
             found.append(0.5 * float(s @ solve(part.T @ part, s[:, None])[:, 0]))
         return [one / self._basis.colour for one in found]
-
-    def best(self, clocks: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], float]:
-        """The (lag, drift) that explains most, and its nats."""
-        found = self.nats(clocks)
-        k = int(np.argmax(found))
-        return clocks[k], found[k]
 
 
 class _Held:

@@ -49,7 +49,8 @@ def diagnose_logged(
     the ordinary.
     ValueError, one line, where nothing can be fitted.
     """
-    found = with_columns_as_logged(track, spec, partial(by_rules, recording=recording))
+    ask = partial(by_rules, recording=recording)
+    found = with_columns_as_logged(track, spec, partial(_on_time, ask=ask))
     return beyond_ordinary(found, simulated=simulated)
 
 
@@ -107,13 +108,13 @@ def _as_logged(track: Track, spec: Spec | None, ask: Ask) -> Diagnosis:
 
     Noise in a cause is told too small, and itself as a source that nobody knows.
     """
-    found = _on_time(track, spec, ask)
+    found = ask(track, spec)
     usable = roles.prepared(track)[0]
     by = tuple(name for name in causes(found) if name in usable.covariates)
     clean = cleaned(usable, by) if found.unexplained.detected else None
     if clean is None:
         return found
-    again = _on_time(clean, spec, ask)
+    again = ask(clean, spec)
     if not (_names(again) == _names(found) and _less(again, found)):
         return found
     own = [name for name in by if clean.covariates[name] is not usable.covariates[name]]

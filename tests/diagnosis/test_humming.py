@@ -8,8 +8,7 @@ import numpy as np
 from mismatch_trials import Trial, made
 from scipy.signal import lfilter
 
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.humming import loudest_band
+from ahrsd.diagnosis.narrow_band import loudest_band
 
 
 def turning(time_s: np.ndarray, rate_hz: float, spread_hz: float) -> np.ndarray:
@@ -44,14 +43,14 @@ def test_slow_noise_is_not_heard_again_at_the_rate_of_new_readings() -> None:
     assert loudest_band(seen, 50.0, 25.0 / 3) is None
 
 
-def test_a_propeller_that_nobody_logged_is_located_by_its_frequency() -> None:
+def test_a_propeller_that_nobody_logged_is_located_by_its_frequency(ask) -> None:
     """It was colour of the noise: the recording and the model agreed."""
     quiet = replace(made(Trial(seed=8, samples=6000)).track, covariates={})
     phase = turning(quiet.time_s, 3.0, 0.25)
     field = np.outer(np.cos(phase), [1.2e-3, -0.8e-3, 0.0])
     field += np.outer(np.sin(phase), [0.0, 0.8e-3, 1.0e-3])
-    assert diagnose(quiet).mismatch is False
-    answer = diagnose(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + field))
+    assert ask(quiet).mismatch is False
+    answer = ask(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + field))
     assert answer.findings == ()
     where = answer.unexplained.where
     assert where is not None

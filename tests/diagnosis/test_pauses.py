@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.gram import block_edges
 from ahrsd.diagnosis.pauses import LEFT_S, without_jumps
 from ahrsd.diagnosis.predictive import segments_of
@@ -50,8 +49,8 @@ def test_cuts_by_time_are_bounded_by_the_rows() -> None:
     assert segments_of(track).max() < len(track)
 
 
-def test_a_clock_that_is_set_while_it_records_is_diagnosed() -> None:
+def test_a_clock_that_is_set_while_it_records_is_diagnosed(ask) -> None:
     """From 1970 to 2025: once more than a terabyte."""
-    found = diagnose(_jumping(1.7471e9, samples=2500))
+    found = ask(_jumping(1.7471e9, samples=2500))
     assert not found.mismatch
     assert found.notes[0].startswith("the clock jumps by +1.7471e+09 s")

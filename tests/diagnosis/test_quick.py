@@ -86,10 +86,10 @@ def test_what_the_form_of_pulses_leaves_is_no_line(quiet: Track) -> None:
     assert [one.effect for one in diagnose(pulsed).findings] == ["sync_pulses"]
 
 
-def test_a_line_above_the_working_rate_is_named_at_its_frequency(quiet: Track) -> None:
+def test_a_line_above_the_working_rate_is_named_at_its_frequency(quiet: Track, ask) -> None:
     phase = 2 * np.pi * 13.217 * quiet.time_s[:, None]
     added = 0.8e-3 * np.cos(phase) * np.array([0.48, 0.6, -0.64])
-    answer = diagnose(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + added))
+    answer = ask(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + added))
     assert [one.effect for one in answer.findings] == ["ac_interference"]
     assert abs(answer.findings[0].setting["frequency_hz"] - 13.217) < 1e-3
     size = np.linalg.norm([one.value for one in answer.findings[0].parameters])

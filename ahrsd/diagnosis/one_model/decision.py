@@ -20,7 +20,13 @@ from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.locate import single_source
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Sized
-from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, plain_delay
+from ahrsd.diagnosis.one_model.effect_components import (
+    LAG,
+    LAG_FORM,
+    TO_THE_DIGIT,
+    holds,
+    plain_delay,
+)
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
 from ahrsd.diagnosis.one_model.remainder import still_spells
@@ -309,6 +315,10 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
         # the scan knows sizes and noise but roughly: both as sets of their own
         by_name[mine] = best.score - fewer.score
         by_name[named_so] = all_sets.judge(fewer.names | {rival}, best).score - fewer.score
+    for name, keys in space.effects.items():
+        wider = all_sets.component(keys[0])
+        if name in by_name and name != mine and holds(wider, own, TO_THE_DIGIT):
+            by_name[name] = by_name[mine] + float(np.log(priors.SAME_FORM))
     total = np.logaddexp.reduce(list(by_name.values()))
     shares = {name: float(np.exp(nats - total)) for name, nats in by_name.items()}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))

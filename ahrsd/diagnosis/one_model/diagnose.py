@@ -17,7 +17,9 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.missing import lost_turns
 from ahrsd.diagnosis.null import fit_null
+from ahrsd.diagnosis.one_model import rich
 from ahrsd.diagnosis.one_model.answer.whole_answer import whole_answer
+from ahrsd.diagnosis.one_model.column_clocks import wrong_clock
 from ahrsd.diagnosis.one_model.recorded_rate import Quick, quick
 from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
 from ahrsd.diagnosis.one_model.search_rounds import Searched, answered
@@ -52,7 +54,16 @@ def diagnose(
     if lost := lost_turns(problem.recorded, problem.cold):
         asked = asked.with_facts(lost)
         problem, start = begun(asked.put_right(), spec, library)
-    found, fast = _found(problem, start, library)
+    richest = rich.richest(problem, start.filtered, library)
+    if (clock := wrong_clock(richest)) is not None:
+        at_its_time = diagnose(
+            clock.moved(asked.track), spec, library=library, recording=recording,
+            simulated=simulated,
+        )  # fmt: skip
+        if any(one.setting.get("covariate") == clock.column for one in at_its_time.findings):
+            said = f"{clock.words}: its cause is judged at the sensor's time"
+            return replace(at_its_time, notes=(said, *at_its_time.notes))
+    found, fast = _found(problem, richest, start, library)
     told = whole_answer(
         asked,
         start,
@@ -66,14 +77,14 @@ def diagnose(
 
 
 def _found(
-    problem: Problem, start: NullFit, library: Mapping[str, Effect]
+    problem: Problem, richest: rich.Judged, start: NullFit, library: Mapping[str, Effect]
 ) -> tuple[Searched, Quick]:
     """The search, and what only the recorded rate shows; with that taken out the search anew."""
-    found = answered(problem, start, library)
+    found = answered(richest, library)
     fast = _quick(found, library)
     if fast.slower is not None:
         again = fit_null(fast.slower.track, problem.spec, start.model, walk=False)
-        found = answered(fast.slower, again, library)
+        found = answered(rich.richest(fast.slower, again.filtered, library), library)
         fast = replace(fast, left=_quick(found, library).left)
     return found, fast
 

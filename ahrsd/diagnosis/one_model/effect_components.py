@@ -24,6 +24,8 @@ LAG_FORM = "form of the delay"
 _ALIKE = 1e-3
 #: parts in which the transition of a step is free
 PIECES = 20
+#: of a component's power beyond another that is rounding: no reading tells the two
+TO_THE_DIGIT = 1e-12
 #: s between the times at which a logged cause is tried
 LATE_STEP_S = priors.LOGGED_LATE_S[-1] - priors.LOGGED_LATE_S[-2]
 #: parts of a recording's length, and factors, to which onsets and scales are sought
@@ -120,15 +122,18 @@ def plain_delay(library: Mapping[str, Effect], sign: float) -> Effect:
     return next(one for one in library.values() if one.plain and one.delay * sign > 0.0)
 
 
-def holds(one: Component, part: Component) -> bool:
-    """Whether a component can be all that another is: its columns are among the first's."""
-    mine, other = one.columns.mag, part.columns.mag
-    if mine is None or other is None or one.columns.gyro is not None or one.width <= part.width:
+def holds(one: Component, part: Component, least: float = _ALIKE) -> bool:
+    """Whether a component can be all that another is: its columns are among the first's.
+
+    least: of the other's power that may be beyond
+    """
+    if one.width <= part.width or (one.columns.mag is None) != (part.columns.mag is None):
         return False
-    X, y = mine.reshape(-1, one.width), other.reshape(-1, part.width)
-    G = X.T @ X
-    left = y - X @ np.linalg.lstsq(G, X.T @ y, rcond=None)[0]
-    return float(np.sum(left**2)) < _ALIKE * float(np.sum(y**2))
+    if one.columns.mag is not None and one.columns.gyro is not None:
+        return False
+    X, y = (_flat(each.columns).reshape(-1, each.width) for each in (one, part))
+    left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    return float(np.sum(left**2)) < least * float(np.sum(y**2))
 
 
 def beyond(one: Component, part: Component) -> Component:

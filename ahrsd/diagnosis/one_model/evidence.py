@@ -56,6 +56,7 @@ class Products:
     """What the data say, band by band.
 
     G (B, q, q), s (B, q), square (B,), rows (B,);  step: of the noise's spectrum (`noise_model`)
+    alone: numbers of bands that stand alone in it
     """
 
     G: Array
@@ -63,6 +64,7 @@ class Products:
     square: Array
     rows: Array
     step: float
+    alone: slice | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +115,7 @@ def evaluated(products: Products, laws: Sequence[Law], log_noise: Array, psi: Ar
     by_phi = 0.5 * (m**2 - sure)
     noise = _noise(products, found, m * deviation, deviation)
     by_noise = 0.5 * (noise.expected * inverse - products.rows)
-    of_noise, slope_of_noise = noise_model.log_prior(log_noise, products.step)
+    of_noise, slope_of_noise = noise_model.log_prior(log_noise, products.step, products.alone)
     likelihood = 0.5 * (float(m @ scaled) - log_det)
     likelihood -= 0.5 * float(
         products.rows @ (log_noise + np.log(2 * np.pi)) + products.square @ inverse
@@ -179,7 +181,7 @@ def _curvature(
     own = np.diag_indices_from(H)
     H[own] = np.maximum(H[own], np.concatenate(expected))
     H *= 0.5
-    H[:count, :count] += noise_model.stiffness(count, products.step)
+    H[:count, :count] += noise_model.stiffness(count, products.step, products.alone)
     H[own] += np.concatenate([np.zeros(count), prior.stiffness])
     return H
 
@@ -249,7 +251,7 @@ def _newton(at: At, x: Array, low: Array, high: Array) -> Array:
     free = ~(((x <= low) & (g < 0.0)) | ((x >= high) & (g > 0.0)))
     while np.any(free):
         rest = g[free] - H[np.ix_(free, ~free)] @ step[~free]
-        step[free] = linalg.solve(H[np.ix_(free, free)], rest, assume_a="pos")
+        step[free] = _solved(H[np.ix_(free, free)], rest)
         inside = np.clip(step, low - x, high - x)
         beyond = free & (inside != step)
         step = inside
@@ -257,3 +259,14 @@ def _newton(at: At, x: Array, low: Array, high: Array) -> Array:
             break
         free &= ~beyond
     return step
+
+
+def _solved(H: Array, g: Array) -> Array:
+    """H^-1 g of a curvature, each hyperparameter in its own unit.
+
+    Beside something a thousand times louder than the noise some curvatures are 1e12 times others,
+    and unscaled the matrix is singular to rounding.
+    """
+    scale = 1.0 / np.sqrt(np.diag(H))
+    scaled = H * scale * scale[:, None]
+    return np.asarray(scale * linalg.solve(scaled, scale * g, assume_a="pos"))

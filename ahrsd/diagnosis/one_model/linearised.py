@@ -25,6 +25,7 @@ from ahrsd.diagnosis.innovation import (
     run_filter,
     sensitivities,
 )
+from ahrsd.diagnosis.narrow_band import BAND_HZ
 from ahrsd.diagnosis.one_model import noise_model
 from ahrsd.diagnosis.one_model.component import Component, Fixed
 from ahrsd.diagnosis.one_model.evidence import At, Products
@@ -88,6 +89,7 @@ class Linearised:
     """A point, the context there, and products of components, each made once.
 
     batches: (3 M, p) rows of components that passed the filter together, as the noise sees them
+    alone: numbers of bands of the noise that stand alone, None where there are none
     """
 
     point: Point
@@ -98,6 +100,7 @@ class Linearised:
     seen: dict[str, Seen] = field(default_factory=dict)
     batches: list[Array] = field(default_factory=list)
     blocks: dict[tuple[int, int], Array] = field(default_factory=dict)
+    alone: slice | None = None
 
     def add(self, components: Sequence[Component]) -> None:
         """Pass components through the filter; what is known already is left out.
@@ -164,7 +167,7 @@ class Linearised:
         square = np.array([float(self.y[a:b] @ self.y[a:b]) for a, b in self._bands()])
         used = float(np.count_nonzero(self.point.filtered.used)) / int(self.edges[-1])
         rows = np.array([(b - a) * used for a, b in self._bands()])
-        return Products(G, s, square, rows, step)
+        return Products(G, s, square, rows, step, self.alone)
 
     @property
     def log_whitening(self) -> float:
@@ -267,16 +270,23 @@ def regained(point: Point) -> Point:
     return replace(point, filtered=run_filter(problem.track, again, mag, gyro))
 
 
-def linearised(point: Point, context: Context) -> Linearised:
+def linearised(
+    point: Point, context: Context, band_hz: tuple[float, float] | None = None
+) -> Linearised:
     """The recording at a point, the calibration known and put back.
 
-    context: of which all columns are made
+    context: of which all columns are made;  band_hz: in which the noise may have any power
     """
     smooth = regressing(point.filtered, context.rate_b_rad_s)
     count = length(len(point.filtered.whitened))
     scaled = point.filtered.whitened / point.loud.amplitude[:, None]
     white = by_frequency(scaled[:, :, None])[:, 0]
-    made = Linearised(point, context, smooth, noise_model.octaves(count), white)
+    edges, alone = noise_model.octaves(count), None
+    if band_hz is not None:
+        low, high = (round(2 * count * one / point.problem.rate_hz) for one in band_hz)
+        width = round(2 * count * BAND_HZ / point.problem.rate_hz)
+        edges, alone = noise_model.with_band(edges, low, min(high, count), width)
+    made = Linearised(point, context, smooth, edges, white, alone=alone)
     prior = prior_of(point.problem.track)
     law = Fixed(prior.deviation**2)
     made.add([Component(CALIBRATION, "sensor", nuisance_columns(smooth), law)])

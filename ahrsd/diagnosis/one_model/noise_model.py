@@ -32,20 +32,48 @@ def octaves(count: int) -> NDArray[np.intp]:
     return np.array([0, *edges[::-1]], dtype=np.intp)
 
 
-def log_prior(log_noise: Array, deviation: float) -> tuple[float, Array]:
-    """Log density of the bands' log powers (B,), and its gradient; deviation: octave to octave."""
-    step = np.diff(log_noise) / deviation
+def with_band(
+    edges: NDArray[np.intp], low: int, high: int, width: int
+) -> tuple[NDArray[np.intp], slice]:
+    """Edges with bands of their own from one cosine to another, and their numbers.
+
+    width: of one, cosines: what hums is louder in the middle than at its sides
+    """
+    near = (high - low) // 2
+    kept = [e for e in edges.tolist()[1:-1] if e < low - near or e > high + near]
+    own = np.linspace(low, high, max(1, round((high - low) / width)) + 1).round().astype(int)
+    found = sorted({0, *kept, *own.tolist(), int(edges[-1])})
+    return np.array(found, dtype=np.intp), slice(found.index(low), found.index(high))
+
+
+def _deviations(count: int, deviation: float, alone: slice | None) -> Array:
+    """(B - 1,) of the steps of the spectrum; to bands that stand alone and from them any."""
+    out = np.full(count - 1, deviation)
+    if alone is not None:
+        out[max(0, alone.start - 1) : alone.stop] = priors.NOISE_TOP
+    return out
+
+
+def log_prior(
+    log_noise: Array, deviation: float, alone: slice | None = None
+) -> tuple[float, Array]:
+    """Log density of the bands' log powers (B,), and its gradient.
+
+    deviation: octave to octave;  alone: numbers of bands that may stand out by any power
+    """
+    deviations = _deviations(len(log_noise), deviation, alone)
+    step = np.diff(log_noise) / deviations
     top = log_noise[-1] / priors.NOISE_TOP
     gradient = np.zeros(len(log_noise))
-    gradient[:-1] += step / deviation
-    gradient[1:] -= step / deviation
+    gradient[:-1] += step / deviations
+    gradient[1:] -= step / deviations
     gradient[-1] -= top / priors.NOISE_TOP
-    return -0.5 * float(step @ step + top**2) - len(step) * float(np.log(deviation)), gradient
+    return -0.5 * float(step @ step + top**2) - float(np.sum(np.log(deviations))), gradient
 
 
-def stiffness(count: int, deviation: float) -> Array:
+def stiffness(count: int, deviation: float, alone: slice | None = None) -> Array:
     """(B, B) curvature of minus that log density."""
-    difference = np.diff(np.eye(count), axis=0) / deviation
+    difference = np.diff(np.eye(count), axis=0) / _deviations(count, deviation, alone)[:, None]
     found = difference.T @ difference
     found[-1, -1] += 1.0 / priors.NOISE_TOP**2
     return np.asarray(found)

@@ -93,6 +93,8 @@ EFFECT_GRID = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
 #: s by which a logged cause may come late into the log, or early;  source: averages of loggers; the
 #: motor's current of a flight came 0.32 s late
 LOGGED_LATE_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
+#: s by which a column's clock is off from which on it is sought: nearer, its setting is
+ON_TIME_S = 1.0
 #: s over which a logger ordinarily takes its mean: a battery's monitor filters over a tenth
 LOGGED_BLUR_S = 0.05
 #: relative size of what an effect leaves of its form, its second order
@@ -104,6 +106,8 @@ FORM = 0.03
 NOISE_STEP_CLEAN, NOISE_STEP_REAL, NOISE_STEP_FREE, NOISE_TOP = 0.25, 0.6, 1.5, 3.0
 #: log power by which a band is louder than the highest where the noise has what a model lacks
 LOUD = 2.0
+#: times as loud as its sides that a narrow band is for it to be a source that hums and no colour
+STANDS_OUT = 3.0
 #: log powers between which a band stays
 NOISE_RANGE = (-9.0, 9.0)
 #: degrees of freedom of readings beyond their level, beside normal ones;  source: 3 on a flight
@@ -128,6 +132,9 @@ NEAR = 0.7
 NAME_ODDS, UNKNOWN_ODDS = 3.0, 3.0
 #: both on a recording with an ordinary remainder: its laws are not exact, a few nats say nothing
 ODDS_REAL = 12.0
+#: odds that what one effect explains is a wider one's in just that form, which no reading tells:
+#: one cause may make a gyro's axes all be off alike, but more often they differ
+SAME_FORM = 0.5
 #: nats that a move of the search must gain
 MOVE = 2.0
 #: how near to all of a delay must be a filter's to be called one
@@ -146,5 +153,7 @@ SHIFTS = (0.236, 0.382, 0.472, 0.618, 0.764, 0.854)
 SHOWN_AT = 6.5
 #: probability that any bin of any regime is outside of its band where nothing is left
 BINS_OUTSIDE = 0.01
+#: s that an object which is passed by shows at most: what it leaves there is no noise
+PASSING_S = 30.0
 #: probability by chance, and correlation, of a logged column that is said to move with a course
 CHANCE, ALIKE = 0.2, 0.5

@@ -7,14 +7,16 @@ found, and the library's quick effects are searched there, by the same evidence.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ahrsd.diagnosis.delay import without_lag
+from ahrsd.diagnosis.diagnosis import Unexplained
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.innovation import run_filter
+from ahrsd.diagnosis.narrow_band import loudest_band, of_band
 from ahrsd.diagnosis.one_model import decision, noise_model, priors, rich
 from ahrsd.diagnosis.one_model.effect_components import component
 from ahrsd.diagnosis.one_model.linearised import (
@@ -27,7 +29,7 @@ from ahrsd.diagnosis.one_model.linearised import (
     moved,
     relevelled,
 )
-from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, searched
+from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, Space, searched
 from ahrsd.diagnosis.problem import Problem, model_at_rate
 from ahrsd.diagnosis.thin import thinned
 from ahrsd.samples import Array
@@ -41,6 +43,7 @@ class Quick:
     """An answer at the recorded rate.
 
     left: the recording with all that was found taken out;  all_sets, space: what was searched
+    hum: a band that no name explains and that stands out of the noise
     slower: the problem of a search that begins anew without what was found, None where nothing was
     """
 
@@ -49,6 +52,7 @@ class Quick:
     slower: Problem | None
     all_sets: Hypotheses
     space: Space
+    hum: Unexplained
 
 
 def quick(
@@ -68,14 +72,35 @@ def quick(
     slower = None
     if answer.findings:
         slower = _without(point.problem, made.point.problem, fast, answer.best)
-    return Quick(answer, point, slower, all_sets, space)
+    return Quick(answer, point, slower, all_sets, space, _hum(fast, answer.best))
 
 
 def _searched(
     point: Point, library: Mapping[str, Effect], *, real: bool
 ) -> tuple[Linearised, Hypotheses, Space, Hypothesis]:
-    """The likeliest set of quick effects at a point."""
-    fast = linearised(point, point.context)
+    """The likeliest set of quick effects at a point.
+
+    Where a band stands out it may be noise as well: what was found without that has to be likelier
+    than a band of any power.
+    """
+    plain = linearised(point, point.context)
+    first = _searched_in(plain, library, (), real=real)
+    if real:
+        return first
+    known = first[1].judge(frozenset())
+    rate_hz = point.problem.rate_hz
+    highest_hz = 0.5 * rate_hz * float(np.mean(point.filtered.used))  # readings that repeat
+    band = loudest_band(plain.left_by(known.keys, known.at), rate_hz, highest_hz)
+    if band is None:
+        return first
+    beside = linearised(point, point.context, band[:2])
+    return _searched_in(beside, library, [first[3].names], real=real)
+
+
+def _searched_in(
+    fast: Linearised, library: Mapping[str, Effect], starts: Sequence[Names], *, real: bool
+) -> tuple[Linearised, Hypotheses, Space, Hypothesis]:
+    """The likeliest set in one form of the noise.  starts: sets beside the empty one."""
     candidates = {}
     for name, effect in library.items():
         settings = effect.settings(fast.context) if effect.quick else ()
@@ -88,7 +113,28 @@ def _searched(
     noise = rich.fitted(fast, (CALIBRATION,), step).log_noise
     all_sets = Hypotheses(fast, (), noise, {}, real=real)
     space = Space(candidates, (), lambda *_: [], lambda _: None, lambda _: [])
-    return fast, all_sets, space, searched(all_sets, space, [frozenset()])[0]
+    return fast, all_sets, space, searched(all_sets, space, [frozenset(), *starts])[0]
+
+
+def _hum(fast: Linearised, best: Hypothesis) -> Unexplained:
+    """The band of the noise that stands alone, where what was found leaves it loud."""
+    alone = fast.alone
+    if alone is None:
+        return Unexplained(False)
+    log_noise = best.at.log_noise
+    sides = [k for k in (alone.start - 1, alone.stop) if 0 <= k < len(log_noise)]
+    beside = float(max(log_noise[k] for k in sides))
+    ratio = np.exp(log_noise[alone] - beside)
+    rows = 1.5 * np.diff(fast.edges)[alone]
+    nats = float(np.sum(rows * (ratio - 1.0 - np.log(ratio))))
+    if np.max(ratio) < priors.STANDS_OUT or nats < priors.UNKNOWN_ODDS:
+        return Unexplained(False)
+    low, high = float(fast.edges[alone.start]), float(fast.edges[alone.stop])
+    rate_hz, count = fast.point.problem.rate_hz, int(fast.edges[-1])
+    level = replace(best.at, log_noise=np.full(len(log_noise), beside))
+    left = fast.left_by(best.keys, level)
+    band_hz = (rate_hz * low / (2 * count), rate_hz * high / (2 * count))
+    return of_band(fast.context, left, rate_hz, band_hz, nats)
 
 
 def at_recorded_rate(slow: Point) -> Point:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.one_model import decision, priors, rich
 from ahrsd.diagnosis.one_model.component import Component
@@ -16,7 +15,6 @@ from ahrsd.diagnosis.one_model.effect_components import LAG, PIECES
 from ahrsd.diagnosis.one_model.linearised import unread
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.one_model.search_space import best_at
-from ahrsd.diagnosis.problem import Problem
 from ahrsd.samples import Array
 
 #: linearisations with a search each, at most
@@ -32,9 +30,8 @@ class Searched:
     space: Space
 
 
-def answered(problem: Problem, start: NullFit, library: Mapping[str, Effect]) -> Searched:
+def answered(found: rich.Judged, library: Mapping[str, Effect]) -> Searched:
     """Searched at the richest model, and again at what was found, until that stays."""
-    found = rich.richest(problem, start.filtered, library)
     all_sets, space, best = best_at(found, library, (), was_real=True)
     answer = decision.decided(all_sets, space, best, library)
     for _ in range(ROUNDS - 1):

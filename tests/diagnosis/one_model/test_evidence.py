@@ -199,3 +199,21 @@ def test_the_maximum_is_that_of_another_climb():
         start = np.concatenate([found.log_noise, found.psi]) + 0.3
         other = minimize(cost, start, jac=True, bounds=list(zip(low, high, strict=True)))
         assert found.nats == pytest.approx(-other.fun, abs=0.05)
+
+
+def test_bands_that_stand_alone_may_have_any_power() -> None:
+    edges, alone = noise_model.with_band(noise_model.octaves(4000), 700, 900, 50)
+    assert edges.tolist() == [0, 62, 125, 250, 500, 700, 750, 800, 850, 900, 2000, 4000]
+    assert edges[alone].tolist() == [700, 750, 800, 850]
+    quiet = np.zeros(len(edges) - 1)
+    loud = quiet.copy()
+    loud[alone] = 3.0
+    near, far = (noise_model.log_prior(loud, STEP, where)[0] for where in (alone, None))
+    assert near > noise_model.log_prior(quiet, STEP, alone)[0] - 1.1
+    assert far < noise_model.log_prior(quiet, STEP)[0] - 15.0
+    _, slope = noise_model.log_prior(loud, STEP, alone)
+    for k, one in enumerate(np.eye(len(loud))):
+        up, down = (noise_model.log_prior(loud + d * one, STEP, alone)[0] for d in (1e-4, -1e-4))
+        assert slope[k] == pytest.approx((up - down) / 2e-4, abs=1e-6)
+    expected = -noise_model.stiffness(len(loud), STEP, alone) @ loud
+    np.testing.assert_allclose(slope, expected, atol=1e-9)

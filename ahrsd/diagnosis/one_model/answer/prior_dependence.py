@@ -51,8 +51,10 @@ def changes(all_sets: Hypotheses, known: Hypothesis, factor: float) -> Mapping[s
     named = sum(one.row is not None for one in members)
     real = all_sets.is_real(known.names)
     step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN
+    alone = all_sets.made.alone
     assumed, wider = (
-        noise_model.log_prior(at.log_noise, deviation)[0] for deviation in (step, factor * step)
+        noise_model.log_prior(at.log_noise, deviation, alone)[0]
+        for deviation in (step, factor * step)
     )
     return {
         NAME: named * log,

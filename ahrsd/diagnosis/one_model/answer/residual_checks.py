@@ -11,7 +11,7 @@ Before is the calibration alone in the same noise: what was left out would else 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -57,17 +57,37 @@ def checks(found: Residuals, maps: Sequence[RegimeMap]) -> dict[str, Check]:
 
     Deterministic.
     """
-    before, value, expected = _compared(found)
-    out = {
-        name: Check(value[name], band, _inside(before[name], band), _inside(value[name], band))
-        for name, band in expected.items()
-    }
+    out = _stated(found)
     for one in maps:
         each = priors.BINS_OUTSIDE / (len(maps) * len(one.after))
         limit = float(special.chdtri(3.0, each)) / 2.0
         was, now = max(one.before), max(one.after)
         out[f"by_{one.quantity}"] = Check(now, (0.0, limit), was <= limit, now <= limit)
     return out
+
+
+def at_recorded_rate(slow: Mapping[str, Check], found: Residuals) -> dict[str, Check]:
+    """Checks of the working rate, and of the recorded one where that has them.
+
+    found: rows of the recorded rate, with all that the search found taken out: where the
+    calibration alone was beside its band already, it is.
+    """
+    fast = _stated(found)
+    return {
+        name: replace(fast[name], inside_before=fast[name].inside_before and one.inside_before)
+        if name in fast
+        else one
+        for name, one in slow.items()
+    }
+
+
+def _stated(found: Residuals) -> dict[str, Check]:
+    """Each statistic of the residual beside its copies."""
+    before, value, expected = _compared(found)
+    return {
+        name: Check(value[name], band, _inside(before[name], band), _inside(value[name], band))
+        for name, band in expected.items()
+    }
 
 
 def _compared(

@@ -13,9 +13,9 @@ import numpy as np
 
 from ahrsd.diagnosis import locate
 from ahrsd.diagnosis.descent import NullFit
-from ahrsd.diagnosis.diagnosis import Diagnosis, Suspect, Unexplained
+from ahrsd.diagnosis.diagnosis import Check, Diagnosis, Finding, RegimeMap, Suspect, Unexplained
 from ahrsd.diagnosis.effects.base import Effect
-from ahrsd.diagnosis.facts import Fact, of_fact, rounding
+from ahrsd.diagnosis.facts import Fact, around, lost_at, of_fact, rounding
 from ahrsd.diagnosis.hygiene import would_have_shown
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.noise import level_facts
@@ -25,6 +25,7 @@ from ahrsd.diagnosis.one_model.answer import pictures, residual_checks, support,
 from ahrsd.diagnosis.one_model.answer.held_out import HeldOut
 from ahrsd.diagnosis.one_model.answer.left_sizes import told_sizes
 from ahrsd.diagnosis.one_model.answer.repaired_noise import repaired_noise
+from ahrsd.diagnosis.one_model.decision import Answer
 from ahrsd.diagnosis.one_model.recorded_rate import Quick
 from ahrsd.diagnosis.one_model.search_rounds import Searched
 from ahrsd.diagnosis.prepared import Prepared
@@ -56,7 +57,8 @@ def whole_answer(
     left = _with_channels(support.what_is_left(answer, held), found, courses)
     remainder_nats = support.nats_of_remainder(all_sets, answer)
     left = told_sizes(all_sets, answer, left, remainder_nats, simulated=simulated)
-    loud = _loud(found, fast, spec_given=spec_given)
+    left = max(left, fast.hum, key=lambda one: (one.detected, one.evidence_nats))
+    loud = _loud(found, fast, asked.facts, told, spec_given=spec_given)
     still = resting(start.context(), library, LIMITS) if at_rest(start) else ()
     named = (*asked.told(library), *told, *(of_fact(fact, library) for fact in loud), *still)
     something = bool(named) or left.detected
@@ -67,7 +69,8 @@ def whole_answer(
         *pictures.contributions(all_sets, answer),
         *pictures.contributions(fast.all_sets, fast.answer),
     ]
-    surest = max(answer.log_odds, fast.answer.log_odds, remainder_nats, 0.0)
+    odds = answer.log_odds, fast.answer.log_odds
+    surest = max(*odds, remainder_nats, fast.hum.evidence_nats, 0.0)
     counted = len(named) > len(told)
     said = support.doubts(told) if something else support.nearest(answer, all_sets)
     return Diagnosis(
@@ -77,7 +80,7 @@ def whole_answer(
         p_value=0.0 if counted else float(np.exp(-surest)),
         findings=named,
         unexplained=left,
-        posterior_predictive=residual_checks.checks(residuals, maps),
+        posterior_predictive=_checked(residuals, maps, fast.answer, quickly),
         sensitivity=() if something else visibility.limits([*alone, *_seen_quickly(fast)]),
         notes=_notes(asked, found, said, still=at_rest(start), something=something),
         model=fast.left.filtered.model,
@@ -90,15 +93,39 @@ def whole_answer(
     )
 
 
+def _checked(
+    residuals: residual_checks.Residuals, maps: Sequence[RegimeMap], quick: Answer, held: HeldOut
+) -> dict[str, Check]:
+    """Of the residual, where only the recorded rate shows it at that: what was found and left."""
+    checked = residual_checks.checks(residuals, maps)
+    if not quick.keys:
+        return checked
+    fast = residual_checks.residuals_of(held.rows(quick.best.names))
+    return residual_checks.at_recorded_rate(checked, fast)
+
+
 def _seen_quickly(fast: Quick) -> list[visibility.Seen]:
     return visibility.seen_alone(fast.all_sets, fast.space, fast.answer.best.names)
 
 
-def _loud(found: Searched, fast: Quick, *, spec_given: bool) -> list[Fact]:
-    """What is to be said of the noise's level: beside a real remainder it comes and goes."""
-    if found.all_sets.is_real(found.answer.best.names):
+def _loud(
+    found: Searched, fast: Quick, facts: Sequence[Fact], told: Sequence[Finding], *,
+    spec_given: bool,
+) -> list[Fact]:  # fmt: skip
+    """What is to be said of the noise's level.
+
+    Beside a real remainder it comes and goes, coarse numbers scatter by themselves, and where turns
+    were lost or something passed what that leaves is no noise.
+    """
+    if found.all_sets.is_real(found.answer.best.names) or rounding(facts):
         return []
-    return level_facts(fast.left.filtered, spec_given=spec_given)
+    short = [
+        span for one in told if one.where.frame == "world" for span in one.where.intervals_s
+        if span[1] - span[0] < priors.PASSING_S
+    ]  # fmt: skip
+    moments = [*lost_at(facts), *short]
+    levels = level_facts(fast.left.filtered, spec_given=spec_given)
+    return [fact for fact in levels if not around(fact, moments)]
 
 
 def _spans(facts: Sequence[Fact]) -> list[tuple[float, float]]:
@@ -110,8 +137,8 @@ def _notes(
 ) -> tuple[str, ...]:
     problem = found.all_sets.made.point.problem
     seen = () if something else would_have_shown(problem.recorded)
-    how = (NOTE, *asked.notes, *problem.notes, *((HARDLY_TURNED,) if still else ()))
-    return (*how, *said, *asked.lesser, *seen)
+    how = (*asked.notes, *problem.notes, *((HARDLY_TURNED,) if still else ()))
+    return (*how, *said, *asked.lesser, *seen, NOTE)
 
 
 def _with_channels(
