@@ -98,6 +98,11 @@ LOGGED_BLUR_S = 0.05
 #: relative size of what an effect leaves of its form, its second order
 FORM = 0.03
 
+#: deviation over a recording of a name's coefficient that is free in time, relative to itself:
+#: from which on the name stands in for something else, and the largest;  source: 16 names that are
+#: there have .1 at most, without evidence; stand-ins .36 to 1.1
+VARIES, VARIES_MOST = 0.25, 10.0
+
 # --- noise --------------------------------------------------------------------------------------
 #: deviation of a log power from that of the next octave: of a sensor's own noise, of what a real
 #: recording leaves as well, and where only a delay is sought;  of the highest from the filter's
@@ -128,6 +133,8 @@ NEAR = 0.7
 NAME_ODDS, UNKNOWN_ODDS = 3.0, 3.0
 #: both on a recording with an ordinary remainder: its laws are not exact, a few nats say nothing
 ODDS_REAL = 12.0
+#: part of the evidence of what is unknown in a sensor that a name beside it must have
+BESIDE_UNKNOWN = 0.5
 #: nats that a move of the search must gain
 MOVE = 2.0
 #: how near to all of a delay must be a filter's to be called one
