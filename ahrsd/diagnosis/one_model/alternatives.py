@@ -12,8 +12,9 @@ import numpy as np
 
 from ahrsd.diagnosis.locate import unit_columns
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.component import Component, Sized
+from ahrsd.diagnosis.one_model.component import Component, Law, Sized
 from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw, course
+from ahrsd.diagnosis.one_model.remainder import harmonics
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -38,18 +39,31 @@ def other_courses(context: Context) -> list[Component]:
     return [by_rate, course(context, "sensor", quick=QUICK)]
 
 
-def varying(known: Component, added: Array, context: Context) -> Component:
-    """What a name adds (N, 3), by a factor that is free in time, relative to its coefficient."""
+def varying(known: Component, added: Array, context: Context) -> list[Component]:
+    """What a name adds (N, 3), by a factor that is free in time, and by one free in attitude.
+
+    Both are relative to its coefficient.
+    """
     time_s = context.track.time_s
     order = np.arange(1, _WAVES + 1)
     phase = np.pi * (time_s - time_s[0]) / (time_s[-1] - time_s[0])
-    flat = added[:, :, None] * np.cos(phase[:, None] * order)[:, None, :]
-    columns = Columns(gyro=flat) if known.columns.mag is None else Columns(mag=flat)
-    law = CourseLaw(order.astype(float), 1.0, most=priors.VARIES_MOST)
-    odds = float(np.log(priors.COURSE))
-    return Component(form_key(known.key), known.frame, columns, law, odds)
+    in_time = CourseLaw(order.astype(float), 1.0, most=priors.VARIES_MOST)
+    unit = context.smooth_b / np.linalg.norm(context.smooth_b, axis=1, keepdims=True)
+    degree_1_and_2 = np.column_stack([np.sqrt(3.0) * unit, harmonics(context.smooth_b)[:, :5]])
+    low, high = (np.array([np.log(one)]) for one in (priors.COURSE_SIZES[0], priors.VARIES_MOST))
+    in_attitude = Sized(np.ones(degree_1_and_2.shape[1]), low, high)
+    factors: list[tuple[Array, Law]] = [
+        (np.cos(phase[:, None] * order), in_time),
+        (degree_1_and_2, in_attitude),
+    ]
+    found = []
+    for key, (factor, law) in zip(form_keys(known.key), factors, strict=True):
+        flat = added[:, :, None] * factor[:, None, :]
+        columns = Columns(gyro=flat) if known.columns.mag is None else Columns(mag=flat)
+        found.append(Component(key, known.frame, columns, law, float(np.log(priors.COURSE))))
+    return found
 
 
-def form_key(key: str) -> str:
-    """Key of the free factor of a name."""
-    return f"{key}, free in time"
+def form_keys(key: str) -> tuple[str, str]:
+    """Keys of the free factors of a name."""
+    return f"{key}, free in time", f"{key}, free in attitude"

@@ -20,7 +20,7 @@ from ahrsd.diagnosis.diagnosis import Cost, Finding, Share, Unexplained, Value, 
 from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.locate import Frame, single_source, unit_columns
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.alternatives import form_key, other_courses, varying
+from ahrsd.diagnosis.one_model.alternatives import form_keys, other_courses, varying
 from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM, plain_delay
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
@@ -70,7 +70,7 @@ def decided(
         effect = all_sets.component(key).effect
         if effect is None or effect in switching or _is_ordinary(all_sets, best, key):
             continue
-        if form_key(key) in best.names:
+        if not best.names.isdisjoint(form_keys(key)):
             continue
         finding, term = _told(all_sets, space, best, key, odds[key], library)
         found.append(finding)
@@ -212,26 +212,25 @@ def _held_to_form(
     all_sets: Hypotheses, space: Space, best: Hypothesis, rivals: dict[str, Hypothesis]
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
     """With a free factor for each name that stands in for something: its coefficient varies."""
-    while space.courses:
+    while True:
         asked = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.UNKNOWN_ODDS
-        found = best
+        found, made = best, all_sets.made
         for key in _names(all_sets, best):
-            if form_key(key) in best.names:
+            one = all_sets.component(key)
+            # a quick cause's phase is summed from its column, and wanders as that errs
+            wanders = one.row is not None and one.row.quick and "covariate" in one.setting
+            if wanders or not best.names.isdisjoint(form_keys(key)):
                 continue
-            form = varying(
-                all_sets.component(key),
-                added_by(all_sets, best, key)[0],
-                all_sets.made.context,
-            )
-            all_sets.made.add([form])
-            one = all_sets.judge(best.names | {form.key}, best)
-            varies = float(np.exp(all_sets.psi_of(one)[form.key][0])) > priors.VARIES
-            if varies and one.score > max(best.score + asked, found.score):
-                found = one
+            forms = varying(one, added_by(all_sets, best, key)[0], made.context)
+            made.add(forms)
+            for form in forms:
+                free = all_sets.judge(best.names | {form.key}, best)
+                varies = float(np.exp(all_sets.psi_of(free)[form.key][0])) > priors.VARIES
+                if varies and free.score > max(best.score + asked, found.score):
+                    found = free
         if found is best:
             return best, rivals
         best, rivals = _borne_out(all_sets, space, found)
-    return best, rivals
 
 
 def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
@@ -458,7 +457,7 @@ def _left(
         key = max(courses, key=lambda one: odds[one])
         if key in space.courses:
             return (key,), _course(all_sets, best, key, odds[key])
-        stands_in = [name for name in _names(all_sets, best) if form_key(name) == key]
+        stands_in = [name for name in _names(all_sets, best) if key in form_keys(name)]
         return (key, *stands_in), _other(all_sets, best, (key, *stands_in), odds[key])
     for key, size in priors.ORDINARY.items():
         if key not in best.names or size_of(all_sets, best, key) < size.up_to():
