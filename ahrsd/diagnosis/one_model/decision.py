@@ -70,8 +70,6 @@ def decided(
         effect = all_sets.component(key).effect
         if effect is None or effect in switching or _is_ordinary(all_sets, best, key):
             continue
-        if not best.names.isdisjoint(form_keys(key)):
-            continue
         finding, term = _told(all_sets, space, best, key, odds[key], library)
         found.append(finding)
         terms.append(term)
@@ -156,16 +154,20 @@ def _jumping(
     levels = np.vstack([np.zeros(3), np.cumsum(changes, axis=0)])
     course = levels[np.searchsorted(onsets, at, side="right")]
     frame = all_sets.component(keys[0]).frame
-    nats = sum(odds[key] for key in keys)
+    nats = sum(odds.get(key, 0.0) for key in keys)
     return tuple(keys), _described(at, course, frame, nats, ((onsets[0], float(time_s[-1])),))
 
 
 def _borne_out(
     all_sets: Hypotheses, space: Space, best: Hypothesis
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
-    """The set without members that are not sure, and what is likeliest without each other one."""
+    """The set without members that are not sure, and what is likeliest without each other one.
+
+    A name with a free factor beside it is a part of that: it stays as long.
+    """
     while True:
         own = [key for key in best.names if key not in all_sets.remainder]
+        own = [key for key in own if best.names.isdisjoint(form_keys(key))]
         asked = {key: asked_odds(all_sets, best, key) for key in own}
         rivals = {key: all_sets.judge(all_sets.without(best.names, key), best) for key in own}
         if all(best.score - rivals[key].score >= asked[key] for key in own):
