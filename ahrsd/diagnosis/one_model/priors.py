@@ -98,9 +98,9 @@ LOGGED_BLUR_S = 0.05
 #: relative size of what an effect leaves of its form, its second order
 FORM = 0.03
 
-#: deviation over a recording of a name's coefficient that is free in time, relative to itself:
-#: from which on the name stands in for something else, and the largest;  source: 16 names that are
-#: there have .1 at most, without evidence; stand-ins .36 to 1.1
+#: deviation of a name's coefficient that is free in time or attitude, relative to itself: from
+#: which on the name stands in for something else, and the largest;  source: in time twelve names
+#: that are there have .1 at most, stand-ins .36 to 1.3 (workboat 501, 601, road_and_air 502, 602)
 VARIES, VARIES_MOST = 0.25, 10.0
 
 # --- noise --------------------------------------------------------------------------------------
@@ -133,7 +133,8 @@ NEAR = 0.7
 NAME_ODDS, UNKNOWN_ODDS = 3.0, 3.0
 #: both on a recording with an ordinary remainder: its laws are not exact, a few nats say nothing
 ODDS_REAL = 12.0
-#: part of the evidence of what is unknown in a sensor that a name beside it must have
+#: part of the evidence of what is unknown in a sensor that a name beside it must have;  source:
+#: stand-ins .25 and .46 there, the one that is there .75
 BESIDE_UNKNOWN = 0.5
 #: nats that a move of the search must gain
 MOVE = 2.0
