@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -17,8 +18,9 @@ from ahrsd.diagnosis.confound import separating_manoeuvre
 from ahrsd.diagnosis.delay import usual_step
 from ahrsd.diagnosis.diagnosis import Cost, Finding, Share, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.base import Effect, Setting
-from ahrsd.diagnosis.locate import single_source
+from ahrsd.diagnosis.locate import Frame, single_source, unit_columns
 from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.alternatives import form_keys, other_courses, varying
 from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
@@ -65,6 +67,8 @@ def decided(
 ) -> Answer:
     """The answer of a search."""
     best, rivals = _borne_out(all_sets, space, best)
+    best, rivals = _beside_others(all_sets, space, best, rivals)
+    best, rivals = _held_to_form(all_sets, space, best, rivals)
     odds = {key: best.score - rival.score for key, rival in rivals.items()}
     switching = _switching(all_sets, best)
     found, terms, keys = [], [], []
@@ -156,18 +160,21 @@ def _jumping(
     levels = np.vstack([np.zeros(3), np.cumsum(changes, axis=0)])
     course = levels[np.searchsorted(onsets, at, side="right")]
     frame = all_sets.component(keys[0]).frame
-    nats = sum(odds[key] for key in keys)
+    nats = sum(odds.get(key, 0.0) for key in keys)
     return tuple(keys), _described(at, course, frame, nats, ((onsets[0], float(time_s[-1])),))
 
 
 def _borne_out(
     all_sets: Hypotheses, space: Space, best: Hypothesis
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
-    """The set without members that are not sure, and what is likeliest without each other one."""
+    """The set without members that are not sure, and what is likeliest without each other one.
+
+    A name with a free factor beside it is a part of that: it stays as long.
+    """
     while True:
         own = [key for key in best.names if key not in all_sets.remainder]
-        real = all_sets.is_real(best.names)
-        asked = {key: asked_odds(all_sets, key, real=real) for key in own}
+        own = [key for key in own if best.names.isdisjoint(form_keys(key))]
+        asked = {key: asked_odds(all_sets, best, key) for key in own}
         rivals = {key: all_sets.judge(all_sets.without(best.names, key), best) for key in own}
         if all(best.score - rivals[key].score >= asked[key] for key in own):
             rivals = {key: _without(all_sets, space, best, key) for key in own}
@@ -179,11 +186,85 @@ def _borne_out(
         best = _without(all_sets, space, best, key)
 
 
-def asked_odds(all_sets: Hypotheses, key: str, *, real: bool) -> float:
-    """Log odds from which on a member is told."""
-    if real and key != LAG:
-        return priors.ODDS_REAL
-    return priors.UNKNOWN_ODDS if all_sets.component(key).effect is None else priors.NAME_ODDS
+def _names(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
+    """Members that the library has, without the delay."""
+    known = [key for key in best.names if all_sets.component(key).row is not None]
+    return sorted(key for key in known if key != LAG)
+
+
+def _beside_others(
+    all_sets: Hypotheses, space: Space, best: Hypothesis, rivals: dict[str, Hypothesis]
+) -> tuple[Hypothesis, dict[str, Hypothesis]]:
+    """The names that hold beside sources of other laws; the set as it was where all do.
+
+    A source that is quick is noise of a colour as well: only in place of a name it is told.
+    """
+    if not _names(all_sets, best) or not space.courses:
+        return best, rivals
+    others = other_courses(all_sets.made.context)
+    all_sets.made.add(others)
+    wide, rest = best, frozenset(all_sets.remainder)
+    for one in others:
+        more = wide.names | {one.key}
+        found = [all_sets.judge(names, wide) for names in {more, more - rest}]
+        wide = max((wide, *found), key=lambda each: each.score)
+    if wide is best:
+        return best, rivals
+    held, others_rivals = _borne_out(all_sets, space, wide)
+    if set(_names(all_sets, held)) >= set(_names(all_sets, best)):
+        return best, rivals
+    return held, others_rivals
+
+
+def _held_to_form(
+    all_sets: Hypotheses, space: Space, best: Hypothesis, rivals: dict[str, Hypothesis]
+) -> tuple[Hypothesis, dict[str, Hypothesis]]:
+    """With a free factor for each name that stands in for something: its coefficient varies."""
+    while True:
+        asked = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.UNKNOWN_ODDS
+        found, made = best, all_sets.made
+        for key in _names(all_sets, best):
+            one = all_sets.component(key)
+            # a quick cause's phase is summed from its column, and wanders as that errs
+            wanders = one.row is not None and one.row.quick and "covariate" in one.setting
+            if wanders or not best.names.isdisjoint(form_keys(key)):
+                continue
+            forms = varying(one, added_by(all_sets, best, key)[0], made.context)
+            made.add(forms)
+            for form in forms:
+                free = all_sets.judge(best.names | {form.key}, best)
+                varies = float(np.exp(all_sets.psi_of(free)[form.key][0])) > priors.VARIES
+                if varies and free.score > max(best.score + asked, found.score):
+                    found = free
+        if found is best:
+            return best, rivals
+        best, rivals = _borne_out(all_sets, space, found)
+
+
+def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
+    """Log odds from which on a member is told.
+
+    Beside something unknown in its sensor a name has to be the larger part: a source that no law
+    here has leaves a rest, and names take that.
+    """
+    one = all_sets.component(key)
+    if key == LAG:
+        return priors.NAME_ODDS
+    asked = priors.UNKNOWN_ODDS if one.row is None else priors.NAME_ODDS
+    if all_sets.is_real(best.names):
+        asked = priors.ODDS_REAL
+    if one.row is None:
+        return asked
+    unknown = [
+        other for other in best.names - frozenset(all_sets.remainder)
+        if (course := all_sets.component(other)).row is None
+        and (course.columns.mag is None) == (one.columns.mag is None)
+        and not _is_ordinary(all_sets, best, other)
+    ]  # fmt: skip
+    if not unknown:
+        return asked
+    nats = best.score - all_sets.judge(best.names - frozenset(unknown), best).score
+    return max(asked, priors.BESIDE_UNKNOWN * nats)
 
 
 def _is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
@@ -382,11 +463,14 @@ def _left(
     all_sets: Hypotheses, space: Space, best: Hypothesis, odds: Mapping[str, float]
 ) -> tuple[tuple[str, ...], Unexplained]:
     """What no name explains, where that is beyond the ordinary, and the members that it is."""
-    courses = [key for key in space.courses if key in odds]
+    courses = [key for key in odds if all_sets.component(key).row is None]
     courses = [key for key in courses if not _is_ordinary(all_sets, best, key)]
     if courses:
         key = max(courses, key=lambda one: odds[one])
-        return (key,), _course(all_sets, best, key, odds[key])
+        if key in space.courses:
+            return (key,), _course(all_sets, best, key, odds[key])
+        stands_in = [name for name in _names(all_sets, best) if key in form_keys(name)]
+        return (key, *stands_in), _other(all_sets, best, (key, *stands_in), odds[key])
     for key, size in priors.ORDINARY.items():
         if key not in best.names or size_of(all_sets, best, key) < size.up_to():
             continue
@@ -424,6 +508,17 @@ def _course(all_sets: Hypotheses, best: Hypothesis, key: str, odds: float) -> Un
     course = np.cos(phase[:, None] * order) @ modes
     whole = ((float(time_s[0]), float(time_s[-1])),)
     return _described(at, course, one.frame, odds, whole)
+
+
+def _other(all_sets: Hypotheses, best: Hypothesis, keys: Sequence[str], odds: float) -> Unexplained:
+    """What is left that members explain together, whatever their law: its course in their frame."""
+    one, context = all_sets.component(keys[0]), all_sets.made.context
+    added = sum(added_by(all_sets, best, key)[0] for key in keys)
+    turned = np.einsum("nia,ni->na", unit_columns(context, cast("Frame", one.frame)), added)
+    time_s = context.track.time_s
+    at = np.linspace(time_s[0], time_s[-1], _PIECES)
+    course = np.column_stack([np.interp(at, time_s, column) for column in turned.T])
+    return _described(at, course, one.frame, odds, ((float(time_s[0]), float(time_s[-1])),))
 
 
 def _described(

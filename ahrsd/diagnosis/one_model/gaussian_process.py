@@ -22,6 +22,8 @@ from ahrsd.samples import Array
 
 #: half waves of a course: one in so many seconds, and from few to many
 MODE_S, FEWEST, MOST = 5.0, 16, 28
+#: the same of a quick one
+QUICK_S, MOST_QUICK = 1.5, 80
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,16 +90,20 @@ def course(
     frame: Frame,
     ordinary: priors.Size | None = None,
     like: Component | None = None,
+    quick: str | None = None,
 ) -> Component:
     """A course in one frame; of ordinary size where that is given, else of any.
 
-    like: one of the same frame, whose columns it takes
+    like: one of the same frame, whose columns it takes;  quick: key of one with short waves too
     """
-    order = np.arange(1, int(np.clip(context.track.duration_s / MODE_S, FEWEST, MOST)) + 1)
+    waves = np.clip(context.track.duration_s / MODE_S, FEWEST, MOST)
+    if quick is not None:
+        waves = np.clip(context.track.duration_s / QUICK_S, FEWEST, MOST_QUICK)
+    order = np.arange(1, int(waves) + 1)
     columns = _cosines(context, frame, order) if like is None else like.columns
     unit = priors.COURSE_UNIT[frame]
     law = CourseLaw(np.repeat(order, 3).astype(float), unit)
-    key = f"free {frame}"
+    key = quick or f"free {frame}"
     if ordinary is not None:
         middle = float(np.log(ordinary.median / unit))
         law = CourseLaw(law.order, unit, middle, ordinary.spread, ordinary.most / unit)

@@ -100,6 +100,11 @@ LOGGED_BLUR_S = 0.05
 #: relative size of what an effect leaves of its form, its second order
 FORM = 0.03
 
+#: deviation of a name's coefficient that is free in time or attitude, relative to itself: from
+#: which on the name stands in for something else, and the largest;  source: in time twelve names
+#: that are there have .1 at most, stand-ins .36 to 1.3 (workboat 501, 601, road_and_air 502, 602)
+VARIES, VARIES_MOST = 0.25, 10.0
+
 # --- noise --------------------------------------------------------------------------------------
 #: deviation of a log power from that of the next octave: of a sensor's own noise, of what a real
 #: recording leaves as well, and where only a delay is sought;  of the highest from the filter's
@@ -135,6 +140,9 @@ ODDS_REAL = 12.0
 #: odds that what one effect explains is a wider one's in just that form, which no reading tells:
 #: one cause may make a gyro's axes all be off alike, but more often they differ
 SAME_FORM = 0.5
+#: part of the evidence of what is unknown in a sensor that a name beside it must have;  source:
+#: stand-ins .25 and .46 there, the one that is there .75
+BESIDE_UNKNOWN = 0.5
 #: nats that a move of the search must gain
 MOVE = 2.0
 #: how near to all of a delay must be a filter's to be called one

@@ -199,3 +199,36 @@ def test_the_way_of_a_hand_with_a_magnet_is_no_name_beside_its_step():
     assert one.setting["onset_s"] == pytest.approx(track.time_s[0] + 66.0, abs=2.0)
     np.testing.assert_allclose([p.value for p in one.parameters], [0.04, -0.03, 0.02], atol=2e-3)
     assert not found.unexplained.detected
+
+
+@pytest.mark.parametrize("varies", [0.0, 1.5])
+def test_a_name_whose_coefficient_varies_by_as_much_as_itself_is_not_told(varies):
+    track = made(Trial(seed=31, effects=(), samples=4000)).track
+    amps, since_s = track.covariates["motor_current_a"], track.time_s - track.time_s[0]
+    by = 1.0 + varies * np.cos(2 * np.pi * since_s / track.duration_s)
+    axis = np.array([0.6, -0.7, 0.39])
+    added = 1e-3 * (amps * by)[:, None] * axis
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    if varies == 0.0:
+        assert [one.effect for one in found.findings] == ["motor_current_field"]
+        assert not found.unexplained.detected
+        return
+    assert found.findings == ()
+    left = found.unexplained
+    assert left.detected
+    assert left.where.frame == "sensor"
+    assert abs(np.array(left.where.direction) @ axis) > 0.99
+    at, source = np.array(left.course).T
+    put = np.interp(at, track.time_s, 1e-3 * amps * by)
+    assert abs(np.corrcoef(source, put)[0, 1]) > 0.9
+
+
+def test_a_line_that_wanders_in_frequency_is_no_alternating_field_but_unknown():
+    track = track_of(experiment("wam", seed=9, samples=4000))
+    since_s = track.time_s - track.time_s[0]
+    turns = 8.0 * since_s + 1.5 * np.sin(2 * np.pi * since_s / 60.0)
+    added = 4e-3 * np.cos(2 * np.pi * turns)[:, None] * [0.6, -0.7, 0.39]
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    assert found.findings == ()
+    assert found.unexplained.detected
+    assert found.unexplained.where.frame == "sensor"

@@ -21,6 +21,7 @@ from ahrsd.diagnosis.added_field import (
 )
 from ahrsd.diagnosis.diagnosis import Component, Ordinary, Unexplained
 from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.alternatives import BY_RATE, QUICK, form_keys
 from ahrsd.diagnosis.one_model.component import Fixed
 from ahrsd.diagnosis.one_model.decision import Answer, added_by, coefficients, size_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, beside
@@ -37,6 +38,8 @@ _WORDS = {
     "gyro_matrix": "a crooked gyro with scales of its own",
     "by_force": "an error of the gyro by force",
     "bending": "a mount that gives",
+    BY_RATE: "a field by the rates, free",
+    QUICK: "a quick course in time, free (sensor)",
 }
 #: of 95 % of a normal size
 _WITHIN = 1.96
@@ -53,7 +56,7 @@ def told_sizes(
     if not all_sets.is_real(best.names):
         return left
     if left.detected:
-        known = dict.fromkeys(_words(all_sets, key) for key in answer.unknown)
+        known = dict.fromkeys(_words(all_sets, best, key) for key in answer.unknown)
         why = f"beyond what such recordings ordinarily leave: {', '.join(known)}"
         sizes = left_sizes(all_sets, best, why, answer.unknown)
         return replace(left, ordinary=sizes)
@@ -83,7 +86,15 @@ def left_sizes(
         up_to = size * _to_limit(all_sets, best, key)
         there = nats[key] > priors.ODDS_REAL
         row = Component(
-            key, _words(all_sets, key), frame, size, up_to, unit, heading_deg, nats[key], there
+            key,
+            _words(all_sets, best, key),
+            frame,
+            size,
+            up_to,
+            unit,
+            heading_deg,
+            nats[key],
+            there,
         )
         parts.append(row)
     fields = [one for one in parts if one.unit == "gauss"]
@@ -105,10 +116,13 @@ def left_sizes(
     )
 
 
-def _words(all_sets: Hypotheses, key: str) -> str:
+def _words(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
     """What a part is, in words."""
-    if all_sets.component(key).row is not None:
-        return f"one of the steps of a source that changes ({key.split(maxsplit=1)[0]})"
+    one, effect = all_sets.component(key), key.split(maxsplit=1)[0]
+    if not best.names.isdisjoint(form_keys(key)):
+        return f"what {effect} stands in for"
+    if one.row is not None:
+        return f"one of the steps of a source that changes ({effect})"
     return _WORDS.get(key, f"a course in time, free ({all_sets.component(key).frame})")
 
 

@@ -18,14 +18,11 @@ def supported(answer: Answer, held: HeldOut, first: int) -> tuple[Finding, ...]:
     first: number of the first one's term among all terms
     """
     all_sets, best = held.all_sets, answer.best
-    real = all_sets.is_real(best.names)
     return tuple(
         replace(
             one,
             heldout=held.told((key,)),
-            priors=on_priors(
-                all_sets, best, answer.rivals[key], asked_odds(all_sets, key, real=real)
-            ),
+            priors=on_priors(all_sets, best, answer.rivals[key], asked_odds(all_sets, best, key)),
             term=number,
         )
         for number, (key, one) in enumerate(
@@ -43,7 +40,7 @@ def what_is_left(answer: Answer, held: HeldOut) -> Unexplained:
     if keys[0] not in answer.rivals:
         return left
     all_sets, best = held.all_sets, answer.best
-    asked = asked_odds(all_sets, keys[0], real=all_sets.is_real(best.names))
+    asked = asked_odds(all_sets, best, keys[0])
     return replace(left, priors=on_priors(all_sets, best, answer.rivals[keys[0]], asked))
 
 
@@ -91,7 +88,7 @@ def nearest(answer: Answer, all_sets: Hypotheses) -> tuple[str, ...]:
     if not more:
         return ()
     key = max(more, key=lambda one: more[one].score)
-    asked = asked_odds(all_sets, key, real=all_sets.is_real(best.names))
+    asked = asked_odds(all_sets, more[key], key)
     found = on_priors(all_sets, more[key], best, asked)
     most = max(nats for one in found.assumed for nats in (one.half_nats, one.double_nats))
     name = all_sets.component(key).effect

@@ -54,7 +54,10 @@ def whole_answer(
     slow = support.supported(answer, held, 0)
     told = (*slow, *support.supported(fast.answer, quickly, len(slow)))
     courses = pictures.courses(all_sets, answer.best)
-    left = _with_channels(support.what_is_left(answer, held), found, courses)
+    left = support.what_is_left(answer, held)
+    if not left.detected:
+        left = support.what_is_left(fast.answer, quickly)
+    left = _with_channels(left, found, courses)
     remainder_nats = support.nats_of_remainder(all_sets, answer)
     left = told_sizes(all_sets, answer, left, remainder_nats, simulated=simulated)
     left = max(left, fast.hum, key=lambda one: (one.detected, one.evidence_nats))

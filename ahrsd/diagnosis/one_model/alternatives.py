@@ -1,0 +1,69 @@
+"""What is asked beside names: sources of other laws than slow ones in time, and a name's own form.
+
+A source that no name has is slow in time, or quick, or follows how the sensor turns.  Names that
+are flexible explain a part of it, and nothing else being there, take its evidence.  And what stands
+in for it has no constant coefficient: with one that is free in time it explains far more, while a
+name that is there explains no more than by chance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd.diagnosis.locate import unit_columns
+from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.component import Component, Law, Sized
+from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw, course
+from ahrsd.diagnosis.one_model.remainder import harmonics
+from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.samples import Array
+
+BY_RATE, QUICK = "free by_rate", "free quick"
+#: half waves of a coefficient that is free in time
+_WAVES = 16
+
+
+def other_courses(context: Context) -> list[Component]:
+    """Fields on the sensor that no name has: by its rate of turn, and quick in time."""
+    rate = context.rate_b_rad_s
+    rate = rate / max(float(np.sqrt(np.mean(np.sum(rate**2, axis=1)))), 1e-12)
+    size = np.linalg.norm(rate, axis=1)
+    functions = np.column_stack([rate, size, size**2])
+    axes = unit_columns(context, "sensor")
+    flat = np.einsum("nk,nia->nika", functions, axes).reshape(len(rate), 3, -1)
+    unit = priors.COURSE_UNIT["sensor"]
+    low, high = (np.array([np.log(unit * one)]) for one in priors.COURSE_SIZES)
+    law = Sized(np.ones(flat.shape[2]), low, high, mean=float(np.log(unit)))
+    odds = float(np.log(priors.COURSE))
+    by_rate = Component(BY_RATE, "sensor", Columns(mag=flat), law, odds)
+    return [by_rate, course(context, "sensor", quick=QUICK)]
+
+
+def varying(known: Component, added: Array, context: Context) -> list[Component]:
+    """What a name adds (N, 3), by a factor that is free in time, and by one free in attitude.
+
+    Both are relative to its coefficient.
+    """
+    time_s = context.track.time_s
+    order = np.arange(1, _WAVES + 1)
+    phase = np.pi * (time_s - time_s[0]) / (time_s[-1] - time_s[0])
+    in_time = CourseLaw(order.astype(float), 1.0, most=priors.VARIES_MOST)
+    unit = context.smooth_b / np.linalg.norm(context.smooth_b, axis=1, keepdims=True)
+    degree_1_and_2 = np.column_stack([np.sqrt(3.0) * unit, harmonics(context.smooth_b)[:, :5]])
+    low, high = (np.array([np.log(one)]) for one in (priors.COURSE_SIZES[0], priors.VARIES_MOST))
+    in_attitude = Sized(np.ones(degree_1_and_2.shape[1]), low, high)
+    factors: list[tuple[Array, Law]] = [
+        (np.cos(phase[:, None] * order), in_time),
+        (degree_1_and_2, in_attitude),
+    ]
+    found = []
+    for key, (factor, law) in zip(form_keys(known.key), factors, strict=True):
+        flat = added[:, :, None] * factor[:, None, :]
+        columns = Columns(gyro=flat) if known.columns.mag is None else Columns(mag=flat)
+        found.append(Component(key, known.frame, columns, law, float(np.log(priors.COURSE))))
+    return found
+
+
+def form_keys(key: str) -> tuple[str, str]:
+    """Keys of the free factors of a name."""
+    return f"{key}, free in time", f"{key}, free in attitude"
