@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd.diagnosis.effects import series, shapes
-from ahrsd.diagnosis.effects.base import Linear, Readings, Setting, smooth_readings_of
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.effects.base import Linear, Readings, Setting
+from ahrsd.diagnosis.values import Columns
 
 _MG = 1e-3
 #: time constants of a drift that settles, as a vehicle that warms up does
@@ -151,10 +151,6 @@ class Hysteresis(Linear):
         """Radii from the noise of a few readings to more than half of the field's usual swing."""
         return tuple({"radius_gauss": radius} for radius in (0.0015, 0.006, 0.02, 0.06, 0.15))
 
-    def columns(self, context: Context, setting: Setting) -> Columns:
-        """Of the smooth field."""
-        return self.terms(smooth_readings_of(context), setting)
-
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """Between -1 and 1 per axis."""
         induced, radius = readings.field_b @ readings.soft_iron.T, setting["radius_gauss"]
@@ -186,10 +182,6 @@ class ViscousMagnetisation(Linear):
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Time constants a factor of three and a half apart."""
         return tuple({"time_constant_s": tau} for tau in (5.0, 18.0, 60.0))
-
-    def columns(self, context: Context, setting: Setting) -> Columns:
-        """Of the smooth field."""
-        return self.terms(smooth_readings_of(context), setting)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The symmetric matrices on what trails."""
