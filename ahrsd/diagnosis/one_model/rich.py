@@ -145,9 +145,9 @@ def _likeliest_delay(problem: Problem, filtered: Filtered, library: Mapping[str,
         return best
 
     means = climbed(at(0.0, instants=False), instants=False)
-    if problem.thin > 1:  # nothing of the difference is left of what was averaged
-        return means
     lag_s = means.base.made.point.problem.lag_s
+    if lag_s <= 0.0 or problem.thin > 1:  # such a gyro is early; and what was averaged is a mean
+        return means
     instants = climbed(at(lag_s, instants=True), instants=True)
     return instants if instants.nats > means.nats + priors.ODDS_REAL else means
 
