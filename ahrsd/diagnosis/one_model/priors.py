@@ -32,14 +32,14 @@ class Size:
 RECORDINGS = 19
 #: deviation over the recording, gauss and rad/s; of the others of the coefficient of unit functions
 ORDINARY: Mapping[str, Size] = {
-    "world_course": Size(8.87e-03, 1.67, 0.1),  # gauss
-    "gyro_course": Size(8.35e-04, 1.81, 0.05),  # rad/s
+    "world_course": Size(7.75e-03, 1.53, 0.1),  # gauss
+    "gyro_course": Size(1.28e-03, 1.73, 0.05),  # rad/s
     "by_direction": Size(2.90e-03, 1.74, 0.2),  # gauss: harmonics of degree 2 and 3
-    "by_change": Size(1.07e-03, 1.59, 0.03),  # s: axes that are late by different times
-    "bending": Size(5.71e-01, 1.54, 3.0),  # of the library's usual flexible mount
-    "by_rate_squared": Size(2.00e-03, 2.32, 0.03),  # rad/s at 1 rad/s
-    "field_by_rate": Size(9.30e-04, 1.88, 0.02),  # gauss at 1 rad/s
-    "by_force": Size(4.14e-03, 1.97, 0.03),  # rad/s at 1 g
+    "by_change": Size(1.23e-03, 1.51, 0.03),  # s: axes that are late by different times
+    "bending": Size(5.58e-01, 1.10, 3.0),  # of the library's usual flexible mount
+    "by_rate_squared": Size(1.42e-03, 2.10, 0.03),  # rad/s at 1 rad/s
+    "field_by_rate": Size(7.40e-04, 1.72, 0.02),  # gauss at 1 rad/s
+    "by_force": Size(2.79e-03, 1.74, 0.03),  # rad/s at 1 g
 }
 #: of a gyro's matrix: how crooked it sits (1.2 degrees), scales and shears of its axes
 ORDINARY_MISALIGNMENT_RAD, ORDINARY_SCALE = 0.02, 0.012
