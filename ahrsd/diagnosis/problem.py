@@ -33,6 +33,7 @@ class Problem:
 
     recorded: the track as it was recorded;  thin, cold: what made the working `track` from it
     lag_s:    lag of the magnetometer that is already taken out of the track
+    instants: the gyro's values are rates at instants: half of a step of that lag is theirs
     riding:   (recorded rows, 3) gauss of named terms that ride with the sensor, without that lag;
               None for none
     averaged: readings of the magnetometer in a working row that has any: less than `thin` where it
@@ -51,6 +52,7 @@ class Problem:
     averaged: float = 1.0
     notes: tuple[str, ...] = ()
     riding: Array | None = None
+    instants: bool = False
 
     @property
     def rate_hz(self) -> float:
@@ -67,7 +69,8 @@ class Problem:
         riding = self.riding
         if riding is not None and of_magnetometer(self.recorded, lag_s):
             riding = earlier(self.recorded, riding, lag_s)
-        track = thinned(without_lag(self.recorded, lag_s), self.thin, self.cold, riding)
+        moved = without_lag(self.recorded, lag_s, instants=self.instants)
+        track = thinned(moved, self.thin, self.cold, riding)
         return replace(self, track=track, lag_s=lag_s)
 
     def beside(self, riding: Array, model: NullModel) -> Problem:

@@ -135,3 +135,19 @@ def test_beside_a_late_gyro_nothing_else_is_moved() -> None:
     np.testing.assert_array_equal(moved.gyro_b_rad_s, delayed_gyro(track, -0.05).gyro_b_rad_s)
     assert moved.covariates is track.covariates
     assert moved.accel_b_m_s2 is track.accel_b_m_s2
+
+
+@pytest.mark.parametrize("lag_s", [0.05, 0.09, 0.02])
+def test_rates_at_instants_are_drawn_from_value_to_value_and_are_half_a_step_early(lag_s):
+    """About one axis, where turns add up: the mean of the straight lines over the earlier step."""
+    t = 0.1 * np.arange(60)
+    values = np.random.default_rng(5).normal(size=60)
+    rate = np.outer(values, [0.0, 0.0, 1.0])
+    track = Track(t, np.full(60, 0.1), np.zeros((60, 3)), rate, None, {}, (slice(0, 60),))
+    fine = np.linspace(0.0, 5.9, 59 * 1000 + 1)
+    drawn = np.interp(fine, t, values)
+    turn = np.concatenate([[0.0], np.cumsum((drawn[1:] + drawn[:-1]) / 2 * np.diff(fine))])
+    earlier_s = t - (lag_s - 0.05)
+    expected = np.diff(np.interp(earlier_s, fine, turn)) / 0.1
+    moved = without_lag(track, lag_s, instants=True).gyro_b_rad_s[1:, 2]
+    np.testing.assert_allclose(moved[2:-2], expected[2:-2], atol=1e-5)

@@ -43,6 +43,7 @@ class GyroScale(Linear):
     manoeuvre = "full turns about each axis"
     size = "0.05 to 1 %"
     source = "Kalibr, OpenVINS (dossier G1)"
+    ordinary = 20.0
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Nothing to choose."""
@@ -105,6 +106,7 @@ class GyroNonlinearity(Linear):
     manoeuvre = "full turns about each axis at two rates"
     size = "below 0.1 % of full scale"
     source = "dossier G9"
+    ordinary = 6.9
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The rate of the axis, or the size of the whole rate."""

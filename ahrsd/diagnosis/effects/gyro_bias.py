@@ -169,6 +169,7 @@ class VibrationRectification(Linear):
     manoeuvre = "run the motor at rest in steps"
     size = "0.001 to 0.1 deg/s"
     source = "diydrones on aliasing (dossier G5)"
+    ordinary = 0.6
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The acceleration's variance over a second, each current and each shaft squared."""

@@ -305,7 +305,7 @@ class OnboardCalibrationActive(Effect):
     manoeuvre = "read registers 44 and 47; switch the compensation off"
     size = "the whole of the hard iron within a minute"
     source = "VN-100 registers 44 and 47 (dossier F1)"
-    ordinary = 1.4
+    ordinary = 3.5
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """From the first sample on, slowly or quickly, or from a later time."""

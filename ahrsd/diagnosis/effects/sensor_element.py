@@ -138,7 +138,6 @@ class MagCrossAxis(Linear):
     manoeuvre = "pitch and roll to 45 degrees on all headings"
     size = "0.1 to 1 % of the field"
     source = "EGUsphere 2023-588 (dossier M12)"
-    ordinary = 4.5
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Which products."""

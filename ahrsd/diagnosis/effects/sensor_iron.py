@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd.diagnosis.effects import series, shapes
-from ahrsd.diagnosis.effects.base import Linear, Readings, Setting, smooth_readings_of
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.effects.base import Linear, Readings, Setting
+from ahrsd.diagnosis.values import Columns
 
 _MG = 1e-3
 #: time constants of a drift that settles, as a vehicle that warms up does
@@ -33,9 +33,9 @@ class HardIronStep(Linear):
     manoeuvre = "all headings before and after"
     size = "1 to 300 mG"
     source = "BROAD trials 32 to 36; retentive error (dossier M1)"
+    ordinary = 1.9
     recurs = True
     jumps = True
-    ordinary = 1.3
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """A coarse grid of times."""
@@ -68,7 +68,7 @@ class HardIronDrift(Linear):
     manoeuvre = "a longer recording with all headings throughout"
     size = "0.1 to 5 mG/h; more after a shock"
     source = "retentive error of ship's compasses (dossier M2)"
-    ordinary = 9.5
+    ordinary = 12.0
     stands_for = ("mag_bias_temperature",)
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
@@ -110,8 +110,8 @@ class SoftIronStep(Linear):
     manoeuvre = "all headings and some pitch before and after"
     size = "0.5 to 5 %"
     source = "dossier M3"
+    ordinary = 7.4
     recurs = True
-    ordinary = 11.0
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """A coarse grid of times."""
@@ -145,15 +145,11 @@ class Hysteresis(Linear):
     manoeuvre = "full turns to the left and to the right, slowly and quickly"
     size = "0.1 to 3 mG"
     source = "play operator (Preisach); Bowditch on retentive error (dossier M16)"
-    ordinary = 0.4
+    ordinary = 1.4
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Radii from the noise of a few readings to more than half of the field's usual swing."""
         return tuple({"radius_gauss": radius} for radius in (0.0015, 0.006, 0.02, 0.06, 0.15))
-
-    def columns(self, context: Context, setting: Setting) -> Columns:
-        """Of the smooth field."""
-        return self.terms(smooth_readings_of(context), setting)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """Between -1 and 1 per axis."""
@@ -181,15 +177,11 @@ class ViscousMagnetisation(Linear):
     manoeuvre = "quick quarter turns with two minutes of rest between them"
     size = "0.1 to 5 mG"
     source = "Gaussin error (dossier M18)"
-    ordinary = 7.8
+    ordinary = 13.0
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Time constants a factor of three and a half apart."""
         return tuple({"time_constant_s": tau} for tau in (5.0, 18.0, 60.0))
-
-    def columns(self, context: Context, setting: Setting) -> Columns:
-        """Of the smooth field."""
-        return self.terms(smooth_readings_of(context), setting)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The symmetric matrices on what trails."""

@@ -213,7 +213,6 @@ class MagGyroMisalignment(Effect):
     manoeuvre = "turns about all three axes"
     size = "0.05 degrees within a device, up to 3 where the sensors are mounted apart"
     source = "Kok and Schon 2016, arXiv 1612.01044 (dossier G3)"
-    ordinary = 4.7
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """Nothing to choose."""

@@ -113,7 +113,7 @@ class FieldAnomaly(Linear):
     manoeuvre = "pass the place again on another heading"
     size = "1 to 500 mG"
     source = "BROAD trials 28 to 31 (dossier W2)"
-    ordinary = 0.97
+    ordinary = 8.8
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """Where the calibrated field's size departs most: bumps then, a dipole near that place."""
@@ -274,9 +274,9 @@ class FieldStep(Linear):
     manoeuvre = "all headings before and after"
     size = "5 to 100 mG"
     source = "inav #8004 (dossier W7)"
+    ordinary = 1.8
     recurs = True
     jumps = True
-    ordinary = 0.46
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """A coarse grid of times."""

@@ -140,7 +140,7 @@ def _hum(fast: Linearised, best: Hypothesis) -> Unexplained:
 def at_recorded_rate(slow: Point) -> Point:
     """A point at the recording's own rate: all that is taken out is drawn between working rows."""
     problem = slow.problem
-    track = without_lag(problem.recorded, problem.lag_s)
+    track = without_lag(problem.recorded, problem.lag_s, instants=problem.instants)
     at_s, time_s = slow.filtered.track.time_s, track.time_s
 
     def drawn(values: Array | None) -> Array | None:
@@ -162,4 +162,4 @@ def _without(fast: Problem, slow: Problem, made: Linearised, best: Hypothesis) -
     mag, _ = added(len(fast.track), known, values)
     recorded = replace(slow.recorded, mag_b_gauss=slow.recorded.mag_b_gauss - mag)
     track = thinned(recorded, slow.thin, slow.cold)
-    return replace(slow, recorded=recorded, track=track, lag_s=0.0)
+    return replace(slow, recorded=recorded, track=track, lag_s=0.0, instants=False)

@@ -31,10 +31,10 @@ def ordinary_remainder(context: Context) -> list[Component]:
     found = [
         course(context, "world", priors.ORDINARY["world_course"]),
         course(context, "gyro", priors.ORDINARY["gyro_course"]),
-        _sized(context, "by_direction", "sensor", harmonics(context.smooth_b)),
+        _sized(context, "by_direction", "sensor", harmonics(context.field_b)),
         by_change(context),
-        _sized(context, "field_by_rate", "sensor", context.rate_b_rad_s),
-        _sized(context, "by_rate_squared", "gyro", squares(context.rate_b_rad_s)),
+        _sized(context, "field_by_rate", "sensor", context.rowwise_rate_b_rad_s),
+        _sized(context, "by_rate_squared", "gyro", squares(context.rowwise_rate_b_rad_s)),
         gyro_matrix(context),
     ]
     if context.force_b_m_s2 is not None and np.isfinite(context.force_b_m_s2).all():
@@ -91,7 +91,7 @@ def bending(context: Context) -> Component:
 
 def gyro_matrix(context: Context) -> Component:
     """Of the rates: three turns, three scales, three shears, of known ordinary sizes."""
-    w = context.rate_b_rad_s
+    w = context.rowwise_rate_b_rad_s
     columns = np.zeros((len(w), 3, 9))
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3

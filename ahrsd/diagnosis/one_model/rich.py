@@ -124,23 +124,32 @@ def _likeliest_delay(problem: Problem, filtered: Filtered, library: Mapping[str,
     """The small model at the likeliest of some delays, sought up and down from none.
 
     Beside a calibration that a long delay has bent, what is linear in it may point the other way.
+    A gyro's values are means of the rate, or where that is likelier rates at instants.
     """
 
-    def at(lag_s: float) -> Judged:
-        if lag_s == 0.0:
+    def at(lag_s: float, *, instants: bool) -> Judged:
+        if lag_s == 0.0 and not instants:
             return judged(first_point(problem, filtered, (LAG,)), library, (), whole=False)
-        start = first_point(problem.lagging(lag_s), filtered, (LAG,))
+        lagging = replace(problem, instants=instants).lagging(lag_s)
+        start = first_point(lagging, filtered, (LAG,))
         start = replace(start, values={LAG: np.array([lag_s])})
         return judged(start, library, (), whole=False)
 
-    best = at(0.0)
-    for way in (priors.ORDINARY_LAG_S, -priors.ORDINARY_LAG_S):
-        while True:
-            found = at(best.base.made.point.problem.lag_s + way)
-            if found.nats < best.nats + priors.ODDS_REAL:  # readings between samples are smoother
-                break
-            best = found
-    return best
+    def climbed(best: Judged, *, instants: bool) -> Judged:
+        for way in (priors.ORDINARY_LAG_S, -priors.ORDINARY_LAG_S):
+            while True:
+                found = at(best.base.made.point.problem.lag_s + way, instants=instants)
+                if found.nats < best.nats + priors.ODDS_REAL:  # between samples is smoother
+                    break
+                best = found
+        return best
+
+    means = climbed(at(0.0, instants=False), instants=False)
+    lag_s = means.base.made.point.problem.lag_s
+    if lag_s <= 0.0 or problem.thin > 1:  # such a gyro is early; and what was averaged is a mean
+        return means
+    instants = climbed(at(lag_s, instants=True), instants=True)
+    return instants if instants.nats > means.nats + priors.ODDS_REAL else means
 
 
 def settled(point: Point, library: Mapping[str, Effect], named: Sequence[Component]) -> Judged:

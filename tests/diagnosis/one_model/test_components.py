@@ -131,5 +131,5 @@ def test_what_the_model_must_know_of_an_effect_is_in_its_row():
     delays = {name: row.delay for name, row in EFFECTS.items() if row.delay}
     late = {"mag_time_lag": 1.0, "mag_low_pass": 1.0, "gyro_integration": 1.0}
     assert delays == {**late, "gyro_time_lag": -1.0}
-    assert EFFECTS["field_anomaly"].ordinary == pytest.approx(0.97)
+    assert EFFECTS["field_anomaly"].ordinary == pytest.approx(8.8)
     assert [name for name, row in EFFECTS.items() if row.ordinary_part] == ["flexible_mount"]

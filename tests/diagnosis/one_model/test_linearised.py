@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tracks import experiment, track_of
 
+from ahrsd.diagnosis.context import build_context
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation import run_filter
 from ahrsd.diagnosis.limits import LIMITS
@@ -25,7 +27,7 @@ from ahrsd.diagnosis.one_model.evidence import evaluated
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, by_key, first_point, moved, unread
 from ahrsd.diagnosis.one_model.linearised import added as added_by
 from ahrsd.diagnosis.one_model.model_search import beside
-from ahrsd.diagnosis.one_model.remainder import still_spells
+from ahrsd.diagnosis.one_model.remainder import ordinary_remainder, still_spells
 from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
 from ahrsd.diagnosis.problem import problem_of
 from ahrsd.diagnosis.track import Spec, Track
@@ -171,3 +173,25 @@ def test_a_span_in_which_something_was_moved_is_unread_and_the_gyro_carries_the_
     assert silent.filtered.used[at_s > middle_s + 7.0].all()
     assert np.isfinite(silent.filtered.whitened).all()
     assert silent.problem.recorded.mag_b_gauss.shape == track.mag_b_gauss.shape
+
+
+@pytest.mark.parametrize("name", ["by_direction", "viscous_magnetisation", "hysteresis"])
+def test_what_is_made_of_the_field_row_by_row_does_not_follow_that_rows_reading(name):
+    """Beside a loud gyro the smooth field is nearly the reading, which then explains itself."""
+    loud = track_of(experiment("wam", seed=31, samples=600, rate_hz=10.0, sigma_gyro=0.03))
+    problem, cold = problem_of(loud, Spec(), EFFECTS, LIMITS)
+    model = fit_null(problem.track, problem.spec, cold, walk=False).model
+    row, off_gauss = 300, 1e-3
+
+    def columns(track: Track) -> np.ndarray:
+        fit = SimpleNamespace(filtered=run_filter(track, model), terms_gyro=None)
+        context = build_context(track, fit)
+        known = {one.key: one for one in ordinary_remainder(context)}
+        made = known[name] if name in known else library_components(context, EFFECTS)[name][-1]
+        assert made.columns.mag is not None
+        return made.columns.mag[row]
+
+    mag = problem.track.mag_b_gauss.copy()
+    mag[row] += off_gauss
+    moved = columns(replace(problem.track, mag_b_gauss=mag)) - columns(problem.track)
+    assert np.max(np.abs(moved)) < 0.01 * off_gauss
