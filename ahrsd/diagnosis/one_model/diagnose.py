@@ -25,6 +25,7 @@ from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
 from ahrsd.diagnosis.one_model.search_rounds import Searched, answered
 from ahrsd.diagnosis.prepared import prepared
 from ahrsd.diagnosis.problem import Problem, problem_of
+from ahrsd.diagnosis.resting import CAUSES, at_rest, resting
 from ahrsd.diagnosis.track import Spec, Track
 
 
@@ -47,33 +48,43 @@ def diagnose(
     simulated: known to be no real recording, of which nothing is ordinary
     Deterministic.  ValueError, one line, where nothing can be fitted.
     """
-    asked, spec = prepared(track), spec or Spec()
-    if (nothing := asked.stopped(recording, library)) is not None:
+    told = _diagnosed(track, spec or Spec(), library, simulated=simulated, clocks=True)
+    return replace(told, recording=recording)
+
+
+def _diagnosed(
+    track: Track, spec: Spec, library: Mapping[str, Effect], *, simulated: bool, clocks: bool
+) -> Diagnosis:
+    """The same.  clocks: whether a column may run by another clock than the sensor."""
+    asked = prepared(track)
+    if (nothing := asked.stopped("", library)) is not None:
         return nothing
     problem, start = begun(asked.put_right(), spec, library)
     if lost := lost_turns(problem.recorded, problem.cold):
         asked = asked.with_facts(lost)
         problem, start = begun(asked.put_right(), spec, library)
     richest = rich.richest(problem, start.filtered, library)
-    if (clock := wrong_clock(richest)) is not None:
-        at_its_time = diagnose(
-            clock.moved(asked.track), spec, library=library, recording=recording,
-            simulated=simulated,
-        )  # fmt: skip
+    if clocks and (clock := wrong_clock(richest)) is not None:
+        at_its_time = _diagnosed(
+            clock.moved(asked.track), spec, library, simulated=simulated, clocks=False
+        )
         if any(one.setting.get("covariate") == clock.column for one in at_its_time.findings):
             said = f"{clock.words}: its cause is judged at the sensor's time"
             return replace(at_its_time, notes=(said, *at_its_time.notes))
-    found, fast = _found(problem, richest, start, library)
-    told = whole_answer(
+    still = resting(start.context(), library, LIMITS) if at_rest(start) else ()
+    # what a gyro that stands tells of its bias is not asked of the field again
+    searched = {k: one for k, one in library.items() if not still or k not in CAUSES}
+    found, fast = _found(problem, richest, start, searched)
+    return whole_answer(
         asked,
         start,
         found,
         fast,
         library,
+        still,
         spec_given=spec.sigma_mag_gauss is not None,
         simulated=simulated,
     )
-    return replace(told, recording=recording)
 
 
 def _found(

@@ -17,7 +17,6 @@ from ahrsd.diagnosis.diagnosis import Check, Diagnosis, Finding, RegimeMap, Susp
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.facts import Fact, around, lost_at, of_fact, rounding
 from ahrsd.diagnosis.hygiene import would_have_shown
-from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.noise import level_facts
 from ahrsd.diagnosis.null import baseline
 from ahrsd.diagnosis.one_model import priors
@@ -29,7 +28,7 @@ from ahrsd.diagnosis.one_model.decision import Answer
 from ahrsd.diagnosis.one_model.recorded_rate import Quick
 from ahrsd.diagnosis.one_model.search_rounds import Searched
 from ahrsd.diagnosis.prepared import Prepared
-from ahrsd.diagnosis.resting import HARDLY_TURNED, at_rest, resting
+from ahrsd.diagnosis.resting import HARDLY_TURNED, at_rest
 
 NOTE = "by the engine one-model, which is experimental"
 
@@ -40,6 +39,7 @@ def whole_answer(
     found: Searched,
     fast: Quick,
     library: Mapping[str, Effect],
+    still: tuple[Finding, ...],
     *,
     spec_given: bool,
     simulated: bool,
@@ -47,6 +47,7 @@ def whole_answer(
     """Everything that was found.
 
     start: the calibration alone;  spec_given: whether somebody said how loud the sensor is
+    still: what a gyro that stands tells of its bias
     simulated: known to be no real recording
     """
     answer, all_sets = found.answer, found.all_sets
@@ -62,7 +63,6 @@ def whole_answer(
     left = told_sizes(all_sets, answer, left, remainder_nats, simulated=simulated)
     left = max(left, fast.hum, key=lambda one: (one.detected, one.evidence_nats))
     loud = _loud(found, fast, asked.facts, told, spec_given=spec_given)
-    still = resting(start.context(), library, LIMITS) if at_rest(start) else ()
     named = (*asked.told(library), *told, *(of_fact(fact, library) for fact in loud), *still)
     something = bool(named) or left.detected
     residuals = residual_checks.residuals_of(held.rows(answer.best.names))
