@@ -39,9 +39,11 @@ from ahrsd.estimator.epoch import (
 from ahrsd.estimator.epoch_data import EpochBuilder, check_samples, with_border
 from ahrsd.estimator.graph import BLIND, Node, SingularError, curvature, whitening
 from ahrsd.estimator.model_checks import (
+    LeftOver,
     Misalignment,
     change_message,
     divided,
+    left_over,
     misalignment,
 )
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters, instruments
@@ -166,13 +168,14 @@ class HeadingAdvice:
         parts: Mapping[str, Array],
         covariance: Array,
         turned_deg: float = 0.0,
-        slow: Callable[[], noise.SlowResidual | None] = lambda: None,
+        left: Callable[[], str] = str,
     ) -> str:
         """What makes more than half of the heading's variance, in words; empty: it is known well.
 
         covariance (12, 12): the answer's; parts: covariances (12, 12) by "motion" and the names of
         `_WIDENED`, which add up to it but for what they have in common; turned_deg: what axes that
-        were found to be turned make of the heading; slow: what the model leaves over that lasts
+        were found to be turned make of the heading; left: what is known of misfit, in words, or
+        empty
         """
         if not np.hypot(self._sigma_deg(covariance), turned_deg) > _TELLS_DEG:
             return ""
@@ -183,9 +186,7 @@ class HeadingAdvice:
             return ""
         if most == "motion":
             return _MOTION.format(self.manoeuvre(covariance))
-        if most == "misfit" and (left := slow()) is not None and left.words:
-            return left.words
-        return _WIDENED[most]
+        return (left() if most == "misfit" else "") or _WIDENED[most]
 
     def by_place_deg(self, parts: Mapping[str, Array]) -> float:
         """What a field that differs by place makes of the heading, 1 sigma; nan: unknown.
@@ -664,6 +665,27 @@ class Estimator:
         weighed = self._weighed(window)
         return Widening.nothing() if weighed is None else considered(weighed)
 
+    def _left_over(self, window: Window) -> LeftOver | None:
+        """What the epochs of the window leave that is locked to attitude, rate or time."""
+        kinds = self.parameters.kinds
+        if not kinds[0]:
+            return None
+        most = np.max(instruments(*kinds), axis=0)[:16]
+        try:
+            return left_over(
+                window.epochs,
+                window.graph,
+                (self.parameters.prior_gyro_bias_rad_s, most),
+                window.taken,
+                window.usual.mag_gauss,
+            )
+        except np.linalg.LinAlgError:
+            return None
+
+    def _warnings(self, left: LeftOver | None) -> tuple[str, ...]:
+        changed = () if self.restarted_s is None else (change_message(self.restarted_s),)
+        return (*changed, left.words) if left is not None and left.words else changed
+
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
         window = self._window
@@ -697,10 +719,11 @@ class Estimator:
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
         widening = self._by_imperfections(window)
         tempered = window.covariance()
-        divided = tempered * self._parted
-        parts = widening.parts | motion_and_misfit(
-            window.explained_covariance(), divided, self._whitening
-        )
+        divided, plain = tempered * self._parted, window.explained_covariance()
+        left = self._left_over(window)
+        if left is not None:
+            divided = left.widened(divided, plain)
+        parts = widening.parts | motion_and_misfit(plain, divided, self._whitening)
         covariance = divided * (1.0 + doubt**2)
         covariance = covariance + self._by_lag(window) + widening.added
         covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
@@ -712,6 +735,13 @@ class Estimator:
         heading = float(np.hypot(heading_sigma_deg(graph.c, covariance, down, dip), turned))
         advice = HeadingAdvice(graph.c, down, dip, window.usual.mag_gauss)
         averaged = self._builder.averaged
+
+        def told() -> str:
+            if left is not None and left.words:
+                return left.cause
+            slow = window.slow_residual()
+            return "" if slow is None else slow.words
+
         return Estimate(
             soft_iron=A,
             hard_iron_gauss=b,
@@ -733,11 +763,11 @@ class Estimator:
                 and self._misscaled == 0.0
                 and self._doubted_s is None
             ),
-            warnings=() if self.restarted_s is None else (change_message(self.restarted_s),),
+            warnings=self._warnings(left),
             mag_lag_s=window.taken.lag_s,
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,
-            widened_by=advice.widened_by(parts, covariance, turned, window.slow_residual),
+            widened_by=advice.widened_by(parts, covariance, turned, told),
             place_gauss=widening.place_gauss,
             place_deg=advice.by_place_deg(parts),
             gyro_correction=window.taken.gyro,

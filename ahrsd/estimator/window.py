@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.estimator import chain, noise, start
+from ahrsd.estimator import chain, noise
 from ahrsd.estimator.epoch import (
     FoldedInformation,
     Lag,
@@ -767,7 +767,7 @@ def search(
     )
     whole = [data[k] for k in chosen]
     fields = np.vstack([d.field_b_gauss for d in whole])
-    starts = [start.linear_start(whole), start.sphere_start(fields)]
+    starts = [chain.linear_start(whole), chain.sphere_start(fields)]
     first_look = bool(np.array_equal(graph.c, present))
     if not first_look:
         starts.insert(0, present)
@@ -824,7 +824,7 @@ def _further(
             out[k] = _gone_on(thin, one)
         elif not there and not one.mirrored:
             anew = _descend(
-                thin, start.mirrored(one.c, fields), bias, best, independent=one.independent
+                thin, chain.mirrored(one.c, fields), bias, best, independent=one.independent
             )
             out[k] = replace(one, independent=False, mirrored=True)  # an end that stays one
             out.append(replace(anew, mirrored=True))
