@@ -69,12 +69,13 @@ class LockedInformation:
     in units of its ordinary sizes (`LOCKED` says where): `told`.
 
     roots: by what each of `LOCKED` is whitened, (n, n); freedom: and how many directions of it the
-    epoch tells
+    epoch tells; noise: that it was linearised with
     """
 
     told: InstrumentInformation
     roots: dict[str, Array]
     freedom: dict[str, int]
+    noise: chain.Noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -940,6 +941,8 @@ def _of_angle(by_angle: Array, angle: Array) -> Array:
 # (`model_checks`). What follows time is a hard iron of each epoch's own, and needs no columns.
 
 _FROM = _SIZE
+_NEARBY = 3e-3  # of the field: a calibration that moved by less leaves 5e-6 of it to second order
+_ALIKE = 0.1  # of a noise level, by which another makes another epoch
 LOCKED = {
     "attitude": np.arange(_FROM, _FROM + 36),
     "rate": np.arange(_FROM + 36, _FROM + 36 + 9 + 8 + 18),
@@ -960,7 +963,23 @@ def linearise_locked(epochs: Sequence[WindowEpoch]) -> None:
             told = InstrumentInformation(H[k], g[k], place, epoch.factor.point.a.bias)
             own = {key: root[k] for key, (root, _) in roots.items()}
             freedom = {key: int(count[k]) for key, (_, count) in roots.items()}
-            epoch.locked = LockedInformation(told, own, freedom)
+            epoch.locked = LockedInformation(told, own, freedom, epoch.used)
+
+
+def still_locked(old: WindowEpoch, new: WindowEpoch) -> LockedInformation | None:
+    """What is locked in an epoch that was linearised again, where that is as good as before."""
+    known = old.locked
+    if known is None or old.data is not new.data:
+        return None
+    c, moved = new.factor.point.c, new.factor.point.c - known.told.c
+    far = float(np.linalg.norm(moved)) > _NEARBY * float(
+        np.cbrt(np.linalg.det(chain.symmetric(c[:6])))
+    )
+    other = max(
+        abs(new.used.mag_gauss / known.noise.mag_gauss - 1.0),
+        abs(new.used.gyro_rad_s / known.noise.gyro_rad_s - 1.0),
+    )
+    return None if far or other > _ALIKE else known
 
 
 def _locked_columns(

@@ -23,7 +23,6 @@ from ahrsd.estimator.epoch import (
     believed,
     disagreement,
     instrument,
-    linearise_locked,
 )
 from ahrsd.estimator.graph import Graph, retract
 from ahrsd.samples import Array
@@ -170,22 +169,23 @@ def misalignment(
 # component, in the directions of it that the motion shows.
 #
 # Chance: at the answer its whitened scores z have the variance `chance` each, were nothing there.
-# It is what the epochs disagree about among themselves once the component is in: a field that is
-# another at each visit, and noise that is slow, make them disagree, and what is locked to the
-# attitude does not. So it is asked only where the epochs tell each direction about twice.
+# It is what the epochs disagree about among themselves once the component is in, in all of its
+# directions or in that one, whichever is more: a field that is another at each visit, and noise
+# that is slow, make them disagree, and what is locked to the attitude does not. It is known by as
+# many degrees of freedom as are left, so that the test is Student's; where there are fewer than
+# directions that are asked, nothing is said.
 #
 # Size: each coefficient has the deviation t times what is ordinary, t lognormal as real recordings
-# have it, or nothing is there (`_THERE`). A direction in which the epochs
-# tell l times what is ordinary then has scores of the variance chance + t^2 l. So a component that
-# is likelier than nothing has a posterior, and what it does to the answer is an error of it, as for
-# an instrument's imperfections; how much the data leave open of it too.
+# have it, or nothing is there (`_THERE`). A direction in which the epochs tell l, in units of what
+# is ordinary, then has scores of the variance chance + t^2 l. So a component that is likelier than
+# nothing has a posterior: what it is found to be, and what the data leave open of it, is an error
+# of the answer, as it is for an instrument's imperfections. What that does to an answer that is
+# wider already for what epochs disagree about counts only as far as it is more.
 
 _MODES = 3  # half waves over the window: slower than epochs are long
 _SIZES = np.exp(np.arange(-4.0, 3.0))  # times what is ordinary
 _SPREAD = 2.0  # of their logarithm: `diagnosis/one_model/priors.py`, 1.5 to 2.2
 _SHOWN = 1e-6  # information of a direction over that of the best one: less is none
-_TWICE = 2.0  # directions that epochs tell, over those of all, so that they can disagree
-_CHANCE_SIGMAS = 2.0  # by which what they disagree about may be too small by chance
 _THERE = 1.0 / 20.0  # probability before the data; `diagnosis/one_model/priors.py: COURSE`
 _NAMED = 12.0  # nats; `diagnosis/one_model/priors.py: ODDS_REAL`: the laws are not exact
 _FOLLOWS = {"attitude": "the attitude", "rate": "the rate of turn", "time": "the time"}
@@ -239,16 +239,16 @@ def left_over(
     taken: TakenOut,
     noise_gauss: float,
 ) -> LeftOver | None:
-    """By the epochs of a window; None where nothing is likelier than nothing, or too few are there.
+    """By those epochs of a window that `linearise_locked` saw; None where nothing is likelier than
+    nothing, or too few are there.
 
     believed_of: sigma of the gyro's bias (rad/s), and of the instrument's imperfections and the
     place (16,), the largest that may be; noise_gauss: of one reading. LinAlgError: the motion
     tells too little.
     """
-    moving = [epoch for epoch in epochs if epoch.turned]
+    moving = [epoch for epoch in epochs if epoch.locked is not None]
     if len(moving) < 2:
         return None
-    linearise_locked(moving)
     told = [(epoch, epoch.locked) for epoch in moving if epoch.locked is not None]
     known = [one for _, one in told]
     H = np.array([one.told.H for one in known])
@@ -278,13 +278,14 @@ class _Asked:
     """What epochs ask of a component, in the k directions of it that they tell.
 
     scores (k,): whitened by all that else may be; told (k,): information in units of what is
-    ordinary; chance: variance of the scores were nothing there; by_one (12, k): what one of each
-    does to [M, b, w_b]
+    ordinary; chance (k,): variance of the scores were nothing there, known by so many degrees of
+    freedom; by_one (12, k): what one of each does to [M, b, w_b]
     """
 
     scores: Array
     told: Array
-    chance: float
+    chance: Array
+    freedom: float
     by_one: Array
 
     @staticmethod
@@ -296,13 +297,15 @@ class _Asked:
         before: tuple[Array, Array],
     ) -> _Asked | None:
         """course (N, m): by how much each coefficient of the component counts in each epoch, m
-        times; before: what is believed of all else. None where the epochs cannot disagree."""
+        times; before: what is believed of all else. None where the epochs can hardly
+        disagree."""
         (H, g), at, others = epochs, LOCKED[key], slice(0, len(before[1]))
         own_H, own_g = H[:, at[:, None], at], g[:, at]
-        beside = np.einsum("nm,noa->oma", course, H[:, others, at]).reshape(len(before[1]), -1)
-        own = np.einsum("nm,nl,nab->malb", course, course, own_H)
-        own = own.reshape(beside.shape[1], beside.shape[1])
-        gradient = np.einsum("nm,na->ma", course, own_g).ravel()
+        to_others, modes = H[:, at, others], course.shape[1]
+        beside = np.tensordot(course, to_others, (0, 0)).reshape(modes * len(at), -1).T
+        pairs = course[:, :, None] * course[:, None]
+        own = np.tensordot(pairs, own_H, (0, 0)).transpose(0, 2, 1, 3).reshape(beside.shape[1], -1)
+        gradient = (course.T @ own_g).ravel()
         rest_H, rest_g = H[:, others, others].sum(axis=0) + before[0], g[:, others].sum(axis=0)
         rest_g = rest_g + before[1]
         scale = 1.0 / np.sqrt(np.diag(rest_H))
@@ -314,16 +317,21 @@ class _Asked:
         score = vectors.T @ (gradient - gain.T @ rest_g)
         step = -vectors @ (score / values)
         rest = -scale * solved(scale * (rest_g + beside @ step))
-        each = course @ step.reshape(course.shape[1], -1)
-        left = own_g + H[:, at, others] @ rest + np.einsum("nab,nb->na", own_H, each)
-        whitened = np.einsum("nab,nb->na", np.array([one.roots[key] for one in known]), left)
-        count = float(sum(one.freedom[key] for one in known))
-        if count < _TWICE * len(values):
+        each = course @ step.reshape(modes, -1)
+        left = own_g + to_others @ rest + chain.times(own_H, each)
+        roots = np.array([one.roots[key] for one in known])
+        by_others = (roots @ to_others).reshape(-1, len(scale)) * scale
+        fitted = float(np.sum(by_others.T * solved(by_others.T)))
+        freedom = float(sum(one.freedom[key] for one in known)) - len(values) - fitted
+        if freedom < len(values):
             return None
-        freedom = count - len(values)
-        chance = float(np.sum(whitened**2)) / freedom
-        chance *= 1.0 + _CHANCE_SIGMAS * np.sqrt(2.0 / freedom)
-        return _Asked(score / np.sqrt(values), values, chance, -(gain[:12] @ vectors))
+        alike = float(np.sum(chain.times(roots, left) ** 2)) / freedom
+        ways = np.tensordot(course, vectors.reshape(modes, len(at), -1), (1, 0))
+        each_way = chain.times(np.swapaxes(ways, 1, 2), left) ** 2
+        told = np.sum(ways * (own_H @ ways), axis=(0, 1))
+        own_way = each_way.sum(axis=0) / told * len(known) / max(len(known) - 1, 1)
+        chance = np.maximum(alike, own_way)
+        return _Asked(score / np.sqrt(values), values, chance, freedom, -(gain[:12] @ vectors))
 
     def weighed(self, key: str, of_one: float) -> LeftOver:
         """of_one (gauss): rms of a component that asks for one."""
@@ -331,8 +339,11 @@ class _Asked:
         likely = np.exp(-0.5 * (np.log(_SIZES) / _SPREAD) ** 2)
         likely /= likely.sum()
         more = variance * self.told / self.chance
-        gain = self.scores**2 / self.chance * more / (1.0 + more)
-        nats = 0.5 * np.sum(gain - np.log1p(more), axis=1)
+        squares = self.scores**2 / self.chance
+        known = self.freedom + len(squares)
+        nothing = np.log1p(squares.sum() / self.freedom)
+        there = np.log1p(np.sum(squares / (1.0 + more), axis=1) / self.freedom)
+        nats = 0.5 * (known * (nothing - there) - np.sum(np.log1p(more), axis=1))
         most = float(nats.max())
         weights = likely * np.exp(nats - most)
         odds = most + float(np.log(weights.sum()))
@@ -341,5 +352,5 @@ class _Asked:
         mean = -np.sqrt(self.told) * self.scores * variance / (self.chance * (1.0 + more))
         spread = np.diag(weights @ (variance / (1.0 + more))) + (weights * mean.T) @ mean
         added = self.by_one @ spread @ self.by_one.T
-        left = max(float(np.sum(self.scores**2)) - self.chance * len(self.scores), 0.0)
+        left = max(float(np.sum(self.scores**2 - self.chance)), 0.0)
         return LeftOver(key, odds, of_one * float(np.sqrt(left)), (added + added.T) / 2)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 
@@ -32,6 +33,7 @@ from ahrsd.estimator.epoch import (
     gyro_asked,
     informations,
     instrument,
+    linearise_locked,
     of_rests,
     walk_asked,
     whole_informations,
@@ -365,6 +367,7 @@ class Estimator:
         self._moving_epochs = 0
         self._next_search = _FIRST_SEARCH
         self._strange = 0
+        self._is_copy = False  # made for one answer
         self._doubted_s: float | None = None  # since when the newest motion contradicts the answer
         self._parted = 1.0  # variance over the expected of what earlier and later data ask for
         self._misscaled = 0.0  # share of themselves by which the gyro's angles are too small
@@ -651,6 +654,7 @@ class Estimator:
         An epoch that is under way counts as far as it is, if it is long enough to be one.
         """
         if self._new or (self._window and self._builder.pending >= MIN_EPOCH_STEPS):
+            self._watch()
             return self._copy().finish()
         return self._answer()
 
@@ -666,11 +670,15 @@ class Estimator:
         return Widening.nothing() if weighed is None else considered(weighed)
 
     def _left_over(self, window: Window) -> LeftOver | None:
-        """What the epochs of the window leave that is locked to attitude, rate or time."""
-        kinds = self.parameters.kinds
-        if not kinds[0]:
+        """What the epochs of the window leave that is locked to attitude, rate or time.
+
+        What an answer leaves that is not the best yet is its own.
+        """
+        if not self._is_watched(window):
             return None
-        most = np.max(instruments(*kinds), axis=0)[:16]
+        if not self._is_copy:
+            self._watch()
+        most = np.max(instruments(*self.parameters.kinds), axis=0)[:16]
         try:
             return left_over(
                 window.epochs,
@@ -681,6 +689,17 @@ class Estimator:
             )
         except np.linalg.LinAlgError:
             return None
+
+    def _watch(self) -> None:
+        """Ask the epochs what is locked, each once: what is made for one answer keeps it."""
+        if self._window is None or not self._is_watched(self._window):
+            return
+        with suppress(np.linalg.LinAlgError):
+            linearise_locked(self._window.epochs)
+
+    def _is_watched(self, window: Window) -> bool:
+        settled = self._agreed and window.step_sigmas < _SETTLED
+        return bool(self.parameters.imperfections) and settled
 
     def _warnings(self, left: LeftOver | None) -> tuple[str, ...]:
         changed = () if self.restarted_s is None else (change_message(self.restarted_s),)
@@ -700,6 +719,7 @@ class Estimator:
 
     def _copy(self) -> Estimator:
         other = copy(self)
+        other._is_copy = True
         other._builder, other._down = self._builder.copy(), self._down.copy()
         other._new = list(self._new)
         other._window = None if self._window is None else self._window.copy()

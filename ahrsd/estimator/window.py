@@ -36,6 +36,7 @@ from ahrsd.estimator.epoch import (
     linearise_instrument,
     place_borders,
     scores_of,
+    still_locked,
 )
 from ahrsd.estimator.epoch_data import (
     corrected,
@@ -260,6 +261,7 @@ class Window:
         where = {id(factor): i for i, factor in enumerate(factors)}
         for k, new in zip(which, self._linearised(places, **weighing), strict=True):
             factors[where[id(self.epochs[k].factor)]] = new.factor
+            new.locked = still_locked(self.epochs[k], new)
             self.epochs[k] = new
 
     def _moved_directions(self, which: Sequence[int]) -> list[Array]:
