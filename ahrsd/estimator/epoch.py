@@ -941,7 +941,7 @@ def _of_angle(by_angle: Array, angle: Array) -> Array:
 # (`model_checks`). What follows time is a hard iron of each epoch's own, and needs no columns.
 
 _FROM = _SIZE
-_NEARBY = 3e-3  # of the field: a calibration that moved by less leaves 5e-6 of it to second order
+_NEARBY = 1e-2  # of the field: a calibration that moved by less leaves 1e-4 of it to second order
 _ALIKE = 0.1  # of a noise level, by which another makes another epoch
 LOCKED = {
     "attitude": np.arange(_FROM, _FROM + 36),

@@ -54,13 +54,13 @@ def of_change(change_b: Array) -> Array:
     """(N, 3, 8) a matrix on the field's change (N, 3), without what is alike on all axes: that is
     a delay."""
     matrix = np.concatenate([TRACELESS, so3.skew(np.eye(3))])
-    return np.einsum("aij,nj->nia", matrix, change_b)
+    return np.asarray(np.einsum("aij,nj->nia", matrix, change_b))
 
 
 def on_each_axis(functions: Array) -> Array:
     """(N, 3, 3 k) each of functions (N, k) along each axis of the sensor."""
     flat = np.einsum("nk,ia->nika", functions, np.eye(3))
-    return flat.reshape(len(functions), 3, -1)
+    return np.asarray(flat.reshape(len(functions), 3, -1))
 
 
 def courses(time_s: Array, modes: int) -> Array:

@@ -146,9 +146,9 @@ def test_columns_by_hand():
     by_change = locked.of_change(change)[0]
     np.testing.assert_allclose(by_change[:, 0], [0.1, 0.0, -0.3])  # xx - zz
     np.testing.assert_allclose(by_change[:, 2], [-0.2, 0.1, 0.0])  # xy
-    np.testing.assert_allclose(
-        by_change[:, 5:] @ [1.0, 2.0, 3.0], np.cross([1.0, 2.0, 3.0], change[0])
-    )
+    turn = np.array([1.0, 2.0, 3.0])
+    turned = np.cross(turn, change[0])
+    np.testing.assert_allclose(by_change[:, 5:] @ turn, turned, atol=1e-12)
     each = locked.on_each_axis(np.array([[2.0, 5.0]]))[0]
     np.testing.assert_allclose(each, [[2, 0, 0, 5, 0, 0], [0, 2, 0, 0, 5, 0], [0, 0, 2, 0, 0, 5]])
     cosines = locked.courses(np.linspace(3.0, 9.0, 2001), 3)
