@@ -83,7 +83,7 @@ def explain_json(status: Mapping[str, Any]) -> dict[str, object]:
         "warm_start": str(status.get("warm_start", "")),
         "files": list(status["complaints"]),
         "mismatch": _mismatch(status),
-        "warnings": list((status["estimate"] or {}).get("warnings", ())),
+        "warnings": list((status.get("estimate") or {}).get("warnings", ())),
         "gates": shut,
         "others": others,
         "next": _next(status, state, shut, others),
