@@ -222,14 +222,17 @@ class LeftOver:
             "recording says what it is"
         )
 
-    def widened(self, covariance: Array, plain: Array) -> Array:
-        """covariance (12, 12), which is wider than `plain` for what epochs disagree about, and no
-        less wide than for this."""
-        scale = np.sqrt(np.diag(covariance))
-        size = np.outer(scale, scale)
-        more = (self.added - (covariance - plain)) / size
-        values, vectors = np.linalg.eigh((more + more.T) / 2)
-        return np.asarray(covariance + size * ((vectors * np.clip(values, 0.0, None)) @ vectors.T))
+
+def widened(covariance: Array, plain: Array, left: LeftOver | None) -> Array:
+    """covariance (12, 12), which is wider than `plain` for what epochs disagree about, and no less
+    wide than for what is left over."""
+    if left is None:
+        return covariance
+    scale = np.sqrt(np.diag(covariance))
+    size = np.outer(scale, scale)
+    more = (left.added - (covariance - plain)) / size
+    values, vectors = np.linalg.eigh((more + more.T) / 2)
+    return np.asarray(covariance + size * ((vectors * np.clip(values, 0.0, None)) @ vectors.T))
 
 
 def left_over(

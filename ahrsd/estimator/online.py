@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -47,6 +48,7 @@ from ahrsd.estimator.model_checks import (
     divided,
     left_over,
     misalignment,
+    widened,
 )
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters, instruments
 from ahrsd.estimator.window import Window, search
@@ -307,6 +309,14 @@ def blind_names(vectors: Array) -> tuple[str, ...]:
         names.append(" + ".join(_NAMES[i] for i in [lead, *others[:2]]))
         P = P - np.outer(v, v)
     return tuple(names)
+
+
+def misfit_words(left: LeftOver | None, window: Window) -> str:
+    """What is known of misfit; empty: nothing."""
+    if left is not None and left.words:
+        return left.cause
+    slow = window.slow_residual()
+    return "" if slow is None else slow.words
 
 
 # -- The estimator ---------------------------------------------------------------------------------
@@ -738,11 +748,8 @@ class Estimator:
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
         widening = self._by_imperfections(window)
-        tempered = window.covariance()
-        divided, plain = tempered * self._parted, window.explained_covariance()
-        left = self._left_over(window)
-        if left is not None:
-            divided = left.widened(divided, plain)
+        plain, left = window.explained_covariance(), self._left_over(window)
+        divided = widened(window.covariance() * self._parted, plain, left)
         parts = widening.parts | motion_and_misfit(plain, divided, self._whitening)
         covariance = divided * (1.0 + doubt**2)
         covariance = covariance + self._by_lag(window) + widening.added
@@ -753,15 +760,9 @@ class Estimator:
         down, dip = attitude(self._down, [(e.u, e.data.down_b) for e in window.epochs])
         turned = turned_heading_deg(window.taken.numbers[:3], down, dip)
         heading = float(np.hypot(heading_sigma_deg(graph.c, covariance, down, dip), turned))
+        words = partial(misfit_words, left, window)
         advice = HeadingAdvice(graph.c, down, dip, window.usual.mag_gauss)
         averaged = self._builder.averaged
-
-        def told() -> str:
-            if left is not None and left.words:
-                return left.cause
-            slow = window.slow_residual()
-            return "" if slow is None else slow.words
-
         return Estimate(
             soft_iron=A,
             hard_iron_gauss=b,
@@ -787,7 +788,7 @@ class Estimator:
             mag_lag_s=window.taken.lag_s,
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,
-            widened_by=advice.widened_by(parts, covariance, turned, told),
+            widened_by=advice.widened_by(parts, covariance, turned, words),
             place_gauss=widening.place_gauss,
             place_deg=advice.by_place_deg(parts),
             gyro_correction=window.taken.gyro,
