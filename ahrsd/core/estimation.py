@@ -69,6 +69,7 @@ class Calibrator:
         self._void = ""
         self._at_s = float("nan")
         self._heeded_s: float | None = None  # the estimator's restart that was told
+        self._told: set[str] = set()  # what is wrong with the estimate, without its size
 
     @property
     def proposed(self) -> Affine | None:
@@ -136,12 +137,18 @@ class Calibrator:
         return self.step is None or not 0.0 <= self._at_s - self.step.told_s <= _PATIENCE_S
 
     def _heed(self, estimate: Estimate | None) -> None:
-        """Whether the estimator began anew by itself since the last call."""
+        """Whether the estimator began anew by itself since the last call, and what else it warns of
+        for the first time."""
         at_s = self.estimator.restarted_s
         if estimate is not None and at_s is not None and at_s != self._heeded_s:
             self._heeded_s = at_s
             self._void = change_message(at_s)
             self._begin_anew([self._void])
+            self._told.add(_kind(self._void))
+        for text in () if estimate is None else estimate.warnings:
+            if _kind(text) not in self._told:
+                self._told.add(_kind(text))
+                self._notes.append((self._at_s, text))
 
     def _begin_anew(self, notes: list[str]) -> None:
         """The estimate forgot what was before a change: evidence from then proves nothing now."""
@@ -149,6 +156,7 @@ class Calibrator:
         self.collector = EvidenceCollector()
         self.steps.restart()
         self.step_open = False
+        self._told = set()
 
     def _training(self, parts: Iterable[tuple[Role, SampleBlock]]) -> Iterator[SampleBlock]:
         """What the estimator may see; nothing is bridged over what is held out."""
@@ -200,6 +208,11 @@ class Calibrator:
             field_known=True,
             covariance=estimate.covariance * np.outer(scale, scale),
         )
+
+
+def _kind(warning: str) -> str:
+    """A warning without its numbers, which are others with each estimate."""
+    return warning.partition(":")[0]
 
 
 def _unknown_first_step(block: SampleBlock) -> SampleBlock:

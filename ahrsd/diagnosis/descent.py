@@ -14,7 +14,6 @@ import numpy as np
 
 from ahrsd.diagnosis.context import Given, build_context
 from ahrsd.diagnosis.innovation import (
-    TRACELESS,
     Filtered,
     bearings,
     nuisance_columns,
@@ -24,6 +23,7 @@ from ahrsd.diagnosis.innovation import (
 from ahrsd.diagnosis.prior import Prior
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Columns, Context, NullModel
+from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
 _DONE = 0.05  # largest step in standard deviations

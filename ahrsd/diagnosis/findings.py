@@ -14,7 +14,6 @@ from ahrsd.diagnosis.diagnosis import Cost, Finding, Heldout, Share, Value, Wher
 from ahrsd.diagnosis.evidence import SHARPER, posterior
 from ahrsd.diagnosis.gram import solve
 from ahrsd.diagnosis.heldout import gain_of
-from ahrsd.diagnosis.innovation import TRACELESS
 from ahrsd.diagnosis.itself import beside_itself
 from ahrsd.diagnosis.name import LONELY_BLOCKS, Judged
 from ahrsd.diagnosis.regression import CALIBRATION, Base, Candidate, candidate_gram
@@ -32,6 +31,7 @@ from ahrsd.diagnosis.settings import scale_of, scaled
 from ahrsd.diagnosis.unknown import innovation_rms
 from ahrsd.diagnosis.validate import Gain, alternating, heading_error_deg, heldout
 from ahrsd.diagnosis.values import NullModel, Term
+from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
 #: shares below this are not worth a line

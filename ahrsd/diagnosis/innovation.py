@@ -41,14 +41,9 @@ from ahrsd.diagnosis.gains import Gains, Linear, gains
 from ahrsd.diagnosis.recursive import both_ways
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Columns, NullModel
+from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
-#: directions of the soft iron that keep its trace: xx - zz, yy - zz, xy, xz, yz
-TRACELESS = np.zeros((5, 3, 3))
-TRACELESS[0, [0, 2], [0, 2]] = TRACELESS[1, [1, 2], [1, 2]] = 1.0, -1.0
-for _at, (_i, _j) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
-    TRACELESS[_at, _i, _j] = TRACELESS[_at, _j, _i] = 1.0
-TRACELESS.flags.writeable = False
 #: of the field's direction where it is not taken from the first reading
 _UNSURE_RAD = 0.1
 #: of the field's size, in all directions, where a run's first row has no reading

@@ -39,7 +39,7 @@ from ahrsd.diagnosis.thin import turned_up
 from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.estimator import chain
-from ahrsd.estimator.start import linear_start
+from ahrsd.estimator.chain import linear_start
 from ahrsd.samples import Array
 
 _INFLATIONS = (30.0, 10.0, 3.0, 1.0)

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.diagnosis.coarse import noise_of
-from ahrsd.diagnosis.innovation import TRACELESS, Filtered, nuisance_columns, sensitivities
+from ahrsd.diagnosis.innovation import Filtered, nuisance_columns, sensitivities
 from ahrsd.diagnosis.track import Track
+from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
 #: prior deviations of the 11: soft iron about I, hard iron (gauss) about 0, gyro bias (rad/s)

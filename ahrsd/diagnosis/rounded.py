@@ -16,8 +16,9 @@ import numpy as np
 from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.effects.base import Readings
 from ahrsd.diagnosis.evidence import colour
-from ahrsd.diagnosis.innovation import TRACELESS, nuisance_columns, sensitivities
+from ahrsd.diagnosis.innovation import nuisance_columns, sensitivities
 from ahrsd.diagnosis.values import Noise
+from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
 #: sizes that are tried, in parts of the first guess; simulations that tell the scatter

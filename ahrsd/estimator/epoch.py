@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from ahrsd.estimator import chain, noise
+from ahrsd.estimator import chain, locked, noise
 from ahrsd.estimator.chain import halfway
 from ahrsd.estimator.epoch_data import rates, spread
 from ahrsd.estimator.graph import (
@@ -64,6 +64,21 @@ class InstrumentInformation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LockedInformation:
+    """An epoch's quadratic in what is in `InstrumentInformation` and in what is `locked` besides,
+    in units of its ordinary sizes (`LOCKED` says where): `told`.
+
+    roots: by what each of `LOCKED` is whitened, (n, n); freedom: and how many directions of it the
+    epoch tells; noise: that it was linearised with
+    """
+
+    told: InstrumentInformation
+    roots: dict[str, Array]
+    freedom: dict[str, int]
+    noise: chain.Noise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LinearisationPlan:
     """Where one is to be linearised: directions, noise, weights of the fields (None for 1)."""
 
@@ -77,8 +92,8 @@ class LinearisationPlan:
 class WindowEpoch:
     """One epoch in the window: what it is, directions, noise, and its factor.
 
-    used: the noise that it was linearised with; usual: that of the window then; instrument: set
-    by `linearise_instrument`.
+    used: the noise that it was linearised with; usual: that of the window then; instrument, locked:
+    set by `linearise_instrument` and `linearise_locked`.
     """
 
     piece: EpochContent
@@ -89,6 +104,7 @@ class WindowEpoch:
     factor: Factor
     score: MisfitScore | None = None
     instrument: InstrumentInformation | None = None
+    locked: LockedInformation | None = None
     _residuals: noise.Residuals | None = None
     _cells: DirectionCells | None = None
 
@@ -235,13 +251,9 @@ def misfit_scores(factors: Sequence[Factor]) -> list[MisfitScore]:
     gain = cross @ np.linalg.pinv(H[:, BORDERS[:, None], BORDERS], rcond=1e-12, hermitian=True)
     S = H[:, _KEEP[:, None], _KEEP] - gain @ np.swapaxes(cross, 1, 2)
     r = g[:, _KEEP] - (gain @ g[:, BORDERS, None])[:, :, 0]
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(S, axis1=1, axis2=2), 1e-30))
-    values, vectors = np.linalg.eigh(S * scale[:, :, None] * scale[:, None, :])
-    good = values > 1e-4
-    root = np.where(good, 1.0 / np.sqrt(np.where(good, values, 1.0)), 0.0)
-    whiten = root[:, :, None] * np.swapaxes(vectors, 1, 2) * scale[:, None, :]
+    whiten, count = _whitening(S)
     asked = (whiten @ r[:, :, None])[:, :, 0]
-    freedom = np.count_nonzero(good, axis=1).astype(float)
+    freedom = count.astype(float)
     return [MisfitScore(*each) for each in zip(asked, whiten @ S, freedom, strict=True)]
 
 
@@ -337,8 +349,7 @@ _SIZE = 28
 _X, _BIAS, _REST = slice(0, 12), slice(9, 12), slice(12, _SIZE + 3)
 _OF_ANGLE = np.r_[12:15, 16:22]
 _SCALES = np.r_[SCALE:22]
-_OF_FIELD, _OF_MOTION = np.r_[0:9, LAG, PLACE, _SIZE], np.r_[9:15, SCALE:22, _SIZE]
-_FIELD, _MOTION = np.ix_(_OF_FIELD, _OF_FIELD), np.ix_(_OF_MOTION, _OF_MOTION)  # gradient last
+_OF_FIELD, _OF_MOTION = np.r_[0:9, LAG, PLACE], np.r_[9:15, SCALE:22]
 _PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
 IMPERFECTIONS = ("axes", "lag", "scales", "place", "bias")
 _PLACE = np.r_[10:16]
@@ -817,6 +828,19 @@ def disagreement(H: Array, g: Array, steps: Array) -> float:
 
 def _informations(epochs: Sequence[WindowEpoch], c: Array) -> None:
     """`WindowEpoch.instrument` of epochs that were linearised at c."""
+    for epoch, own in zip(epochs, _quadratics(epochs, c), strict=True):
+        at = c, epoch.factor.point.a.bias
+        epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], *at)
+
+
+def _quadratics(
+    epochs: Sequence[WindowEpoch], c: Array, further: Callable[..., _Columns] | None = None
+) -> Array:
+    """H (E, n, n) with the gradient as its last column, of epochs that were linearised at c.
+
+    further: makes of both parts, directions, rates and rows more columns, whose numbers come after
+    those of the instrument, the field's before the motion's
+    """
     rows = chain.Rows.of(
         [chain.Chain(e.data, e.u, e.factor.point.a.bias, e.used, e.weights) for e in epochs]
     )
@@ -827,27 +851,40 @@ def _informations(epochs: Sequence[WindowEpoch], c: Array) -> None:
     rate = np.concatenate([rates(e.data) for e in epochs])
     swept = chain.symmetric(c[:6]) @ np.cross(rate, seen).T
     late = field.by_x[0, 6] * swept  # by_x holds - sqrt(weight) / s_m in that place
-    diag, upper, border = chain.interior(field, motion)
-    columns = np.zeros((2, _SIZE + 1, len(rate)))
-    columns[:, :12], columns[:, _SIZE] = border[:, :12], border[:, 12]
-    columns[:, _OF_ANGLE] = -motion.scale * turn
-    columns[:, _OF_ANGLE, :-1] += np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], turn[:, :, 1:])
-    columns[:, LAG] = np.einsum("rn,rin->in", late, field.own)
     place = _by_place(field, seen, np.concatenate([e.data.down_b for e in epochs]), c)
+    of_field, of_motion = np.zeros((3, 0, len(rate))), np.zeros((2, 0, len(rate)))
+    if further is not None:
+        of_field, of_motion = further(field, motion, seen, rate - rows.bias.T, turned / rows.dt_s)
+    split = _SIZE + of_field.shape[1]
+    size = split + of_motion.shape[1]
+    J = np.concatenate([field.by_x, late[:, None], place, of_field, field.r[:, None]], axis=1)
+    K = np.concatenate([motion.by_bias, turn, of_motion, motion.q[:, None]], axis=1)
+    diag, upper, border = chain.interior(field, motion)
+    columns = np.zeros((2, size + 1, len(rate)))
+    columns[:, :12], columns[:, size] = border[:, :12], border[:, 12]
+    angles = np.r_[_OF_ANGLE, split:size]
+    by_angle = K[:, 3:-1]
+    columns[:, angles] = -motion.scale * by_angle
+    columns[:, angles, :-1] += np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], by_angle[:, :, 1:])
+    columns[:, LAG] = np.einsum("rn,rin->in", late, field.own)
     columns[:, PLACE] = np.einsum("rjn,rin->ijn", place, field.own)
+    columns[:, _SIZE:split] = np.einsum("rjn,rin->ijn", of_field, field.own)
     _, half = halfway(diag, upper, np.ascontiguousarray(columns.transpose(1, 2, 0)))
-    J = np.concatenate([field.by_x, late[:, None], place, field.r[:, None]], axis=1)
-    K = np.concatenate([motion.by_bias, turn, motion.q[:, None]], axis=1)
-    H = np.zeros((len(epochs), _SIZE + 1, _SIZE + 1))
+    fields = np.r_[_OF_FIELD, _SIZE:split, size]
+    motions = np.r_[_OF_MOTION, split:size, size]
+    H = np.zeros((len(epochs), size + 1, size + 1))
     for k, (a, b) in enumerate(zip(rows.first.tolist(), (rows.last + 1).tolist(), strict=True)):
         Y = half[2 * a : 2 * b]
         H[k] = -(Y.T @ Y)
-        H[k][_FIELD] += chain.squares(J[:, :, a:b])
-        H[k][_MOTION] += chain.squares(K[:, :, a:b])
+        H[k][np.ix_(fields, fields)] += chain.squares(J[:, :, a:b])
+        H[k][np.ix_(motions, motions)] += chain.squares(K[:, :, a:b])
     for epoch, own in zip(epochs, H, strict=True):
-        own[_SCALES, _SIZE] -= _by_noise(epoch)
-        at = c, epoch.factor.point.a.bias
-        epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], *at)
+        own[_SCALES, size] -= _by_noise(epoch)
+    return H
+
+
+_Columns = tuple[Array, Array]
+"""Of the field's residuals (3, n, N) and of the motion's (2, m, N)."""
 
 
 def _by_place(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Array:
@@ -894,6 +931,91 @@ def _of_angle(by_angle: Array, angle: Array) -> Array:
     shape = [y * q - x * p, (2 * z * r - x * p - y * q) / np.sqrt(3.0)]
     shape += [-(y * r + z * q), -(x * r + z * p), -(x * q + y * p)]
     return np.array([*turn, -(x * p + y * q + z * r), *shape]).transpose(1, 0, 2)
+
+
+# -- What is locked to attitude, rate and time -----------------------------------------------------
+#
+# What real instruments and places leave over besides (`locked`): harmonics of the field's direction
+# on each axis of the sensor; the field by the rate, and its change by axes that are late by
+# different times; products of the gyro's rates. They are not asked for, only watched
+# (`model_checks`). What follows time is a hard iron of each epoch's own, and needs no columns.
+
+_FROM = _SIZE
+_NEARBY = 1e-2  # of the field: a calibration that moved by less leaves 1e-4 of it to second order
+_ALIKE = 0.1  # of a noise level, by which another makes another epoch
+LOCKED = {
+    "attitude": np.arange(_FROM, _FROM + 36),
+    "rate": np.arange(_FROM + 36, _FROM + 36 + 9 + 8 + 18),
+    "time": np.arange(6, 9),
+}
+
+
+def linearise_locked(epochs: Sequence[WindowEpoch]) -> None:
+    """Compute `WindowEpoch.locked` of the epochs with motion that do not have it yet, as
+    `linearise_instrument`."""
+    silent = [epoch for epoch in epochs if epoch.turned and epoch.locked is None]
+    for place in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in silent}.values():
+        here = [epoch for epoch in silent if epoch.factor.point.c is place]
+        found = _quadratics(here, place, partial(_locked_columns, c=place))
+        H, g = found[:, :-1, :-1], found[:, :-1, -1]
+        roots = {key: _whitening(H[:, at[:, None], at]) for key, at in LOCKED.items()}
+        for k, epoch in enumerate(here):
+            told = InstrumentInformation(H[k], g[k], place, epoch.factor.point.a.bias)
+            own = {key: root[k] for key, (root, _) in roots.items()}
+            freedom = {key: int(count[k]) for key, (_, count) in roots.items()}
+            epoch.locked = LockedInformation(told, own, freedom, epoch.used)
+
+
+def still_locked(old: WindowEpoch, new: WindowEpoch) -> LockedInformation | None:
+    """What is locked in an epoch that was linearised again, where that is as good as before."""
+    known = old.locked
+    if known is None or old.data is not new.data:
+        return None
+    c, moved = new.factor.point.c, new.factor.point.c - known.told.c
+    far = float(np.linalg.norm(moved)) > _NEARBY * float(
+        np.cbrt(np.linalg.det(chain.symmetric(c[:6])))
+    )
+    other = max(
+        abs(new.used.mag_gauss / known.noise.mag_gauss - 1.0),
+        abs(new.used.gyro_rad_s / known.noise.gyro_rad_s - 1.0),
+    )
+    return None if far or other > _ALIKE else known
+
+
+def _locked_columns(
+    field: chain.FieldPart,
+    motion: chain.MotionPart,
+    seen: Array,
+    rate: Array,
+    step_rate: Array,
+    *,
+    c: Array,
+) -> _Columns:
+    """Of directions seen and rates (N, 3) at the rows, and of the step to each (3, N)."""
+    change = np.cross(seen, rate) @ chain.symmetric(c[:6])
+    by_field = np.concatenate(
+        [
+            locked.BY_DIRECTION * locked.on_each_axis(locked.harmonics(seen)),
+            locked.FIELD_BY_RATE * locked.on_each_axis(rate),
+            locked.BY_CHANGE * locked.of_change(change),
+        ],
+        axis=2,
+    )
+    products = locked.BY_RATE_SQUARED * locked.squares(step_rate.T)
+    by_motion = np.einsum("rin,nk->rkin", motion.by_bias, products)
+    weight = field.by_x[0, 6]  # - sqrt(weight) / s_m
+    return weight * by_field.transpose(1, 2, 0), by_motion.reshape(2, -1, len(seen))
+
+
+def _whitening(H: Array) -> tuple[Array, Array]:
+    """Roots (E, n, n) by which gradients of H (E, n, n) are whitened, and how many directions each
+    tells (E,)."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-30))
+    values, vectors = np.linalg.eigh(H * scale[:, :, None] * scale[:, None, :])
+    good = values > _WEAKEST
+    root = np.where(good, 1.0 / np.sqrt(np.where(good, values, 1.0)), 0.0)
+    whiten = root[:, :, None] * np.swapaxes(vectors, 1, 2) * scale[:, None, :]
+    return whiten, np.count_nonzero(good, axis=1)
 
 
 # -- A contradiction -------------------------------------------------------------------------------

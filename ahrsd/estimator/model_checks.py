@@ -1,15 +1,29 @@
-"""Whether a settled window contradicts the model: an iron that changed, axes that are turned."""
+"""Whether a settled window contradicts the model: an iron that changed, axes that are turned, or
+something that is left over and locked to attitude, rate or time."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from ahrsd import so3
 from ahrsd.calibration import Affine
-from ahrsd.estimator import chain
-from ahrsd.estimator.epoch import TURN, InformationStack, believed, disagreement, instrument
+from ahrsd.estimator import chain, locked
+from ahrsd.estimator.epoch import (
+    GYRO_OF_ALL,
+    LOCKED,
+    TURN,
+    InformationStack,
+    LockedInformation,
+    TakenOut,
+    WindowEpoch,
+    believed,
+    disagreement,
+    instrument,
+)
 from ahrsd.estimator.graph import Graph, retract
 from ahrsd.samples import Array
 
@@ -146,3 +160,200 @@ def misalignment(
     full = Affine(C / np.cbrt(np.linalg.det(C)), c[6:9].copy())
     chi2 = float(theta @ np.linalg.solve(spread, theta))
     return Misalignment(theta, spread, chi2, found.misfit, full)
+
+
+# -- What is left over, locked to attitude, rate or time -------------------------------------------
+#
+# What the epochs ask for beyond iron, bias and whatever an instrument and a place may have, against
+# the columns that `diagnose` has for what real recordings leave (`locked`): a score test for each
+# component, in the directions of it that the motion shows.
+#
+# Chance: at the answer its whitened scores z have the variance `chance` each, were nothing there.
+# It is what the epochs disagree about among themselves once the component is in, in all of its
+# directions or in that one, whichever is more: a field that is another at each visit, and noise
+# that is slow, make them disagree, and what is locked to the attitude does not. It is known by as
+# many degrees of freedom as are left, so that the test is Student's; where there are fewer than
+# directions that are asked, nothing is said.
+#
+# Size: each coefficient has the deviation t times what is ordinary, t lognormal as real recordings
+# have it, or nothing is there (`_THERE`). A direction in which the epochs tell l, in units of what
+# is ordinary, then has scores of the variance chance + t^2 l. So a component that is likelier than
+# nothing has a posterior: what it is found to be, and what the data leave open of it, is an error
+# of the answer, as it is for an instrument's imperfections. What that does to an answer that is
+# wider already for what epochs disagree about counts only as far as it is more.
+
+_MODES = 3  # half waves over the window: slower than epochs are long
+_SIZES = np.exp(np.arange(-4.0, 3.0))  # times what is ordinary
+_SPREAD = 2.0  # of their logarithm: `diagnosis/one_model/priors.py`, 1.5 to 2.2
+_SHOWN = 1e-6  # information of a direction over that of the best one: less is none
+_THERE = 1.0 / 20.0  # probability before the data; `diagnosis/one_model/priors.py: COURSE`
+_NAMED = 12.0  # nats; `diagnosis/one_model/priors.py: ODDS_REAL`: the laws are not exact
+_FOLLOWS = {"attitude": "the attitude", "rate": "the rate of turn", "time": "the time"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LeftOver:
+    """The likeliest component of what is left over.
+
+    key: of `LOCKED`; nats: by which it is likelier than nothing; size_gauss: rms of what it makes
+    of the field where it shows; added: to the covariance (12, 12) of [M, b, w_b]
+    """
+
+    key: str
+    nats: float
+    size_gauss: float
+    added: Array
+
+    @property
+    def words(self) -> str:
+        """What it is and what to do; empty: it may be chance."""
+        if not self.nats > _NAMED:
+            return ""
+        return (
+            f"what is left follows {_FOLLOWS[self.key]}: {1e3 * self.size_gauss:.2g} mG; run "
+            "`ahrsd diagnose` on the recording"
+        )
+
+    @property
+    def cause(self) -> str:
+        """The same as what makes the most of a sigma."""
+        return (
+            f"what the model leaves over follows {_FOLLOWS[self.key]}: `ahrsd diagnose` of the "
+            "recording says what it is"
+        )
+
+
+def widened(covariance: Array, plain: Array, left: LeftOver | None) -> Array:
+    """covariance (12, 12), which is wider than `plain` for what epochs disagree about, and no less
+    wide than for what is left over."""
+    if left is None:
+        return covariance
+    scale = np.sqrt(np.diag(covariance))
+    size = np.outer(scale, scale)
+    more = (left.added - (covariance - plain)) / size
+    values, vectors = np.linalg.eigh((more + more.T) / 2)
+    return np.asarray(covariance + size * ((vectors * np.clip(values, 0.0, None)) @ vectors.T))
+
+
+def left_over(
+    epochs: Sequence[WindowEpoch],
+    graph: Graph,
+    believed_of: tuple[float, Array],
+    taken: TakenOut,
+    noise_gauss: float,
+) -> LeftOver | None:
+    """By those epochs of a window that `linearise_locked` saw; None where nothing is likelier than
+    nothing, or too few are there.
+
+    believed_of: sigma of the gyro's bias (rad/s), and of the instrument's imperfections and the
+    place (16,), the largest that may be; noise_gauss: of one reading. LinAlgError: the motion
+    tells too little.
+    """
+    moving = [epoch for epoch in epochs if epoch.locked is not None]
+    if len(moving) < 2:
+        return None
+    told = [(epoch, epoch.locked) for epoch in moving if epoch.locked is not None]
+    known = [one for _, one in told]
+    H = np.array([one.told.H for one in known])
+    g = np.array([one.told.at(graph.c, graph.nodes[epoch.a].bias) for epoch, one in told])
+    sigma_bias, sigmas = believed_of
+    n = 12 + len(sigmas)
+    prior, pull = np.zeros((n, n)), np.zeros(n)
+    own_H, own_g = believed(graph, sigma_bias)
+    prior[:12, :12], pull[:12] = own_H[:12, :12], own_g[:12]
+    prior[12:, 12:] = np.diag(graph.temper / np.square(sigmas))
+    pull[12 + GYRO_OF_ALL] = graph.temper / np.square(sigmas[GYRO_OF_ALL]) * taken.numbers
+    rows = sum(epoch.data.steps for epoch in moving)
+    time_s = np.array([float(epoch.data.time_s[[0, -1]].mean()) for epoch in moving])
+    course = locked.COURSE * locked.courses(time_s, _MODES)
+    found = []
+    for key in LOCKED:
+        column = course if key == "time" else np.ones((len(moving), 1))
+        asked = _Asked.of(key, (H, g), known, column, (prior, pull))
+        if asked is not None:
+            found.append(asked.weighed(key, noise_gauss / np.sqrt(rows)))
+    best = max(found, key=lambda one: one.nats, default=None)
+    return best if best is not None and best.nats > 0.0 else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Asked:
+    """What epochs ask of a component, in the k directions of it that they tell.
+
+    scores (k,): whitened by all that else may be; told (k,): information in units of what is
+    ordinary; chance (k,): variance of the scores were nothing there, known by so many degrees of
+    freedom; by_one (12, k): what one of each does to [M, b, w_b]
+    """
+
+    scores: Array
+    told: Array
+    chance: Array
+    freedom: float
+    by_one: Array
+
+    @staticmethod
+    def of(
+        key: str,
+        epochs: InformationStack,
+        known: Sequence[LockedInformation],
+        course: Array,
+        before: tuple[Array, Array],
+    ) -> _Asked | None:
+        """course (N, m): by how much each coefficient of the component counts in each epoch, m
+        times; before: what is believed of all else. None where the epochs can hardly
+        disagree."""
+        (H, g), at, others = epochs, LOCKED[key], slice(0, len(before[1]))
+        own_H, own_g = H[:, at[:, None], at], g[:, at]
+        to_others, modes = H[:, at, others], course.shape[1]
+        beside = np.tensordot(course, to_others, (0, 0)).reshape(modes * len(at), -1).T
+        pairs = course[:, :, None] * course[:, None]
+        own = np.tensordot(pairs, own_H, (0, 0)).transpose(0, 2, 1, 3).reshape(beside.shape[1], -1)
+        gradient = (course.T @ own_g).ravel()
+        rest_H, rest_g = H[:, others, others].sum(axis=0) + before[0], g[:, others].sum(axis=0)
+        rest_g = rest_g + before[1]
+        scale = 1.0 / np.sqrt(np.diag(rest_H))
+        solved = partial(np.linalg.solve, rest_H * np.outer(scale, scale))
+        gain = scale[:, None] * solved(scale[:, None] * beside)
+        values, vectors = np.linalg.eigh(own - beside.T @ gain)
+        shown = values > _SHOWN * max(float(values[-1]), 1e-30)
+        values, vectors = values[shown], vectors[:, shown]
+        score = vectors.T @ (gradient - gain.T @ rest_g)
+        step = -vectors @ (score / values)
+        rest = -scale * solved(scale * (rest_g + beside @ step))
+        each = course @ step.reshape(modes, -1)
+        left = own_g + to_others @ rest + chain.times(own_H, each)
+        roots = np.array([one.roots[key] for one in known])
+        by_others = (roots @ to_others).reshape(-1, len(scale)) * scale
+        fitted = float(np.sum(by_others.T * solved(by_others.T)))
+        freedom = float(sum(one.freedom[key] for one in known)) - len(values) - fitted
+        if freedom < len(values):
+            return None
+        alike = float(np.sum(chain.times(roots, left) ** 2)) / freedom
+        ways = np.tensordot(course, vectors.reshape(modes, len(at), -1), (1, 0))
+        each_way = chain.times(np.swapaxes(ways, 1, 2), left) ** 2
+        told = np.sum(ways * (own_H @ ways), axis=(0, 1))
+        own_way = each_way.sum(axis=0) / told * len(known) / max(len(known) - 1, 1)
+        chance = np.maximum(alike, own_way)
+        return _Asked(score / np.sqrt(values), values, chance, freedom, -(gain[:12] @ vectors))
+
+    def weighed(self, key: str, of_one: float) -> LeftOver:
+        """of_one (gauss): rms of a component that asks for one."""
+        variance = _SIZES[:, None] ** 2
+        likely = np.exp(-0.5 * (np.log(_SIZES) / _SPREAD) ** 2)
+        likely /= likely.sum()
+        more = variance * self.told / self.chance
+        squares = self.scores**2 / self.chance
+        known = self.freedom + len(squares)
+        nothing = np.log1p(squares.sum() / self.freedom)
+        there = np.log1p(np.sum(squares / (1.0 + more), axis=1) / self.freedom)
+        nats = 0.5 * (known * (nothing - there) - np.sum(np.log1p(more), axis=1))
+        most = float(nats.max())
+        weights = likely * np.exp(nats - most)
+        odds = most + float(np.log(weights.sum()))
+        against = (1.0 / _THERE - 1.0) * float(np.exp(-np.clip(odds, -50.0, 50.0)))
+        weights *= 1.0 / weights.sum() / (1.0 + against)
+        mean = -np.sqrt(self.told) * self.scores * variance / (self.chance * (1.0 + more))
+        spread = np.diag(weights @ (variance / (1.0 + more))) + (weights * mean.T) @ mean
+        added = self.by_one @ spread @ self.by_one.T
+        left = max(float(np.sum(self.scores**2 - self.chance)), 0.0)
+        return LeftOver(key, odds, of_one * float(np.sqrt(left)), (added + added.T) / 2)

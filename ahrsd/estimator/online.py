@@ -12,8 +12,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -32,6 +34,7 @@ from ahrsd.estimator.epoch import (
     gyro_asked,
     informations,
     instrument,
+    linearise_locked,
     of_rests,
     walk_asked,
     whole_informations,
@@ -39,10 +42,13 @@ from ahrsd.estimator.epoch import (
 from ahrsd.estimator.epoch_data import EpochBuilder, check_samples, with_border
 from ahrsd.estimator.graph import BLIND, Node, SingularError, curvature, whitening
 from ahrsd.estimator.model_checks import (
+    LeftOver,
     Misalignment,
     change_message,
     divided,
+    left_over,
     misalignment,
+    widened,
 )
 from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters, instruments
 from ahrsd.estimator.window import Window, search
@@ -166,13 +172,14 @@ class HeadingAdvice:
         parts: Mapping[str, Array],
         covariance: Array,
         turned_deg: float = 0.0,
-        slow: Callable[[], noise.SlowResidual | None] = lambda: None,
+        left: Callable[[], str] = str,
     ) -> str:
         """What makes more than half of the heading's variance, in words; empty: it is known well.
 
         covariance (12, 12): the answer's; parts: covariances (12, 12) by "motion" and the names of
         `_WIDENED`, which add up to it but for what they have in common; turned_deg: what axes that
-        were found to be turned make of the heading; slow: what the model leaves over that lasts
+        were found to be turned make of the heading; left: what is known of misfit, in words, or
+        empty
         """
         if not np.hypot(self._sigma_deg(covariance), turned_deg) > _TELLS_DEG:
             return ""
@@ -183,9 +190,7 @@ class HeadingAdvice:
             return ""
         if most == "motion":
             return _MOTION.format(self.manoeuvre(covariance))
-        if most == "misfit" and (left := slow()) is not None and left.words:
-            return left.words
-        return _WIDENED[most]
+        return (left() if most == "misfit" else "") or _WIDENED[most]
 
     def by_place_deg(self, parts: Mapping[str, Array]) -> float:
         """What a field that differs by place makes of the heading, 1 sigma; nan: unknown.
@@ -306,6 +311,14 @@ def blind_names(vectors: Array) -> tuple[str, ...]:
     return tuple(names)
 
 
+def misfit_words(left: LeftOver | None, window: Window) -> str:
+    """What is known of misfit; empty: nothing."""
+    if left is not None and left.words:
+        return left.cause
+    slow = window.slow_residual()
+    return "" if slow is None else slow.words
+
+
 # -- The estimator ---------------------------------------------------------------------------------
 
 
@@ -364,6 +377,7 @@ class Estimator:
         self._moving_epochs = 0
         self._next_search = _FIRST_SEARCH
         self._strange = 0
+        self._is_copy = False  # made for one answer
         self._doubted_s: float | None = None  # since when the newest motion contradicts the answer
         self._parted = 1.0  # variance over the expected of what earlier and later data ask for
         self._misscaled = 0.0  # share of themselves by which the gyro's angles are too small
@@ -650,6 +664,7 @@ class Estimator:
         An epoch that is under way counts as far as it is, if it is long enough to be one.
         """
         if self._new or (self._window and self._builder.pending >= MIN_EPOCH_STEPS):
+            self._watch()
             return self._copy().finish()
         return self._answer()
 
@@ -663,6 +678,42 @@ class Estimator:
         """What an instrument that is not perfect does to the answer."""
         weighed = self._weighed(window)
         return Widening.nothing() if weighed is None else considered(weighed)
+
+    def _left_over(self, window: Window) -> LeftOver | None:
+        """What the epochs of the window leave that is locked to attitude, rate or time.
+
+        What an answer leaves that is not the best yet is its own.
+        """
+        if not self._is_watched(window):
+            return None
+        if not self._is_copy:
+            self._watch()
+        most = np.max(instruments(*self.parameters.kinds), axis=0)[:16]
+        try:
+            return left_over(
+                window.epochs,
+                window.graph,
+                (self.parameters.prior_gyro_bias_rad_s, most),
+                window.taken,
+                window.usual.mag_gauss,
+            )
+        except np.linalg.LinAlgError:
+            return None
+
+    def _watch(self) -> None:
+        """Ask the epochs what is locked, each once: what is made for one answer keeps it."""
+        if self._window is None or not self._is_watched(self._window):
+            return
+        with suppress(np.linalg.LinAlgError):
+            linearise_locked(self._window.epochs)
+
+    def _is_watched(self, window: Window) -> bool:
+        settled = self._agreed and window.step_sigmas < _SETTLED
+        return bool(self.parameters.imperfections) and settled
+
+    def _warnings(self, left: LeftOver | None) -> tuple[str, ...]:
+        changed = () if self.restarted_s is None else (change_message(self.restarted_s),)
+        return (*changed, left.words) if left is not None and left.words else changed
 
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
@@ -678,6 +729,7 @@ class Estimator:
 
     def _copy(self) -> Estimator:
         other = copy(self)
+        other._is_copy = True
         other._builder, other._down = self._builder.copy(), self._down.copy()
         other._new = list(self._new)
         other._window = None if self._window is None else self._window.copy()
@@ -696,11 +748,9 @@ class Estimator:
         # An answer that moves, or that other starts do not reach, is no better known than that.
         doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
         widening = self._by_imperfections(window)
-        tempered = window.covariance()
-        divided = tempered * self._parted
-        parts = widening.parts | motion_and_misfit(
-            window.explained_covariance(), divided, self._whitening
-        )
+        plain, left = window.explained_covariance(), self._left_over(window)
+        divided = widened(window.covariance() * self._parted, plain, left)
+        parts = widening.parts | motion_and_misfit(plain, divided, self._whitening)
         covariance = divided * (1.0 + doubt**2)
         covariance = covariance + self._by_lag(window) + widening.added
         covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
@@ -710,6 +760,7 @@ class Estimator:
         down, dip = attitude(self._down, [(e.u, e.data.down_b) for e in window.epochs])
         turned = turned_heading_deg(window.taken.numbers[:3], down, dip)
         heading = float(np.hypot(heading_sigma_deg(graph.c, covariance, down, dip), turned))
+        words = partial(misfit_words, left, window)
         advice = HeadingAdvice(graph.c, down, dip, window.usual.mag_gauss)
         averaged = self._builder.averaged
         return Estimate(
@@ -733,11 +784,11 @@ class Estimator:
                 and self._misscaled == 0.0
                 and self._doubted_s is None
             ),
-            warnings=() if self.restarted_s is None else (change_message(self.restarted_s),),
+            warnings=self._warnings(left),
             mag_lag_s=window.taken.lag_s,
             gyro_misscaled=self._misscaled,
             contradicted_s=self._doubted_s,
-            widened_by=advice.widened_by(parts, covariance, turned, window.slow_residual),
+            widened_by=advice.widened_by(parts, covariance, turned, words),
             place_gauss=widening.place_gauss,
             place_deg=advice.by_place_deg(parts),
             gyro_correction=window.taken.gyro,

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.estimator import chain, noise, start
+from ahrsd.estimator import chain, noise
 from ahrsd.estimator.epoch import (
     FoldedInformation,
     Lag,
@@ -36,6 +36,7 @@ from ahrsd.estimator.epoch import (
     linearise_instrument,
     place_borders,
     scores_of,
+    still_locked,
 )
 from ahrsd.estimator.epoch_data import (
     corrected,
@@ -260,6 +261,7 @@ class Window:
         where = {id(factor): i for i, factor in enumerate(factors)}
         for k, new in zip(which, self._linearised(places, **weighing), strict=True):
             factors[where[id(self.epochs[k].factor)]] = new.factor
+            new.locked = still_locked(self.epochs[k], new)
             self.epochs[k] = new
 
     def _moved_directions(self, which: Sequence[int]) -> list[Array]:
@@ -767,7 +769,7 @@ def search(
     )
     whole = [data[k] for k in chosen]
     fields = np.vstack([d.field_b_gauss for d in whole])
-    starts = [start.linear_start(whole), start.sphere_start(fields)]
+    starts = [chain.linear_start(whole), chain.sphere_start(fields)]
     first_look = bool(np.array_equal(graph.c, present))
     if not first_look:
         starts.insert(0, present)
@@ -824,7 +826,7 @@ def _further(
             out[k] = _gone_on(thin, one)
         elif not there and not one.mirrored:
             anew = _descend(
-                thin, start.mirrored(one.c, fields), bias, best, independent=one.independent
+                thin, chain.mirrored(one.c, fields), bias, best, independent=one.independent
             )
             out[k] = replace(one, independent=False, mirrored=True)  # an end that stays one
             out.append(replace(anew, mirrored=True))

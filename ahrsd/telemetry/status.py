@@ -222,6 +222,7 @@ def _estimate(estimate: Estimate | None) -> dict[str, object] | None:
         "heading_sigma_deg": estimate.heading_sigma_deg,
         "misfit": estimate.misfit,
         "unobservable": list(estimate.observability.unobservable),
+        "warnings": list(estimate.warnings),
     }
 
 

@@ -83,6 +83,7 @@ def explain_json(status: Mapping[str, Any]) -> dict[str, object]:
         "warm_start": str(status.get("warm_start", "")),
         "files": list(status["complaints"]),
         "mismatch": _mismatch(status),
+        "warnings": list((status.get("estimate") or {}).get("warnings", ())),
         "gates": shut,
         "others": others,
         "next": _next(status, state, shut, others),
@@ -181,6 +182,7 @@ def explain_lines(explained: Mapping[str, Any]) -> list[str]:
     lines += [f"file: {text}" for text in explained["files"]]
     if explained["mismatch"]:
         lines.append(f"mismatch: {explained['mismatch']}")
+    lines += [f"estimate: {text}" for text in explained["warnings"]]
     write = "further write" if explained["state"] in WRITTEN else "write"
     gates: Sequence[Mapping[str, Any]] = explained["gates"]
     if gates:
@@ -365,7 +367,7 @@ def turned_deg(before_deg: float, after_deg: float) -> float:
 
 
 def estimate_lines_of(status: Status) -> list[str]:
-    """The estimate with its sigmas."""
+    """The estimate with its sigmas, and what is wrong with it."""
     estimate = status["estimate"]
     if estimate is None:
         return ["estimate: none yet"]
@@ -379,6 +381,7 @@ def estimate_lines_of(status: Status) -> list[str]:
         f"estimate: {done}; {sigma}{held}",
         f"  hard iron {iron} mG",
         f"  gyro bias {bias} mrad/s",
+        *(f"  warning: {text}" for text in estimate.get("warnings", ())),
     ]
 
 

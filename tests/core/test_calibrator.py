@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pieces
 import pytest
 from streams import binary_device, emitted, inputs
 
@@ -13,6 +14,7 @@ from ahrsd.config.config import Config, core_settings
 from ahrsd.core.core import Core
 from ahrsd.core.estimation import Calibrator
 from ahrsd.core.settings import CalibratorSettings
+from ahrsd.estimator import locked
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.evidence.values import BasisFacts, HealthFacts
 from ahrsd.samples import SampleBlock
@@ -157,3 +159,26 @@ def test_anew_has_seen_nothing_and_keeps_what_is_in_force(blocks):
     assert not fresh.started
     assert fresh.present is present
     assert fresh.present_gyro_bias_rad_s.tolist() == [0.01, 0.0, 0.0]
+
+
+def test_what_is_left_over_is_told_once_and_judged():
+    """A field that follows the attitude, half of the magnetometer's noise on each axis."""
+    motion = (("circles", 40.0), ("roll", 30.0), ("pitch", 30.0), ("circles", 40.0), ("roll", 30.0))
+    made = pieces.drive(motion, 700)
+    draw = np.random.default_rng(700).normal(size=(12, 3))
+    more = locked.harmonics(made.field_b_gauss) @ draw * np.sqrt(3.0) / np.linalg.norm(draw)
+    told, places = {}, {}
+    for size_gauss in (0.0, 5e-4):
+        whole = replace(made.block, raw_b_gauss=made.block.raw_b_gauss + size_gauss * more)
+        cut = [whole.part(slice(a, a + 40), gap_before=a == 0) for a in range(0, len(whole), 40)]
+        calibrator = run(cut)
+        calibrator.finish()
+        told[size_gauss] = [note.text for note in calibrator.take_notes(0.0)]
+        gates = {gate.gate: gate for gate in calibrator.judged(170.0, HEALTH, BASIS)}
+        places[size_gauss] = gates["field.place"]
+    assert told[0.0] == []
+    (text,) = told[5e-4]
+    assert text.startswith("what is left follows the attitude: 0.")
+    assert text.endswith(" mG; run `ahrsd diagnose` on the recording")
+    assert places[0.0].ok
+    assert not places[5e-4].ok

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ahrsd import so3
-from ahrsd.estimator import chain, start
+from ahrsd.estimator import chain
 from ahrsd.estimator.epoch_data import turned
 
 M = np.array([[0.55, 0.03, -0.02], [0.03, 0.45, 0.01], [-0.02, 0.01, 0.5]])
@@ -31,14 +31,14 @@ def epoch(amplitude, noise_gauss, seed=0, n=2000):
 
 
 def test_linear_start_is_exact_without_noise():
-    c = start.linear_start([epoch(0.5, 0.0)])
+    c = chain.linear_start([epoch(0.5, 0.0)])
     np.testing.assert_allclose(chain.symmetric(c[:6]), M, atol=1e-6)
     np.testing.assert_allclose(c[6:], B, atol=1e-6)
 
 
 def test_linear_start_does_not_shrink_with_noise():
     """Errors in variables: the mean over noise stays at the truth; least squares would not."""
-    found = np.array([start.linear_start([epoch(0.25, 5e-3, seed)]) for seed in range(12)])
+    found = np.array([chain.linear_start([epoch(0.25, 5e-3, seed)]) for seed in range(12)])
     truth = np.r_[chain.upper_triangle(M), B]
     error, spread = found.mean(axis=0) - truth, found.std(axis=0) / np.sqrt(12)
     assert np.all(np.abs(error) < 4 * spread + 1e-3)
@@ -46,7 +46,7 @@ def test_linear_start_does_not_shrink_with_noise():
 
 
 def test_linear_start_needs_an_epoch_longer_than_its_lags():
-    assert start.linear_start([epoch(0.5, 0.0, n=15)]) is None
+    assert chain.linear_start([epoch(0.5, 0.0, n=15)]) is None
 
 
 def test_linear_start_refuses_what_is_not_positive_definite():
@@ -55,21 +55,21 @@ def test_linear_start_refuses_what_is_not_positive_definite():
     data = chain.EpochData(
         field, rng.normal(size=(400, 3)), np.full(400, DT), field, DT * field[:, 0], True
     )
-    c = start.linear_start([data])
+    c = chain.linear_start([data])
     assert c is None or np.linalg.eigvalsh(chain.symmetric(c[:6]))[0] > 0
 
 
 def test_sphere_start_is_exact_on_a_sphere():
     u = np.random.default_rng(0).normal(size=(300, 3))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    c = start.sphere_start(0.47 * u + B)
+    c = chain.sphere_start(0.47 * u + B)
     np.testing.assert_allclose(c, np.r_[0.47, 0, 0, 0.47, 0, 0.47, B], atol=1e-12)
 
 
 def test_sphere_start_refuses_a_plane():
     angle = np.linspace(0, 6, 100)
     circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(100)])
-    assert start.sphere_start(circle) is None
+    assert chain.sphere_start(circle) is None
 
 
 @pytest.mark.parametrize(("amplitude", "expected"), [(0.0, False), (0.02, True), (0.5, True)])
@@ -98,6 +98,6 @@ def test_a_mirrored_start_is_on_the_other_side_of_the_plane_of_the_fields():
     heading = np.linspace(0.0, 2 * np.pi, 50)
     level = np.column_stack([0.2 * np.cos(heading), 0.2 * np.sin(heading), np.full(50, 0.4)])
     c = np.r_[chain.upper_triangle(M), 0.1, -0.2, 0.05]
-    found = start.mirrored(c, level)
+    found = chain.mirrored(c, level)
     np.testing.assert_allclose(found[6:], [0.1, -0.2, 0.75], atol=1e-12)
     np.testing.assert_array_equal(found[:6], c[:6])

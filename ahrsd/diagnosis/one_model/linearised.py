@@ -18,7 +18,6 @@ from scipy.fft import dct, idct, next_fast_len
 from ahrsd.diagnosis import noise_fit
 from ahrsd.diagnosis.context import build_context
 from ahrsd.diagnosis.innovation import (
-    TRACELESS,
     Filtered,
     nuisance_columns,
     regressing,
@@ -33,6 +32,7 @@ from ahrsd.diagnosis.prior import prior_of
 from ahrsd.diagnosis.problem import Problem
 from ahrsd.diagnosis.side_by_side import batches, joined
 from ahrsd.diagnosis.values import Columns, Context, NullModel
+from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
 CALIBRATION = "calibration"

@@ -11,19 +11,14 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.innovation import TRACELESS
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
 from ahrsd.diagnosis.one_model.gaussian_process import course
 from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.estimator.locked import harmonics, of_change, on_each_axis, squares
 from ahrsd.samples import Array
 
 _GRAVITY = 9.81
-_ASIDE = np.eye(3)
-_SKEW = np.array([
-    [[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]],
-    [[0, -1, 0], [1, 0, 0], [0, 0, 0]],
-])  # fmt: skip
 
 
 def ordinary_remainder(context: Context) -> list[Component]:
@@ -46,7 +41,7 @@ def ordinary_remainder(context: Context) -> list[Component]:
 def _sized(context: Context, key: str, frame: str, functions: Array) -> Component:
     """Each function (N, k) along each axis of the sensor, all coefficients of one size."""
     law = ordinary(priors.ORDINARY[key], np.ones(3 * functions.shape[1]))
-    flat = np.einsum("nk,ia->nika", functions, _ASIDE).reshape(len(functions), 3, -1)
+    flat = on_each_axis(functions)
     columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
     return Component(key, frame, columns, law)
 
@@ -76,9 +71,8 @@ def still_spells(time_s: Array, gyro_rad_s: Array) -> list[tuple[float, float]]:
 
 def by_change(context: Context) -> Component:
     """A matrix on the field's change, without what is alike on all axes: that is the delay."""
-    matrix = np.concatenate([TRACELESS, _SKEW])
-    columns = np.einsum("aij,nj->nia", matrix, context.field_dot_b)
-    law = ordinary(priors.ORDINARY["by_change"], np.ones(len(matrix)))
+    columns = of_change(context.field_dot_b)
+    law = ordinary(priors.ORDINARY["by_change"], np.ones(columns.shape[2]))
     return Component("by_change", "sensor", Columns(mag=columns), law)
 
 
@@ -100,27 +94,3 @@ def gyro_matrix(context: Context) -> Component:
         columns[:, i, 6 + axis], columns[:, j, 6 + axis] = w[:, j], w[:, i]
     deviation = np.repeat([priors.ORDINARY_MISALIGNMENT_RAD, priors.ORDINARY_SCALE], [3, 6])
     return Component("gyro_matrix", "gyro", Columns(gyro=columns), Fixed(deviation**2))
-
-
-def harmonics(field_b: Array) -> Array:
-    """(N, 12) harmonics of degree 2 and 3 of a direction, of mean square 1 on the sphere."""
-    x, y, z = (field_b / np.maximum(np.linalg.norm(field_b, axis=1, keepdims=True), 1e-300)).T
-    second = [x * y, y * z, z * x, (x**2 - y**2) / 2, (3 * z**2 - 1) / (2 * np.sqrt(3))]
-    third = [
-        x * y * z * 2,
-        z * (x**2 - y**2),
-        x * (5 * z**2 - 1) / np.sqrt(10),
-        y * (5 * z**2 - 1) / np.sqrt(10),
-        z * (5 * z**2 - 3) / np.sqrt(15),
-        x * (x**2 - 3 * y**2) / np.sqrt(6),
-        y * (3 * x**2 - y**2) / np.sqrt(6),
-    ]
-    return np.column_stack(
-        [np.sqrt(15.0) * np.array(second).T, np.sqrt(105.0 / 4) * np.array(third).T]
-    )
-
-
-def squares(rate: Array) -> Array:
-    """(N, 6) products of the rates, less nothing: a mean is a bias, which the calibration has."""
-    x, y, z = rate.T
-    return np.column_stack([x * x, y * y, z * z, x * y, y * z, z * x])

@@ -14,7 +14,7 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.one_model import noise_model, priors
 from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw
-from ahrsd.diagnosis.one_model.remainder import harmonics, squares
+from ahrsd.estimator.locked import harmonics, squares
 
 
 @pytest.mark.parametrize("psi", [np.array([0.3, 0.5]), np.array([-1.0, 3.0])])

@@ -1,0 +1,69 @@
+"""What real instruments and places leave over, as columns: locked to attitude, rate and time.
+
+A sensor is not quite linear, a gyro not quite straight, a room differs from place to place and its
+field from time to time. `diagnose` has these functions in its model of a recording (its ordinary
+remainder), and the estimator watches with them what its epochs leave (`model_checks`). Pure
+functions of directions, rates and times; sizes are those of untouched real recordings.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd import so3
+from ahrsd.samples import Array
+
+#: (5, 3, 3) directions of the soft iron that keep its trace: xx - zz, yy - zz, xy, xz, yz
+TRACELESS = np.zeros((5, 3, 3))
+TRACELESS[0, [0, 2], [0, 2]] = TRACELESS[1, [1, 2], [1, 2]] = 1.0, -1.0
+for _at, (_i, _j) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
+    TRACELESS[_at, _i, _j] = TRACELESS[_at, _j, _i] = 1.0
+TRACELESS.flags.writeable = False
+
+#: ordinary deviation of a coefficient, of functions of unit size; source: `diagnosis/one_model/
+#: priors.py: ORDINARY` (a test holds them to it). Gauss; gauss and rad/s at 1 rad/s; s; gauss
+BY_DIRECTION, FIELD_BY_RATE, BY_RATE_SQUARED, BY_CHANGE = 7.66e-3, 7.4e-4, 1.42e-3, 1.23e-3
+COURSE = 7.75e-3
+
+
+def harmonics(field_b: Array) -> Array:
+    """(N, 12) harmonics of degree 2 and 3 of a direction, of mean square 1 on the sphere."""
+    x, y, z = (field_b / np.maximum(np.linalg.norm(field_b, axis=1, keepdims=True), 1e-300)).T
+    second = [x * y, y * z, z * x, (x**2 - y**2) / 2, (3 * z**2 - 1) / (2 * np.sqrt(3))]
+    third = [
+        x * y * z * 2,
+        z * (x**2 - y**2),
+        x * (5 * z**2 - 1) / np.sqrt(10),
+        y * (5 * z**2 - 1) / np.sqrt(10),
+        z * (5 * z**2 - 3) / np.sqrt(15),
+        x * (x**2 - 3 * y**2) / np.sqrt(6),
+        y * (3 * x**2 - y**2) / np.sqrt(6),
+    ]
+    return np.column_stack(
+        [np.sqrt(15.0) * np.array(second).T, np.sqrt(105.0 / 4) * np.array(third).T]
+    )
+
+
+def squares(rate: Array) -> Array:
+    """(N, 6) products of the rates, less nothing: a mean is a bias, which the calibration has."""
+    x, y, z = rate.T
+    return np.column_stack([x * x, y * y, z * z, x * y, y * z, z * x])
+
+
+def of_change(change_b: Array) -> Array:
+    """(N, 3, 8) a matrix on the field's change (N, 3), without what is alike on all axes: that is
+    a delay."""
+    matrix = np.concatenate([TRACELESS, so3.skew(np.eye(3))])
+    return np.asarray(np.einsum("aij,nj->nia", matrix, change_b))
+
+
+def on_each_axis(functions: Array) -> Array:
+    """(N, 3, 3 k) each of functions (N, k) along each axis of the sensor."""
+    flat = np.einsum("nk,ia->nika", functions, np.eye(3))
+    return np.asarray(flat.reshape(len(functions), 3, -1))
+
+
+def courses(time_s: Array, modes: int) -> Array:
+    """(N, modes) cosines of mean square 1 over the times, of 1 half wave, 2 and so on."""
+    since = (time_s - time_s.min()) / max(float(np.ptp(time_s)), 1e-9)
+    return np.asarray(np.sqrt(2.0) * np.cos(np.pi * since[:, None] * np.arange(1, modes + 1)))
