@@ -22,7 +22,7 @@ TRACELESS.flags.writeable = False
 
 #: ordinary deviation of a coefficient, of functions of unit size; source: `diagnosis/one_model/
 #: priors.py: ORDINARY` (a test holds them to it). Gauss; gauss and rad/s at 1 rad/s; s; gauss
-BY_DIRECTION, FIELD_BY_RATE, BY_RATE_SQUARED, BY_CHANGE = 7.66e-3, 7.4e-4, 1.42e-3, 1.23e-3
+BY_DIRECTION, FIELD_BY_RATE, BY_RATE_SQUARED, BY_CHANGE = 2.90e-3, 7.4e-4, 1.42e-3, 1.23e-3
 COURSE = 7.75e-3
 
 

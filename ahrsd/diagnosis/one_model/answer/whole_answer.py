@@ -72,15 +72,14 @@ def whole_answer(
         *pictures.contributions(all_sets, answer),
         *pictures.contributions(fast.all_sets, fast.answer),
     ]
-    odds = answer.log_odds, fast.answer.log_odds
-    surest = max(*odds, remainder_nats, fast.hum.evidence_nats, 0.0)
+    odds = answer.log_odds, fast.answer.log_odds, remainder_nats, fast.hum.evidence_nats, 0.0
     counted = len(named) > len(told)
     said = support.doubts(told) if something else support.nearest(answer, all_sets)
     return Diagnosis(
         recording="",
         baseline=baseline(start),
         mismatch=something,
-        p_value=0.0 if counted else float(np.exp(-surest)),
+        p_value=0.0 if counted else float(np.exp(-max(odds))),
         findings=named,
         unexplained=left,
         posterior_predictive=_checked(residuals, maps, fast.answer, quickly),
