@@ -130,10 +130,15 @@ class Fleet:
             if self.cluster is None
             else ["--cluster", self.cluster.address]
         )
-        with self.out.with_suffix(".log").open("ab") as log:
-            self.driver = subprocess.Popen(
-                [*self.command, *place, *options], stdout=log, stderr=log, env=ENVIRONMENT
-            )
+        # a person's shell lets Ctrl-C through; whoever runs the tests may ignore it
+        inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            with self.out.with_suffix(".log").open("ab") as log:
+                self.driver = subprocess.Popen(
+                    [*self.command, *place, *options], stdout=log, stderr=log, env=ENVIRONMENT
+                )
+        finally:
+            signal.signal(signal.SIGINT, inherited)
         self.starts += 1
 
     @property
