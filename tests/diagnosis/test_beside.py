@@ -67,6 +67,7 @@ def test_a_misalignment_is_named_beside_a_room_with_its_value():
     assert found.unexplained.detected
 
 
+@pytest.mark.slow
 def test_a_sharp_step_is_named_beside_a_room_and_a_change_like_the_others_is_not():
     track = room()
     later = (track.time_s >= 83.0)[:, None]

@@ -49,6 +49,7 @@ print(json.dumps(kept))
 
 
 @pytest.mark.benchmark
+@pytest.mark.slow
 def test_unplugging_leaks_nothing(tmp_path):
     """In a process of its own: the memory of one that has run a thousand tests moves by itself."""
     path = {"PYTHONPATH": os.pathsep.join([str(BENCHMARKS), *filter(None, sys.path)])}

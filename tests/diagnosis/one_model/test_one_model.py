@@ -12,7 +12,6 @@ from test_resting import standing, warming
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.forward import context_along, contribution
-from ahrsd.diagnosis.logged import with_columns_as_logged
 from ahrsd.diagnosis.model_file import from_text, of_diagnosis, to_text
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import NothingToFit
@@ -134,20 +133,6 @@ def test_half_a_step_of_delay_is_told_with_what_would_tell_it_from_a_lag():
     assert [share.effect for share in one.alternatives] == ["mag_time_lag"]
     assert one.confidence + one.alternatives[0].confidence == pytest.approx(1.0, abs=1e-6)
     assert "two rates" in one.separate_from
-
-
-def test_a_column_with_a_hole_names_its_cause():
-    name = "motor_current_field"
-    one = made(Trial(seed=32, effects=((name, 1.0),), samples=2500, rate_hz=12.5))
-    amps = one.track.covariates["motor_current_a"]
-    t = one.track.time_s - one.track.time_s[0]
-    holed = np.where((t > 60.0) & (t < 90.0), np.nan, amps)
-    track = one.track.with_columns({**one.track.covariates, "motor_current_a": holed})
-    found = with_columns_as_logged(track, None, diagnose)
-    assert [each.effect for each in found.findings] == [name]
-    assert found.notes[0].startswith("column motor_current_a has no values in ")
-    _, value, _ = one.truth[0]
-    np.testing.assert_allclose([p.value for p in found.findings[0].parameters], value, rtol=0.1)
 
 
 @pytest.mark.parametrize(("name", "strength"), [("mag_low_pass", 3.0), ("gyro_time_lag", 2.0)])
