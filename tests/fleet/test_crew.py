@@ -81,8 +81,7 @@ def test_every_task_has_one_answer_and_failures_are_answers_too():
 
 def test_a_process_that_is_killed_costs_no_task_and_all_end_with_the_crew(tmp_path):
     found: list[int] = []
-    # a task that lay with the process at that moment is tried again after begin_s
-    with crew(Place(2), Limits(begin_s=10.0)) as workers:
+    with crew(Place(2), Limits()) as workers:
         for number, (task, answer) in enumerate(
             workers.map(partial(own_process, tmp_path), range(30), failed)
         ):
