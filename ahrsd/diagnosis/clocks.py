@@ -84,7 +84,7 @@ def suspects(course: Located, track: Track) -> list[tuple[float, str]]:
     return [(lag_s, name) for _, lag_s, name in sorted(found, reverse=True)]
 
 
-class Asked(Protocol):
+class ColumnEvidence(Protocol):
     """A field in the sensor's axes by one column at other times, against the readings.
 
     middle_s: time about which a clock drifts;  duration_s: of the recording
@@ -106,11 +106,11 @@ def clock_of(basis: Base, name: str, around_s: float) -> Late | None:
 
     basis: with the calibration known, and nothing that follows the column
     """
-    return clock_by(_InInnovations(basis, name), around_s)
+    return likeliest_clock(_EvidenceInInnovations(basis, name), around_s)
 
 
-def clock_by(asked: Asked, around_s: float) -> Late | None:
-    """The same by any model's own evidence."""
+def likeliest_clock(asked: ColumnEvidence, around_s: float) -> Late | None:
+    """The same by the evidence of any model, sought round a lag, s."""
     coarse = np.arange(around_s - COARSE_S[0], around_s + COARSE_S[0] + 0.1, COARSE_S[1])
     at, _ = _best(asked, [(float(lag), 0.0) for lag in coarse])
     asked.quieten(at)
@@ -130,7 +130,9 @@ def clock_by(asked: Asked, around_s: float) -> Late | None:
     return Late(asked.column, round(at[0], 3), at[1], asked.middle_s)
 
 
-def _best(asked: Asked, clocks: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], float]:
+def _best(
+    asked: ColumnEvidence, clocks: Sequence[tuple[float, float]]
+) -> tuple[tuple[float, float], float]:
     """The (lag, drift) that explains most, and its nats."""
     found = asked.nats(clocks)
     k = int(np.argmax(found))
@@ -145,7 +147,7 @@ def at_clock(track: Track, column: str, clock: tuple[float, float], middle_s: fl
     return np.asarray(course - course.mean())
 
 
-class _InInnovations:
+class _EvidenceInInnovations:
     """A field in the sensor's axes by one column at other times, against the innovations."""
 
     def __init__(self, basis: Base, name: str) -> None:

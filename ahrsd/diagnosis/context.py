@@ -188,7 +188,9 @@ def rate_by_others(rate: Array, smooth: Array, width: float) -> Array:
     impulse[middle] = 1.0
     once = gaussian(impulse, width)
     own = float((2 * once - gaussian(once, width))[middle, 0])
-    return np.asarray((smooth - own * rate) / (1.0 - own))
+    others = (smooth - own * rate) / (1.0 - own)
+    # an axis that keeps its mean has no part of a row in it
+    return np.where(np.ptp(smooth, axis=0) > 0.0, others, smooth)
 
 
 def bandwidth_hz(rate: Array, runs: Sequence[slice], dt_s: float, sigma: float) -> float:

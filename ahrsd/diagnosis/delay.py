@@ -13,8 +13,8 @@ would be off by the acceleration times a quarter of a step squared, half of what
 of a lag of some milliseconds); only the gyro's small noise is mixed.
 
 Where the gyro's values are rates at instants (`instants`) the rate is straight from value to value,
-and half of a step of the lag is theirs.  Drawn through means it would be as far off as that is of a
-turn within a step: at 10 Hz a flight's turns had an error of 3 mG a step besides.
+and half of a step of the lag is theirs.  Drawn through means it would be off by as much
+as the rate changes within a step, which at 10 Hz on a flight is far more than its noise.
 """
 
 from __future__ import annotations

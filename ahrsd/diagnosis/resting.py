@@ -8,7 +8,7 @@ Warming up, time since power-on and wandering look nearly alike; they are told a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,6 +75,16 @@ def at_rest(fit: NullFit) -> bool:
     field = fit.filtered.nominal_b
     unit = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-300)
     return bool(1.0 - np.linalg.norm(unit.mean(axis=0)) < REST_SPREAD)
+
+
+def told_at_rest(library: Mapping[str, Effect], still: Sequence[Finding]) -> Mapping[str, Effect]:
+    """What a field that hardly turns can tell: the gyro, what rides with the sensor, what is quick.
+
+    still: what a gyro that stands tells of its bias, which is not asked of the field again
+    The delays stay: their rows make the column that a model always has.
+    """
+    asked = {k: one for k, one in library.items() if not (still and k in CAUSES)}
+    return {k: e for k, e in asked.items() if e.family == "gyro" or e.rides or e.quick or e.delay}
 
 
 def resting(context: Context, library: Mapping[str, Effect], limits: Limits) -> tuple[Finding, ...]:

@@ -20,8 +20,9 @@ for _at, (_i, _j) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
     TRACELESS[_at, _i, _j] = TRACELESS[_at, _j, _i] = 1.0
 TRACELESS.flags.writeable = False
 
-#: ordinary deviation of a coefficient, of functions of unit size; source: `diagnosis/one_model/
-#: priors.py: ORDINARY` (a test holds them to it). Gauss; gauss and rad/s at 1 rad/s; s; gauss
+#: middle ordinary deviation of a coefficient, of functions of unit size, of untouched recordings
+#: (`python tests/benchmarks/diagnosis/bench_remainder_priors.py`; their spread is in the diagnosis'
+#: `priors.py`). Gauss; gauss and rad/s at 1 rad/s; s; gauss
 BY_DIRECTION, FIELD_BY_RATE, BY_RATE_SQUARED, BY_CHANGE = 2.90e-3, 7.4e-4, 1.42e-3, 1.23e-3
 COURSE = 7.75e-3
 

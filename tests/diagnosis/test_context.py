@@ -169,6 +169,21 @@ def test_a_column_of_rates_has_nothing_of_its_own_rows_noise() -> None:
     assert np.std((others - clean)[inner]) < 0.3 * 0.05
 
 
+def test_an_axis_that_does_not_turn_keeps_its_mean_row_by_row() -> None:
+    """Its smooth rate has no part of a row in it: taken out, that row's noise would be put in."""
+    draw = np.random.default_rng(6)
+    t = np.arange(5000) / 25.0
+    clean = np.column_stack([np.full(len(t), 0.02), 0.2 * np.cos(0.3 * t), 0.2 * np.sin(0.2 * t)])
+    rate = clean + 0.02 * draw.standard_normal(clean.shape)
+    runs = (slice(0, len(t)),)
+    smooth = smoothed_rate(rate, runs, 0.04, 0.02)
+    assert np.ptp(smooth[:, 0]) == 0.0
+    width = 1.0 / (2 * np.pi * bandwidth_hz(rate, runs, 0.04, 0.02) * 0.04)
+    others = rate_by_others(rate, smooth, width)
+    np.testing.assert_array_equal(others[:, 0], smooth[:, 0])
+    assert np.all(np.std(others - smooth, axis=0)[1:] > 0.0)
+
+
 def test_quick_rates_are_not_taken_from_their_neighbours() -> None:
     rate = np.random.default_rng(1).standard_normal((100, 3))
     assert rate_by_others(rate, rate, 1.0) is rate

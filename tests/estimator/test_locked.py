@@ -9,7 +9,6 @@ import pieces
 import pytest
 from scipy.signal import lfilter
 
-from ahrsd.diagnosis.one_model import priors
 from ahrsd.estimator import locked
 from ahrsd.estimator.model_checks import LeftOver, widened
 from ahrsd.estimator.online import WHOLE, Estimator
@@ -131,15 +130,6 @@ def test_an_answer_is_no_less_wide_than_what_is_left_makes_it():
         "what is left follows the attitude: 1 mG; run `ahrsd diagnose` on the recording"
     )
     assert replace(left, nats=11.0).words == ""
-
-
-def test_columns_have_the_sizes_that_the_diagnosis_measured():
-    ordinary = priors.ORDINARY
-    assert ordinary["by_direction"].median == locked.BY_DIRECTION
-    assert ordinary["field_by_rate"].median == locked.FIELD_BY_RATE
-    assert ordinary["by_rate_squared"].median == locked.BY_RATE_SQUARED
-    assert ordinary["by_change"].median == locked.BY_CHANGE
-    assert ordinary["world_course"].median == locked.COURSE
 
 
 def test_columns_by_hand():

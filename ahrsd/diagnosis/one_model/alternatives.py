@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.locate import unit_columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Law, Sized
 from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw, course
 from ahrsd.diagnosis.values import Columns, Context
-from ahrsd.estimator.locked import harmonics
+from ahrsd.estimator.locked import harmonics, on_each_axis
 from ahrsd.samples import Array
 
 BY_RATE, QUICK = "free by_rate", "free quick"
@@ -25,12 +24,10 @@ _WAVES = 16
 
 def other_courses(context: Context) -> list[Component]:
     """Fields on the sensor that no name has: by its rate of turn, and quick in time."""
-    rate = context.rate_b_rad_s
+    rate = context.rowwise_rate_b_rad_s
     rate = rate / max(float(np.sqrt(np.mean(np.sum(rate**2, axis=1)))), 1e-12)
     size = np.linalg.norm(rate, axis=1)
-    functions = np.column_stack([rate, size, size**2])
-    axes = unit_columns(context, "sensor")
-    flat = np.einsum("nk,nia->nika", functions, axes).reshape(len(rate), 3, -1)
+    flat = on_each_axis(np.column_stack([rate, size, size**2]))
     unit = priors.COURSE_UNIT["sensor"]
     low, high = (np.array([np.log(unit * one)]) for one in priors.COURSE_SIZES)
     law = Sized(np.ones(flat.shape[2]), low, high, mean=float(np.log(unit)))
@@ -48,8 +45,8 @@ def varying(known: Component, added: Array, context: Context) -> list[Component]
     order = np.arange(1, _WAVES + 1)
     phase = np.pi * (time_s - time_s[0]) / (time_s[-1] - time_s[0])
     in_time = CourseLaw(order.astype(float), 1.0, most=priors.VARIES_MOST)
-    unit = context.smooth_b / np.linalg.norm(context.smooth_b, axis=1, keepdims=True)
-    degree_1_and_2 = np.column_stack([np.sqrt(3.0) * unit, harmonics(context.smooth_b)[:, :5]])
+    unit = context.field_b / np.linalg.norm(context.field_b, axis=1, keepdims=True)
+    degree_1_and_2 = np.column_stack([np.sqrt(3.0) * unit, harmonics(context.field_b)[:, :5]])
     low, high = (np.array([np.log(one)]) for one in (priors.COURSE_SIZES[0], priors.VARIES_MOST))
     in_attitude = Sized(np.ones(degree_1_and_2.shape[1]), low, high)
     factors: list[tuple[Array, Law]] = [

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.clocks import Late, at_clock, clock_by, suspects
+from ahrsd.diagnosis.clocks import Late, at_clock, likeliest_clock, suspects
 from ahrsd.diagnosis.effects.shapes import on_axes
 from ahrsd.diagnosis.locate import Located, segments
 from ahrsd.diagnosis.one_model import priors
@@ -33,7 +33,7 @@ def wrong_clock(found: Judged) -> Late | None:
         return None
     asked = suspects(_course(found), track)
     asked = [one for one in asked if abs(one[0]) > priors.ON_TIME_S]
-    return clock_by(_InModel(found, asked[0][1]), asked[0][0]) if asked else None
+    return likeliest_clock(_EvidenceBesideModel(found, asked[0][1]), asked[0][0]) if asked else None
 
 
 def _course(found: Judged) -> Located:
@@ -51,7 +51,7 @@ def _course(found: Judged) -> Located:
     return Located("sensor", 0.0, 0.0, value.size, 1.0, cut, waves @ value, deviation, flat, 0.0)
 
 
-class _InModel:
+class _EvidenceBesideModel:
     """A field by one column at other times, against the readings beside a model."""
 
     def __init__(self, found: Judged, column: str) -> None:

@@ -7,11 +7,11 @@ prepared -> null fit -> richest model, linearised -> search over sets -> lineari
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 from ahrsd.diagnosis.descent import NullFit
-from ahrsd.diagnosis.diagnosis import Diagnosis, Finding
+from ahrsd.diagnosis.diagnosis import Diagnosis
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
@@ -25,7 +25,7 @@ from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
 from ahrsd.diagnosis.one_model.search_rounds import Searched, answered
 from ahrsd.diagnosis.prepared import prepared
 from ahrsd.diagnosis.problem import Problem, problem_of
-from ahrsd.diagnosis.resting import CAUSES, at_rest, resting
+from ahrsd.diagnosis.resting import at_rest, resting, told_at_rest
 from ahrsd.diagnosis.track import Spec, Track
 
 
@@ -72,7 +72,7 @@ def _diagnosed(
             said = f"{clock.words}: its cause is judged at the sensor's time"
             return replace(at_its_time, notes=(said, *at_its_time.notes))
     still = resting(start.context(), library, LIMITS) if at_rest(start) else ()
-    searched = _told_at_rest(library, still) if at_rest(start) else library
+    searched = told_at_rest(library, still) if at_rest(start) else library
     found, fast = _found(problem, richest, start, searched)
     return whole_answer(
         asked,
@@ -84,15 +84,6 @@ def _diagnosed(
         spec_given=spec.sigma_mag_gauss is not None,
         simulated=simulated,
     )
-
-
-def _told_at_rest(library: Mapping[str, Effect], still: Sequence[Finding]) -> Mapping[str, Effect]:
-    """What a field that hardly turns can tell: the gyro, what rides with the sensor, what is quick.
-
-    still: what a gyro that stands tells of its bias, which is not asked of the field again
-    """
-    asked = {k: one for k, one in library.items() if not (still and k in CAUSES)}
-    return {k: e for k, e in asked.items() if e.family == "gyro" or e.rides or e.quick or e.delay}
 
 
 def _found(

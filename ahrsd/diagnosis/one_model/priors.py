@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import exp
 
+from ahrsd.estimator import locked
+
 
 @dataclass(frozen=True, slots=True)
 class Size:
@@ -32,13 +34,13 @@ class Size:
 RECORDINGS = 19
 #: deviation over the recording, gauss and rad/s; of the others of the coefficient of unit functions
 ORDINARY: Mapping[str, Size] = {
-    "world_course": Size(7.75e-03, 1.53, 0.1),  # gauss
+    "world_course": Size(locked.COURSE, 1.53, 0.1),  # gauss
     "gyro_course": Size(1.28e-03, 1.73, 0.05),  # rad/s
-    "by_direction": Size(2.90e-03, 1.74, 0.2),  # gauss: harmonics of degree 2 and 3
-    "by_change": Size(1.23e-03, 1.51, 0.03),  # s: axes that are late by different times
+    "by_direction": Size(locked.BY_DIRECTION, 1.74, 0.2),  # gauss: harmonics of degree 2 and 3
+    "by_change": Size(locked.BY_CHANGE, 1.51, 0.03),  # s: axes that are late by different times
     "bending": Size(5.58e-01, 1.10, 3.0),  # of the library's usual flexible mount
-    "by_rate_squared": Size(1.42e-03, 2.10, 0.03),  # rad/s at 1 rad/s
-    "field_by_rate": Size(7.40e-04, 1.72, 0.02),  # gauss at 1 rad/s
+    "by_rate_squared": Size(locked.BY_RATE_SQUARED, 2.10, 0.03),  # rad/s at 1 rad/s
+    "field_by_rate": Size(locked.FIELD_BY_RATE, 1.72, 0.02),  # gauss at 1 rad/s
     "by_force": Size(2.79e-03, 1.74, 0.03),  # rad/s at 1 g
 }
 #: of a gyro's matrix: how crooked it sits (1.2 degrees), scales and shears of its axes
