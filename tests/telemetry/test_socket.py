@@ -30,6 +30,30 @@ def served(live, tmp_path):
     public.close()
 
 
+class Asking:
+    """A program that speaks to the socket by itself, as any language may."""
+
+    def __init__(self, path):
+        self.socket = socket.socket(socket.AF_UNIX)
+        self.socket.settimeout(PATIENCE_S)
+        self.socket.connect(str(path))
+        self.lines = self.socket.makefile("rb")
+        assert self.record()["schema"] == SCHEMA
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.lines.close()
+        self.socket.close()
+
+    def say(self, data):
+        self.socket.sendall(data)
+
+    def record(self):
+        return json.loads(self.lines.readline())
+
+
 def until_status(path):
     """The first status with samples."""
     for _ in range(100):
@@ -86,12 +110,12 @@ def test_readers_that_never_read_cost_no_sample(served):
 def test_a_request_that_is_none_is_answered_and_the_connection_lives(tmp_path):
     server = SocketServer(tmp_path / "s")
     try:
-        with DaemonConnection(tmp_path / "s") as asked:
-            asked._socket.sendall(b'nonsense\n{"ask":"status"}\n')
-            assert "not a JSON object" in asked._line()["error"]
-            assert "only just begun" in asked._line()["error"]
-            asked._socket.sendall(b"x" * 5000)
-            assert asked._line()["error"] == "a line of over 4096 bytes"
+        with Asking(tmp_path / "s") as asked:
+            asked.say(b'nonsense\n{"ask":"status"}\n')
+            assert "not a JSON object" in asked.record()["error"]
+            assert "only just begun" in asked.record()["error"]
+            asked.say(b"x" * 5000)
+            assert asked.record()["error"] == "a line of over 4096 bytes"
     finally:
         server.close()
     assert not (tmp_path / "s").exists()
@@ -131,9 +155,9 @@ def test_no_daemon_is_one_clear_line(tmp_path):
 def test_a_slow_reader_gets_a_gap_record(tmp_path):
     server = SocketServer(tmp_path / "s", limit_bytes=20_000)
     try:
-        with DaemonConnection(tmp_path / "s") as asked:
-            asked._socket.sendall(b'{"ask": "watch", "of": ["status"]}\n')
-            assert asked._line() == {"watching": ["status"]}
+        with Asking(tmp_path / "s") as asked:
+            asked.say(b'{"ask": "watch", "of": ["status"]}\n')
+            assert asked.record() == {"watching": ["status"]}
             for number in range(600):
                 server.status({"number": number, "fill": "x" * 2000})
                 time.sleep(0.0005)
@@ -141,9 +165,8 @@ def test_a_slow_reader_gets_a_gap_record(tmp_path):
             while server.dropped == 0 and time.monotonic() < until:
                 time.sleep(0.01)
             seqs, gaps = [], []
-            asked._socket.settimeout(1.0)
             while not gaps:
-                record = asked._line()
+                record = asked.record()
                 (gaps if record["record"] == "gap" else seqs).append(record)
                 server.status({"number": -1})
     finally:
@@ -158,10 +181,10 @@ def test_clients_that_leave_while_records_come_end_nothing(tmp_path):
     try:
         server.status({"number": 0})
         for number in range(400):
-            with DaemonConnection(tmp_path / "s") as asked:
-                asked._socket.sendall(b'{"ask": "watch", "of": ["status"]}\n')
-                assert asked._line() == {"watching": ["status"]}
-                asked._socket.sendall(b'{"ask": "status"}\n')
+            with Asking(tmp_path / "s") as asked:
+                asked.say(b'{"ask": "watch", "of": ["status"]}\n')
+                assert asked.record() == {"watching": ["status"]}
+                asked.say(b'{"ask": "status"}\n')
                 server.status({"number": number})
             server.status({"number": number})
         with DaemonConnection(tmp_path / "s") as asked:

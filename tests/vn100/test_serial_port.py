@@ -14,6 +14,7 @@ import termios
 import threading
 import time
 import tty
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -362,8 +363,15 @@ def test_no_permission_names_the_group_to_join(monkeypatch, tmp_path, mode, memb
     status = os.stat_result((0o020000 | mode, 0, 0, 1, 0, 20, 0, 0, 0, 0))
     monkeypatch.setattr(serial_port.grp, "getgrgid", lambda _: group)
     monkeypatch.setattr(serial_port.os, "getgroups", lambda: [1000])
-    monkeypatch.setattr(serial_port, "_user", lambda: "ada")
+    ada = SimpleNamespace(pw_name="ada")
+    monkeypatch.setattr(serial_port.pwd, "getpwuid", lambda _: ada)
     monkeypatch.setattr(serial_port.Path, "stat", lambda _: status)
-    error = serial_port._why(str(port), PermissionError(errno.EACCES, "no"))
-    assert isinstance(error, PortForbidden)
-    assert str(error) == f"{port}: no permission; {advice}"
+    monkeypatch.setattr(serial_port, "holders", lambda _: ())
+
+    def refused(*_):
+        raise PermissionError(errno.EACCES, "no")
+
+    monkeypatch.setattr(serial_port.os, "open", refused)
+    with pytest.raises(PortForbidden) as caught:
+        SerialPort(port, 115200)
+    assert str(caught.value) == f"{port}: no permission; {advice}"
