@@ -360,7 +360,7 @@ def test_no_permission_names_the_group_to_join(monkeypatch, tmp_path, mode, memb
     port.write_bytes(b"")
     port.chmod(mode)
     group = grp.struct_group(("dialout", "x", 20, ["ada"] if member else []))
-    status = os.stat_result((0o020000 | mode, 0, 0, 1, 0, 20, 0, 0, 0, 0))
+    status = os.stat_result((0o020000 | mode, 0, 0, 1, 0, 20, 0, 0, 0, 0), {"st_rdev": 0x403})
     monkeypatch.setattr(serial_port.grp, "getgrgid", lambda _: group)
     monkeypatch.setattr(serial_port.os, "getgroups", lambda: [1000])
     ada = SimpleNamespace(pw_name="ada")
