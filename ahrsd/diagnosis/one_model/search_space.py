@@ -41,7 +41,7 @@ def best_at(
         here = known | real if was_real else known
         starts = [here, known, here | {COURSES[0]}, here | set(COURSES[:2]) - real]
     if not (known and was_real):
-        starts += [frozenset([key]) for key in _offered(all_sets, space, all_sets.judge(()))]
+        _offered(all_sets, space, all_sets.judge(()))
     found = searched(all_sets, space, starts)
     if not all_sets.is_real(found[0].names):
         new = [found[0].names | {key} for key in _offered(all_sets, space, found[0])]
