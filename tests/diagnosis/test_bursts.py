@@ -40,12 +40,10 @@ def quiet() -> Track:
     return replace(made(Trial(seed=8, samples=6000)).track, covariates={})
 
 
-def test_bursts_are_located_and_not_named(quiet: Track) -> None:
+def test_bursts_are_located_and_not_named(quiet: Track, ask) -> None:
     times = np.array([31.0, 62.0, 75.5, 120.0, 171.0, 203.0])
     on = np.any(np.abs(quiet.time_s[:, None] - times) < 0.6, axis=1)[:, None]
-    answer = diagnose(
-        replace(quiet, mag_b_gauss=quiet.mag_b_gauss + on * np.array([4e-3, 0, -3e-3]))
-    )
+    answer = ask(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + on * np.array([4e-3, 0, -3e-3])))
     assert answer.findings == ()
     where = answer.unexplained.where
     assert where is not None

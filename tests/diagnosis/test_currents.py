@@ -49,9 +49,9 @@ def test_a_logged_current_alone_is_named(shape: str, seed: int) -> None:
 @pytest.mark.parametrize(
     "shape", ["square", "quick square", "pulses", pytest.param("levels", marks=pytest.mark.slow)]
 )
-def test_an_unlogged_current_is_one_source_on_the_vehicle(shape: str) -> None:
+def test_an_unlogged_current_is_one_source_on_the_vehicle(shape: str, ask) -> None:
     track = track_of(experiment("wam", seed=6, samples=3000))
-    found = diagnose(_disturbed(track, 0.3 * SHAPES[shape](track.time_s), logged=False))
+    found = ask(_disturbed(track, 0.3 * SHAPES[shape](track.time_s), logged=False))
     assert found.findings == ()
     where = found.unexplained.where
     assert where is not None

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.facts import spans_of
 from ahrsd.diagnosis.ringing import ringing_rows
 
@@ -40,10 +39,10 @@ def test_a_swing_is_loud_and_noise_that_is_louder_slower_or_wilder_is_not() -> N
     assert np.abs(np.array(found)[:, 0] / 10.0 - TIMES_S).max() < 1.5
 
 
-def test_what_rings_on_the_sensor_is_located_and_not_named() -> None:
+def test_what_rings_on_the_sensor_is_located_and_not_named(ask) -> None:
     quiet = replace(made(Trial(seed=8, samples=6000)).track, covariates={})
     field = np.outer(rung(quiet.time_s), [1.5e-3, -1.0e-3, 1.2e-3])
-    answer = diagnose(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + field))
+    answer = ask(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + field))
     assert answer.findings == ()
     assert answer.unexplained.detected
     where = answer.unexplained.where

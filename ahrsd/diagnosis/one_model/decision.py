@@ -255,6 +255,7 @@ def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
         asked = priors.ODDS_REAL
     if one.row is None:
         return asked
+    asked = max(asked, priors.BESIDE_UNKNOWN * all_sets.unknown_nats)
     unknown = [
         other for other in best.names - frozenset(all_sets.remainder)
         if (course := all_sets.component(other)).row is None
@@ -518,7 +519,8 @@ def _other(all_sets: Hypotheses, best: Hypothesis, keys: Sequence[str], odds: fl
     time_s = context.track.time_s
     at = np.linspace(time_s[0], time_s[-1], _PIECES)
     course = np.column_stack([np.interp(at, time_s, column) for column in turned.T])
-    return _described(at, course, one.frame, odds, ((float(time_s[0]), float(time_s[-1])),))
+    whole = ((float(time_s[0]), float(time_s[-1])),)
+    return _described(at, course, one.frame, odds, one.setting.get("spans_s", whole))
 
 
 def _described(

@@ -100,5 +100,8 @@ def _found(
 
 
 def _quick(found: Searched, library: Mapping[str, Effect]) -> Quick:
-    real = found.all_sets.is_real(found.answer.best.names)
-    return quick(found.all_sets.made, found.answer.best, library, real=real)
+    answer = found.answer
+    real = found.all_sets.is_real(answer.best.names)
+    switches = any(key in found.space.sources for key in answer.unknown)
+    nats = answer.unexplained.evidence_nats if switches else 0.0
+    return quick(found.all_sets.made, answer.best, library, real=real, source_nats=nats)

@@ -51,6 +51,7 @@ class Hypotheses:
     forms: key of what a component leaves of its form, which comes and goes with it
     beside_delay: effects of which a delay is a part: they are asked beside it, not in its place
     real: whether all sets are of a recording that leaves what real ones do, whatever is in them
+    unknown_nats: evidence of a source that switches and was taken out: a rest of it is left
     """
 
     made: Linearised
@@ -61,6 +62,7 @@ class Hypotheses:
     beside_delay: frozenset[str] = frozenset()
     judged: dict[Names, Hypothesis] = field(default_factory=dict)
     real: bool = False
+    unknown_nats: float = 0.0
 
     def component(self, key: str) -> Component:
         """By its key."""
@@ -210,6 +212,8 @@ class Space:
     """What a search may put into a set: candidates by effect, and free courses.
 
     finer: neighbours of a setting;  form: what a component leaves of its form;  steps_at: of a time
+    sources: that switch, of which one at most is in a set, and beside a remainder none: how large
+             they are in rooms is not measured
     """
 
     effects: dict[str, list[str]]
@@ -217,6 +221,7 @@ class Space:
     finer: Callable[[Component, int], list[Component]]
     form: Callable[[Component], Component | None]
     steps_at: Callable[[float], list[Component]]
+    sources: list[str] = field(default_factory=list)
 
 
 def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> list[Hypothesis]:
@@ -257,8 +262,10 @@ def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
     out = [all_sets.without(names, key) for key in own]
     courses = [key for key in space.courses if key not in names]
     out += [names | {key} for key in courses]
-    rest = frozenset(all_sets.remainder)
-    out.append(names - rest if rest <= names else names | rest)
+    rest, sources = frozenset(all_sets.remainder), frozenset(space.sources)
+    if not all_sets.is_real(names):
+        out += [names - sources | {key} for key in space.sources if key not in names]
+    out.append(names - rest if rest <= names else (names - sources) | rest)
     bare = names - set(space.courses)
     for base in {names, bare}:
         ranked = asked(all_sets, space, base, here)

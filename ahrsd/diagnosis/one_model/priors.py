@@ -88,6 +88,16 @@ COURSE_SIZES = (1e-2, 5e2)
 COURSE_CORNERS = (1.0, 40.0)
 #: corner, in half waves a recording, below which a course is a drift: a walk has one
 DRIFT_CORNER = 3.0
+#: of a source that comes and goes: s that it is on and off at a time, of which its course is free
+#: in such pieces; half waves a second between which its corner is
+SPELL_S, BETWEEN_S, SPELL_PIECE_S, SPELL_CORNERS = 2.0, 20.0, 0.2, (0.1, 10.0)
+#: spells of it: fewer is something that happened; part of the time that it is on, beyond which it
+#: does not come and go; and half waves of all of them, at most
+FEWEST_SPELLS, MOST_ON, MOST_WAVES = 2, 0.3, 100
+#: how often what switches is outside of the vehicle;  source: the rules' three nats
+SWITCHES_OUTSIDE = 0.05
+#: square of a jump of the mean, in its deviations, of three axes: one in 1e6 by chance
+JUMPS = 31.0
 #: how many times its usual scale an effect is, evenly in the logarithm
 EFFECT_SIZES = (1e-2, 10.0)
 #: the same where candidates are only ranked

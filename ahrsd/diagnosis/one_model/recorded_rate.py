@@ -56,18 +56,25 @@ class Quick:
 
 
 def quick(
-    made: Linearised, best: Hypothesis, library: Mapping[str, Effect], *, real: bool
+    made: Linearised,
+    best: Hypothesis,
+    library: Mapping[str, Effect],
+    *,
+    real: bool,
+    source_nats: float = 0.0,
 ) -> Quick:
     """The quick effects beside a set that was found at the working rate.
 
     real: whether that set leaves what real recordings do: then a column has to tell, for a room has
           alternating fields of its own
+    source_nats: evidence of a source in that set that switches
     """
     point = at_recorded_rate(moved(made, best.keys, best.at))
     fast, all_sets, space, found = _searched(point, library, real=real)
     for _ in range(LEVELLED if found.names else 0):  # rows far off for what is found are not now
         point = relevelled(fast, found.keys, found.at)
         fast, all_sets, space, found = _searched(point, library, real=real)
+    all_sets.unknown_nats = source_nats
     answer = decision.decided(all_sets, space, found, library)
     slower = None
     if answer.findings:

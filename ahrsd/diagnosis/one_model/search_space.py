@@ -18,6 +18,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
 )
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, Space, searched
 from ahrsd.diagnosis.one_model.rich import Judged, psi_by_key
+from ahrsd.diagnosis.one_model.switching import switching
 
 COURSES = ("free sensor", "free world", "free gyro")
 #: settings that an onset which was sought finely counts for at least
@@ -39,8 +40,22 @@ def best_at(
     if known:
         here = known | real if was_real else known
         starts = [here, known, here | {COURSES[0]}, here | set(COURSES[:2]) - real]
+    if not (known and was_real):
+        _offered(all_sets, space, all_sets.judge(()))
     found = searched(all_sets, space, starts)
+    if not all_sets.is_real(found[0].names):
+        new = [found[0].names | {key} for key in _offered(all_sets, space, found[0])]
+        if new:
+            found = searched(all_sets, space, [found[0].names, *new])
     return all_sets, space, found[0]
+
+
+def _offered(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[str]:
+    """Keys of the sources that switch as a set leaves them, put among what may be in one."""
+    new = switching(all_sets, here)
+    all_sets.made.add(new)
+    space.sources.extend(one.key for one in new if one.key not in space.sources)
+    return [one.key for one in new]
 
 
 def space_at(
