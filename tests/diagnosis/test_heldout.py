@@ -127,19 +127,35 @@ def test_what_a_room_hides_of_a_step_is_not_known_from_the_rest_after_it() -> No
     assert not _alone(harmless, np.array([0.0, 1.1e4, 1.4e4, 20.0, 1.1e4]), 3, 13.0)
 
 
-def test_a_field_that_jumps_is_held_out_by_the_second(made, track, monkeypatch):
-    """The filter has followed it before a stretch is over: no stretch knows it for another one."""
-    monkeypatch.setattr(findings, "gain_of", lambda *_, **__: None)
+@pytest.fixture(scope="module")
+def jumped(made, track):
+    """The world's field jumps by a milligauss at 90 s."""
     jump = 1e-3 * np.array([0.6, -0.5, 0.6])
     turned = np.swapaxes(fit_null(track).context().R_nb, 1, 2) @ jump
     read = turned @ true_model(made).soft_iron.T
     later = (track.time_s - track.time_s[0] > 90.0)[:, None]
-    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + later * read))
+    return replace(track, mag_b_gauss=track.mag_b_gauss + later * read)
+
+
+def test_a_field_that_jumps_has_its_name_and_its_time(jumped, ask):
+    """For some seconds it looks like a field of another strength."""
+    found = ask(jumped)
+    (step,) = found.findings
+    assert step.effect == "field_step"
+    assert step.setting["onset_s"] == pytest.approx(90.0, abs=0.5)
+    assert step.confidence > 0.9
+    assert not found.unexplained.detected
+
+
+def test_a_field_that_jumps_is_held_out_by_the_second(jumped, track, monkeypatch):
+    """The filter has followed it before a stretch is over: no stretch knows it for another one."""
+    monkeypatch.setattr(findings, "gain_of", lambda *_, **__: None)
+    found = diagnose(jumped)
     (step,) = found.findings
     assert step.effect == "field_step"
     assert not found.unexplained.detected
     gained = step.heldout.nll_gain_per_sample * len(track)
     assert gained == pytest.approx(500.0, rel=0.2)
     monkeypatch.setattr(findings, "LONELY_BLOCKS", 1.0)  # asked as of what shows all the time
-    (again,) = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + later * read)).findings
+    (again,) = diagnose(jumped).findings
     assert again.heldout.nll_gain_per_sample < 0.0

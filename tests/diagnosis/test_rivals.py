@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis import rivals
+from ahrsd.diagnosis.diagnosis import Diagnosis
 from ahrsd.diagnosis.discrepancy import UNIT_GAUSS
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.engine import diagnose
@@ -30,6 +32,8 @@ from ahrsd.diagnosis.rivals import (
 from ahrsd.diagnosis.search import State, formed_basis_of, refitted, survey
 from ahrsd.diagnosis.together import projected
 from ahrsd.diagnosis.track import Spec, Track
+
+Ask = Callable[[Track], Diagnosis]
 
 
 @pytest.fixture(scope="module")
@@ -132,12 +136,12 @@ def test_a_gyro_bias_that_comes_and_goes_is_no_pair_of_steps(track: Track) -> No
 
 
 @pytest.mark.parametrize("seed", [4, pytest.param(8, marks=pytest.mark.slow)])
-def test_a_gyro_that_is_off_for_a_while_is_no_object_outside(seed: int) -> None:
+def test_a_gyro_that_is_off_for_a_while_is_no_object_outside(seed: int, ask: Ask) -> None:
     """It was a field that the vehicle passed, or a jump of the field, and something else beside."""
     quiet = made(Trial(seed=seed, samples=7500, rate_hz=25.0, scenario="mam", noise="white")).track
     inside = (quiet.time_s > 150.0) & (quiet.time_s < 190.0)
     spell = inside[:, None] * np.array([-1.7e-4, 2.0e-4, 1.4e-4])
-    found = diagnose(replace(quiet, gyro_b_rad_s=quiet.gyro_b_rad_s + spell))
+    found = ask(replace(quiet, gyro_b_rad_s=quiet.gyro_b_rad_s + spell))
     assert found.findings == ()
     assert found.unexplained.where.frame == "gyro"
     (begin_s, end_s), *_ = found.unexplained.where.intervals_s
@@ -145,9 +149,11 @@ def test_a_gyro_that_is_off_for_a_while_is_no_object_outside(seed: int) -> None:
     assert end_s == pytest.approx(190.0, abs=6.0)
 
 
-def test_a_scale_that_differs_between_the_senses_of_rotation_has_no_name(track: Track) -> None:
+def test_a_scale_that_differs_between_the_senses_of_rotation_has_no_name(
+    track: Track, ask: Ask
+) -> None:
     added = np.abs(track.gyro_b_rad_s) * np.array([3e-3, -4e-3, 5e-3])
-    found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + added))
+    found = ask(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + added))
     assert found.findings == ()
     assert found.unexplained.detected
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.effects.base import Readings, readings_of
+from ahrsd.diagnosis.diagnosis import Diagnosis
+from ahrsd.diagnosis.effects.base import Readings, Setting, readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.track import Track
+
+Ask = Callable[[Track], Diagnosis]
 
 
 def _quiet(seed: int) -> tuple[Track, Readings]:
@@ -20,14 +24,12 @@ def _quiet(seed: int) -> tuple[Track, Readings]:
     return track, readings_of(fit_null(track, walk=False).context())
 
 
-def test_a_compensation_on_board_is_named_once_with_its_part() -> None:
+def test_a_compensation_on_board_is_named_once_with_its_part(ask: Ask) -> None:
     track, readings = _quiet(3)
     effect = EFFECTS["onboard_calibration_active"]
     setting = {"onset_s": float(track.time_s[0]), "time_constant_s": 105.0}
     changed = effect.simulate(readings, np.array([0.3, 0.02]), setting).mag_b_gauss
-    answer = diagnose(
-        replace(track, mag_b_gauss=track.mag_b_gauss + changed - readings.mag_b_gauss)
-    )
+    answer = ask(replace(track, mag_b_gauss=track.mag_b_gauss + changed - readings.mag_b_gauss))
     assert [one.effect for one in answer.findings] == ["onboard_calibration_active"]
     found = answer.findings[0]
     assert abs(found.parameters[0].value - 0.3) < 0.02
@@ -70,8 +72,28 @@ def test_a_start_up_between_the_grids_time_constants() -> None:
     assert np.abs(got - value).max() < 1e-4
 
 
-def test_a_slow_pulsation_of_the_outside_field_is_one_name_where_positions_are_logged() -> None:
-    """Without them it may as well be the way through a field that differs from place to place."""
+def test_a_slow_pulsation_of_the_outside_field_is_one_name_where_positions_are_logged(
+    ask: Ask,
+) -> None:
+    pulsed, setting = _pulsed()
+    logged = made(Trial(seed=5, samples=7000)).track.covariates
+    placed = {name: values for name, values in logged.items() if name.startswith("position")}
+    answer = ask(replace(pulsed, covariates=placed))
+    assert [one.effect for one in answer.findings] == ["geomagnetic_drift"]
+    assert not answer.unexplained.detected
+    assert abs(answer.findings[0].setting["length_s"] / setting["length_s"] - 1) < 0.1
+
+
+def test_a_slow_pulsation_may_be_a_way_where_no_position_is_logged() -> None:
+    """Through a field that differs from place to place."""
+    nowhere = diagnose(_pulsed()[0])
+    assert nowhere.findings == ()
+    assert nowhere.unexplained.detected
+    assert nowhere.unexplained.where.frame == "world"
+
+
+def _pulsed() -> tuple[Track, Setting]:
+    """The world's field swings by half a wave in a little more than half of the recording."""
     track, readings = _quiet(5)
     effect = EFFECTS["geomagnetic_drift"]
     span_s = float(np.ptp(track.time_s))
@@ -79,16 +101,7 @@ def test_a_slow_pulsation_of_the_outside_field_is_one_name_where_positions_are_l
     setting = {**wave, "length_s": 0.55 * span_s, "turn_deg": 67.0}
     changed = effect.simulate(readings, np.array([2.5e-3, -1e-3, 2e-3]), setting).mag_b_gauss
     pulsed = replace(track, mag_b_gauss=track.mag_b_gauss + changed - readings.mag_b_gauss)
-    logged = made(Trial(seed=5, samples=7000)).track.covariates
-    placed = {name: values for name, values in logged.items() if name.startswith("position")}
-    answer = diagnose(replace(pulsed, covariates=placed))
-    assert [one.effect for one in answer.findings] == ["geomagnetic_drift"]
-    assert not answer.unexplained.detected
-    assert abs(answer.findings[0].setting["length_s"] / setting["length_s"] - 1) < 0.1
-    nowhere = diagnose(pulsed)
-    assert nowhere.findings == ()
-    assert nowhere.unexplained.detected
-    assert nowhere.unexplained.where.frame == "world"
+    return pulsed, setting
 
 
 @pytest.mark.slow

@@ -8,6 +8,9 @@ name that is there explains no more than by chance.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import replace
+
 import numpy as np
 
 from ahrsd.diagnosis.one_model import priors
@@ -34,6 +37,19 @@ def other_courses(context: Context) -> list[Component]:
     odds = float(np.log(priors.COURSE))
     by_rate = Component(BY_RATE, "sensor", Columns(mag=flat), law, odds)
     return [by_rate, course(context, "sensor", quick=QUICK)]
+
+
+def lone_parts(all_parts: Iterable[Component]) -> list[Component]:
+    """Parts of what every recording leaves, each of any size and beside none of the others.
+
+    Where one is there and not the others it is no ordinary remainder: a source that no name has.
+    """
+    found = []
+    for one in all_parts:
+        if isinstance(one.law, Sized):
+            law, odds = replace(one.law, spread=0.0), float(np.log(priors.COURSE))
+            found.append(replace(one, key=f"free {one.key}", law=law, prior=odds))
+    return found
 
 
 def varying(known: Component, added: Array, context: Context) -> list[Component]:

@@ -18,9 +18,10 @@ from ahrsd.diagnosis.confound import separating_manoeuvre
 from ahrsd.diagnosis.delay import usual_step
 from ahrsd.diagnosis.diagnosis import Cost, Finding, Share, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.base import Effect, Setting
+from ahrsd.diagnosis.intervals import departures
 from ahrsd.diagnosis.locate import Frame, single_source, unit_columns
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.alternatives import form_keys, other_courses, varying
+from ahrsd.diagnosis.one_model.alternatives import form_keys, lone_parts, other_courses, varying
 from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
@@ -66,6 +67,7 @@ def decided(
     all_sets: Hypotheses, space: Space, best: Hypothesis, library: Mapping[str, Effect]
 ) -> Answer:
     """The answer of a search."""
+    best = _with_one_part(all_sets, space, best)
     best, rivals = _borne_out(all_sets, space, best)
     best, rivals = _beside_others(all_sets, space, best, rivals)
     best, rivals = _held_to_form(all_sets, space, best, rivals)
@@ -186,6 +188,21 @@ def _borne_out(
         best = _without(all_sets, space, best, key)
 
 
+def _with_one_part(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+    """The set with a part of what recordings leave in place of all of them, where that is likelier.
+
+    What has but one of them, and that far beyond the others, leaves nothing ordinary.
+    """
+    rest = frozenset(all_sets.remainder)
+    if all_sets.real or not rest & best.names or not space.courses:
+        return best
+    found = lone_parts(all_sets.component(key) for key in all_sets.remainder)
+    all_sets.made.add(found)
+    bare = best.names - rest
+    judged = [all_sets.judge(bare | {one.key}) for one in found]
+    return max((best, *judged), key=lambda one: one.score)
+
+
 def _names(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
     """Members that the library has, without the delay."""
     known = [key for key in best.names if all_sets.component(key).row is not None]
@@ -201,12 +218,14 @@ def _beside_others(
     """
     if not _names(all_sets, best) or not space.courses:
         return best, rivals
+    parts = lone_parts(all_sets.component(key) for key in all_sets.remainder)
     others = other_courses(all_sets.made.context)
-    all_sets.made.add(others)
+    all_sets.made.add([*parts, *others])
     wide, rest = best, frozenset(all_sets.remainder)
-    for one in others:
+    for one in (*others, *parts):
         more = wide.names | {one.key}
-        found = [all_sets.judge(names, wide) for names in {more, more - rest}]
+        tried = {more - rest} if one in parts else {more, more - rest}
+        found = [all_sets.judge(names, wide) for names in tried]
         wide = max((wide, *found), key=lambda each: each.score)
     if wide is best:
         return best, rivals
@@ -395,7 +414,8 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
     named_so = all_sets.component(rival).effect or rival
     if own.row is None or by_name[named_so] > by_name[mine]:
         # the scan knows sizes and noise but roughly: both as sets of their own
-        by_name[mine] = best.score - fewer.score
+        off = best.score - fewer.score - by_name[mine]
+        by_name = {name: nats + off for name, nats in by_name.items()}
         by_name[named_so] = all_sets.judge(fewer.names | {rival}, best).score - fewer.score
     for name, keys in space.effects.items():
         wider = all_sets.component(keys[0])
@@ -501,14 +521,17 @@ def size_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
 def _course(all_sets: Hypotheses, best: Hypothesis, key: str, odds: float) -> Unexplained:
     """A free course in time: its frame, its direction and its values."""
     one, time_s = all_sets.component(key), all_sets.made.context.track.time_s
-    value, _ = coefficients(all_sets, best, key)
-    modes = value.reshape(-1, 3)
-    at = np.linspace(time_s[0], time_s[-1], _PIECES)
+    modes, unsure = (part.reshape(-1, 3) for part in coefficients(all_sets, best, key))
+    edges = np.linspace(time_s[0], time_s[-1], _PIECES + 1)
+    at = (edges[1:] + edges[:-1]) / 2
     order = np.arange(1, len(modes) + 1)
     phase = np.pi * (at - time_s[0]) / (time_s[-1] - time_s[0])
-    course = np.cos(phase[:, None] * order) @ modes
-    whole = ((float(time_s[0]), float(time_s[-1])),)
-    return _described(at, course, one.frame, odds, whole)
+    waves = np.cos(phase[:, None] * order)
+    course = waves @ modes
+    deviation = np.sqrt(np.mean(waves**2 @ unsure**2, axis=1))
+    away = departures(edges, course, deviation, course)
+    spans = away or [(float(time_s[0]), float(time_s[-1]))]
+    return _described(at, course, one.frame, odds, tuple(spans))
 
 
 def _other(all_sets: Hypotheses, best: Hypothesis, keys: Sequence[str], odds: float) -> Unexplained:

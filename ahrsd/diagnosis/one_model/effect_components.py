@@ -14,6 +14,7 @@ from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.locate import Frame, unit_columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
+from ahrsd.diagnosis.settings import ANGLES, SCALES
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -29,7 +30,10 @@ TO_THE_DIGIT = 1e-12
 #: s between the times at which a logged cause is tried
 LATE_STEP_S = priors.LOGGED_LATE_S[-1] - priors.LOGGED_LATE_S[-2]
 #: parts of a recording's length, and factors, to which onsets and scales are sought
-_FINE = (1 / 40, 1 / 120, 1 / 400, 1 / 1200)
+_FINE = (1 / 40, 1 / 120, 1 / 400, 1 / 1200, 1 / 3600)
+
+#: degrees by which angles of a setting are first turned
+_TURN_DEG = 20.0
 
 
 def library_components(
@@ -175,10 +179,14 @@ def neighbours(setting: Setting, duration_s: float, round_: int) -> list[Setting
     if "late_s" in setting:
         late_s, step_s = float(setting["late_s"]), LATE_STEP_S / 2 ** (1 + round_)
         out += [{**setting, "late_s": round(late_s + way * step_s, 4)} for way in (-1, 1)]
-    for name in ("length_s", "time_constant_s", "radius_gauss"):
+    for name in SCALES:
         if name in setting:
-            factor = 1.5 ** (1.0 / (1 + round_))
+            factor = 1.5 ** (1.0 / 2**round_)
             out += [{**setting, name: float(setting[name]) * f} for f in (1 / factor, factor)]
+    for name in ANGLES:
+        if name in setting:
+            turn_deg, step_deg = float(setting[name]), _TURN_DEG / 2**round_
+            out += [{**setting, name: turn_deg + way * step_deg} for way in (-1, 1)]
     return out
 
 

@@ -108,6 +108,11 @@ class Linearised:
         Components that have their columns in common pass once.
         """
         unknown = [one for one in components if one.key not in self.seen]
+        had = {id(one.component.columns): one for one in self.seen.values()}
+        for one in unknown:
+            if id(one.columns) in had:
+                self.seen[one.key] = replace(had[id(one.columns)], component=one)
+        unknown = [one for one in unknown if one.key not in self.seen]
         first = {id(one.columns): one for one in reversed(unknown)}
         new = list(reversed(first.values()))
         parts = [one.columns for one in new]

@@ -20,7 +20,9 @@ from ahrsd.diagnosis.one_model.evidence import At, reached
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, Linearised
 from ahrsd.samples import Array
 
-BEAM, ASKED, MOST_MOVES, FINER = 2, 4, 8, 3
+BEAM, ASKED, MOST_MOVES = 2, 4, 8
+#: rounds in which settings are sought of what may be added, and on of what is there
+FINER, SHARPEST = 3, 7
 #: moments at which steps are proposed, and how far apart, of the recording's length
 MOMENTS, APART = 4, 0.02
 
@@ -246,7 +248,45 @@ def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> lis
             found = all_sets.compared(names, here, asked_for)
             if found is not None:
                 beams[real] = _best(all_sets, [*beams[real], found], real=real)
-    return sorted((*beams[False], *beams[True]), key=lambda one: -one.score)
+    ranked = sorted((*beams[False], *beams[True]), key=lambda one: -one.score)
+    best = exchanged(all_sets, space, ranked[0])
+    return [sharpened(all_sets, space, best), *ranked[1:]]
+
+
+def exchanged(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+    """The likeliest of a set and those with another name in place of one, while one is likelier.
+
+    A name is added beside noise that has swallowed the others; what it is, is told in its own.
+    """
+    for _ in range(MOST_MOVES):
+        names = [key for key in best.names if all_sets.component(key).row is not None]
+        bases = [best.names - {key} for key in names if key != LAG]
+        found = [base | {key} for base in bases for key in asked(all_sets, space, base, best)]
+        judged = [all_sets.judge(one, best) for one in found]
+        likelier = max((best, *judged), key=lambda one: one.score)
+        if likelier is best:
+            break
+        best = likelier
+    return best
+
+
+def sharpened(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+    """The set with onsets and scales of its names sought on where each is likelier.
+
+    Of what has a thousand nats a time constant that is off by a tenth leaves a hundred, and a free
+    course beside it explains them: it is sought without courses as well, which may then go.
+    """
+    for key in sorted(best.names):
+        if key == LAG or all_sets.component(key).row is None:
+            continue
+        tried = [best]
+        for rest in {best.names, best.names - set(space.courses)}:
+            fewer = all_sets.judge(rest - {key}, best)
+            scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
+            new = sought(all_sets, space, scan, key, range(FINER, SHARPEST))
+            tried.append(all_sets.judge(rest - {key} | {new}, best))
+        best = max(tried, key=lambda one: one.score)
+    return best
 
 
 def _best(all_sets: Hypotheses, found: Iterable[Hypothesis], *, real: bool) -> list[Hypothesis]:
@@ -345,11 +385,13 @@ def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
     )
 
 
-def sought(all_sets: Hypotheses, space: Space, scan: Beside, key: str) -> str:
+def sought(
+    all_sets: Hypotheses, space: Space, scan: Beside, key: str, rounds: Iterable[int] = range(FINER)
+) -> str:
     """The candidate with its onset and scale sought more and more finely."""
     made = all_sets.made
     worth = scan.worth([key])[key] + all_sets.component(key).prior
-    for round_ in range(FINER):
+    for round_ in rounds:
         near = space.finer(all_sets.component(key), round_)
         if not near:
             break

@@ -123,7 +123,9 @@ def _words(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
         return f"what {effect} stands in for"
     if one.row is not None:
         return f"one of the steps of a source that changes ({effect})"
-    return _WORDS.get(key, f"a course in time, free ({all_sets.component(key).frame})")
+    return _WORDS.get(
+        key.removeprefix("free "), f"a course in time, free ({all_sets.component(key).frame})"
+    )
 
 
 def _together(limits: Sequence[float]) -> float:
