@@ -3,9 +3,11 @@
 The filter takes the measured rates for those that turn the field.  Where the gyro's noise turns it
 by more from one reading to the next than the magnetometer scatters, that noise is in every column
 and every evidence (a regression on noisy regressors), and the law by which evidence is judged
-elsewhere is not the one it follows.  So its law is measured (a parametric bootstrap): the
-calibration that was fitted without any name is simulated along the recording's own motion, with its
-stamps, its columns and the noise that was fitted, and the same engine is asked about each copy.
+elsewhere is not the one it follows.  So its law is measured (a parametric bootstrap): the fitted
+calibration alone is simulated along the recording's own motion, with its stamps, its columns and
+the noise that was fitted, and the same engine is asked about each copy.  Calibration and noise are
+those of the fit without any name or beside the names, whose magnetometer is the quieter one: what a
+missing name leaves is no noise, and louder copies show more by chance.
 
 The motion is what the gyro's readings are expected to be without their noise (`wiener`), held by
 field and accelerometer.  Nothing is different in a copy, so whatever is told of one is chance.
@@ -62,7 +64,9 @@ def beyond_chance(
     told = _told_nats(found)
     if problem is None or start is None or told <= 0.0:
         return found
-    recorded, model = problem.recorded, model_at_rate(start.model, problem)
+    recorded = problem.recorded
+    models = [model_at_rate(start.model, problem), *([found.model] if found.model else [])]
+    model = max(models, key=lambda one: loudness(recorded, one))
     if loudness(recorded, model) < limits.chance_loud:
         return found
     truth, shown = motion_of(recorded, model), list[float]()
