@@ -2,12 +2,14 @@
 
 hygiene -> null fit -> survey -> (name -> joint refit -> survey)* -> prune -> swap
         -> what no name explains -> findings, or what this recording would have shown
+        -> beside a loud gyro: whether that is beyond chance
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from ahrsd.diagnosis import unknown
 from ahrsd.diagnosis.along_field import framed
 from ahrsd.diagnosis.beside import named_beside
 from ahrsd.diagnosis.bursts import bursts
+from ahrsd.diagnosis.chance import Answered, beyond_chance
 from ahrsd.diagnosis.cut_out import beside_brief
 from ahrsd.diagnosis.delays import DELAYS
 from ahrsd.diagnosis.descent import NullFit
@@ -76,10 +79,19 @@ def diagnose(
 
     Deterministic.  ValueError, one line, where nothing can be fitted.
     """
-    spec = spec or Spec()
+    ask = partial(
+        _answered, spec=spec or Spec(), library=library, limits=limits, recording=recording
+    )
+    return beyond_chance(track, ask, limits)
+
+
+def _answered(
+    track: Track, spec: Spec, library: Mapping[str, Effect], limits: Limits, recording: str
+) -> Answered:
+    """The answer, whatever is to be expected of it by chance."""
     asked = prepared(track)
     if (nothing := asked.stopped(recording, EFFECTS)) is not None:
-        return nothing
+        return Answered(nothing)
     problem, cold = problem_of(asked.put_right(), spec, library, limits)
     whole, lost = problem, lost_turns(problem.recorded, problem.cold)
     if lost:
@@ -93,7 +105,8 @@ def diagnose(
             lost, problem, (done, fast) = beside, other, again
     still = (HARDLY_TURNED,) if at_rest(done.start) else ()
     notes = (*asked.notes, *still, *done.state.problem.notes)
-    return _told(recording, problem, done, fast, asked.with_facts(lost), notes)
+    told = _told(recording, problem, done, fast, asked.with_facts(lost), notes)
+    return Answered(told, problem, done.start)
 
 
 def _named(problem: Problem, cold: NullModel) -> tuple[_Searched, Quick]:

@@ -37,6 +37,12 @@ class Limits:
     doubt:          what noise model and library do not know, by which every confidence is less:
                     about the share of names with all of the evidence that sealed rings found wrong
                     (docs/validation/blind-trials.md, "calibration error of the confidence")
+    chance_loud:    gyro beside magnetometer: turns of the field by its noise in a step, in the
+                    deviations of a reading, from which on evidence is held against simulations.
+                    1.0 at most in every real recording that was looked at, 4.7 where nothing was
+                    told to be something
+    chance_copies, chance_times: how many, and how many times the largest evidence of these must be
+                    surpassed: 1 in 126 of what chance makes does (`chance`)
     most_terms:     rounds of naming; real recordings beyond this are another model, not a repair
     """
 
@@ -57,6 +63,9 @@ class Limits:
     alone_nats: float = 9.0
     alone_p: float = 1e-4
     doubt: float = 0.01
+    chance_loud: float = 2.0
+    chance_copies: int = 5
+    chance_times: float = 4.0
     most_terms: int = 5
 
     def alone(self) -> Limits:

@@ -3,13 +3,16 @@
 prepared -> null fit -> richest model, linearised -> search over sets -> linearised there -> ...
          -> names, and what is left beyond the ordinary -> quick effects at the recorded rate
          -> what holds it against other readings, other times, other priors
+         -> beside a loud gyro: whether that is beyond chance
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
+from ahrsd.diagnosis.chance import Answered, beyond_chance
 from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.diagnosis import Diagnosis
 from ahrsd.diagnosis.effects.base import Effect
@@ -48,33 +51,38 @@ def diagnose(
     simulated: known to be no real recording, of which nothing is ordinary
     Deterministic.  ValueError, one line, where nothing can be fitted.
     """
-    told = _diagnosed(track, spec or Spec(), library, simulated=simulated, clocks=True)
-    return replace(told, recording=recording)
+    known = spec or Spec()
+    ask = partial(_answered, spec=known, library=library, simulated=simulated, clocks=True)
+    return replace(beyond_chance(track, ask), recording=recording)
 
 
-def _diagnosed(
+def _answered(
     track: Track, spec: Spec, library: Mapping[str, Effect], *, simulated: bool, clocks: bool
-) -> Diagnosis:
-    """The same.  clocks: whether a column may run by another clock than the sensor."""
+) -> Answered:
+    """The answer, whatever is to be expected of it by chance.
+
+    clocks: whether a column may run by another clock than the sensor
+    """
     asked = prepared(track)
     if (nothing := asked.stopped("", library)) is not None:
-        return nothing
+        return Answered(nothing)
     problem, start = begun(asked.put_right(), spec, library)
     if lost := lost_turns(problem.recorded, problem.cold):
         asked = asked.with_facts(lost)
         problem, start = begun(asked.put_right(), spec, library)
     richest = rich.richest(problem, start.filtered, library)
     if clocks and (clock := wrong_clock(richest)) is not None:
-        at_its_time = _diagnosed(
+        at_its_time = _answered(
             clock.moved(asked.track), spec, library, simulated=simulated, clocks=False
         )
-        if any(one.setting.get("covariate") == clock.column for one in at_its_time.findings):
+        moved = at_its_time.found
+        if any(one.setting.get("covariate") == clock.column for one in moved.findings):
             said = f"{clock.words}: its cause is judged at the sensor's time"
-            return replace(at_its_time, notes=(said, *at_its_time.notes))
+            return replace(at_its_time, found=replace(moved, notes=(said, *moved.notes)))
     still = resting(start.context(), library, LIMITS) if at_rest(start) else ()
     searched = told_at_rest(library, still) if at_rest(start) else library
     found, fast = _found(problem, richest, start, searched)
-    return whole_answer(
+    told = whole_answer(
         asked,
         start,
         found,
@@ -84,6 +92,7 @@ def _diagnosed(
         spec_given=spec.sigma_mag_gauss is not None,
         simulated=simulated,
     )
+    return Answered(told, problem, start)
 
 
 def _found(

@@ -1,0 +1,195 @@
+"""What is told beside a loud gyro, held against what the model alone shows there by chance.
+
+The filter takes the measured rates for those that turn the field.  Where the gyro's noise turns it
+by more from one reading to the next than the magnetometer scatters, that noise is in every column
+and every evidence (a regression on noisy regressors), and the law by which evidence is judged
+elsewhere is not the one it follows.  So its law is measured (a parametric bootstrap): the fitted
+calibration alone is simulated along the recording's own motion, with its stamps, its columns and
+the noise that was fitted, and the same engine is asked about each copy.  Calibration and noise are
+those of the fit without any name or beside the names, whose magnetometer is the quieter one: what a
+missing name leaves is no noise, and louder copies show more by chance.
+
+The motion is what the gyro's readings are expected to be without their noise (`wiener`), held by
+field and accelerometer.  Nothing is different in a copy, so whatever is told of one is chance.
+Evidence that is too large by an unknown factor has an exponential tail of unknown scale: it is t
+times the largest of n such with the chance n! / ((1 + t) ... (n + t)), whatever that scale: 1 in
+126 for four times the largest of five.  A copy of which nothing is told counts with what an engine
+keeps to itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ahrsd.diagnosis import forward, wiener
+from ahrsd.diagnosis.context import Given, attitude, build_context, smoothed_rate
+from ahrsd.diagnosis.descent import NullFit
+from ahrsd.diagnosis.diagnosis import Diagnosis, Finding, Unexplained
+from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.hygiene import would_have_shown
+from ahrsd.diagnosis.innovation import bearings, carried_along
+from ahrsd.diagnosis.limits import LIMITS, Limits
+from ahrsd.diagnosis.predictive import checks
+from ahrsd.diagnosis.problem import Problem, model_at_rate
+from ahrsd.diagnosis.track import Track
+from ahrsd.diagnosis.values import NullModel
+from ahrsd.samples import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answered:
+    """An engine's answer, with the calibration that it fitted before any name.
+
+    problem, start: None where nothing was fitted
+    """
+
+    found: Diagnosis
+    problem: Problem | None = None
+    start: NullFit | None = None
+
+
+def beyond_chance(
+    track: Track, ask: Callable[[Track], Answered], limits: Limits = LIMITS
+) -> Diagnosis:
+    """The answer about a track; beside a loud gyro only what is clearly beyond chance is told.
+
+    ask: an engine.  It is asked again for at most `limits.chance_copies` copies, only where
+    something is told and the gyro is loud; the seeds are 0, 1, 2 and so on
+    """
+    first = ask(track)
+    found, problem, start = first.found, first.problem, first.start
+    told = _told_nats(found)
+    if problem is None or start is None or told <= 0.0:
+        return found
+    recorded = problem.recorded
+    models = [model_at_rate(start.model, problem), *([found.model] if found.model else [])]
+    model = max(models, key=lambda one: loudness(recorded, one))
+    if loudness(recorded, model) < limits.chance_loud:
+        return found
+    truth, shown = motion_of(recorded, model), list[float]()
+    while len(shown) < limits.chance_copies:
+        shown.append(_shown_by(copy_of(recorded, truth, model, len(shown)), ask))
+        if limits.chance_times * shown[-1] >= told:
+            break
+    bound = limits.chance_times * max(limits.alone_nats, *shown)
+    said = _words(found, told, shown, bound)
+    if told <= bound:
+        return _agreeing(first, problem, start, said, _p_value(told, shown))
+    weak = [one.effect for one in found.findings if _fitted(one) and one.evidence_nats <= bound]
+    said = f"{said}; chance may be: {', '.join(weak)}" if weak else said
+    return replace(found, notes=(*found.notes, said))
+
+
+def loudness(track: Track, model: NullModel) -> float:
+    """By how much the gyro's noise turns the field in a step, in the magnetometer's deviations."""
+    field_b = np.linalg.solve(model.soft_iron, (track.mag_b_gauss - model.hard_iron_gauss).T)
+    size = float(np.nanmedian(np.linalg.norm(field_b, axis=0)))
+    return size * model.sigma_gyro_rad_s * track.step_s / model.sigma_mag_gauss
+
+
+def motion_of(track: Track, model: NullModel) -> Readings:
+    """Noise-free readings of a calibration along a track's motion without the gyro's noise."""
+    seen = bearings(track, model)
+    context = build_context(track, Given(seen))
+    rate = _without_noise(track, model)
+    quiet = replace(seen, orientation=carried_along(track, rate))
+    R_nb, levelled = attitude(track, quiet)
+    along = replace(
+        context, R_nb=R_nb, world_levelled=levelled, rate_b_rad_s=rate, field_b=seen.nominal_b
+    )
+    return forward.truth_along(along)
+
+
+def copy_of(track: Track, truth: Readings, model: NullModel, seed: int) -> Track:
+    """The track with other readings: those of the truth with the model's noise."""
+    made = forward.simulated(truth, (), forward.noise_of(model), seed)
+    read = np.isfinite(track.mag_b_gauss)
+    mag = np.where(read, made.mag_b_gauss, track.mag_b_gauss)
+    return replace(track, mag_b_gauss=mag, gyro_b_rad_s=made.gyro_b_rad_s)
+
+
+def _without_noise(track: Track, model: NullModel) -> Array:
+    """(N, 3) rates as they are expected to be; in runs too short for a spectrum, smoothed."""
+    rate = track.gyro_b_rad_s - model.gyro_bias_rad_s
+    runs = track.runs or (slice(0, len(track)),)
+    out = smoothed_rate(rate, runs, track.step_s, model.sigma_gyro_rad_s)
+    for run in runs:
+        if run.stop - run.start >= wiener.FEWEST:
+            out[run] = wiener.expected(rate[run])
+    return out
+
+
+def _fitted(one: Finding) -> bool:
+    """Whether it rests on a fit; what was counted in the readings is no matter of noise."""
+    return one.term is not None
+
+
+def _told_nats(found: Diagnosis) -> float:
+    """The largest evidence of what is told and was fitted; 0 where nothing is."""
+    nats = [one.evidence_nats for one in found.findings if _fitted(one)]
+    left = found.unexplained
+    return max([0.0, *nats, *([left.evidence_nats] if left.detected else [])])
+
+
+def _shown_by(copy: Track, ask: Callable[[Track], Answered]) -> float:
+    """What an engine tells of a copy, nats; without end where its fit finds none."""
+    try:
+        return _told_nats(ask(copy).found)
+    except (np.linalg.LinAlgError, ValueError):
+        return float("inf")
+
+
+def _words(found: Diagnosis, told: float, shown: Sequence[float], bound: float) -> str:
+    """What was seen, what simulations show, and what is told beside that."""
+    names = [one.effect for one in found.findings if _fitted(one)]
+    names += ["something unknown"] if found.unexplained.detected else []
+    count, largest = len(shown), max(shown)
+    seeds = "seed 0" if count == 1 else f"seeds 0 to {count - 1}"
+    made = "a simulation" if count == 1 else f"{count} simulations"
+    shows = "shows" if count == 1 else "show"
+    by_chance = f"up to {largest:.0f} nats of such" if largest > 0.0 else "nothing"
+    by_chance = by_chance if np.isfinite(largest) else "evidence without bound"
+    return (
+        f"the gyro's noise is louder than the magnetometer's: {', '.join(names)} is worth "
+        f"{told:.0f} nats here; {made} of the model alone with this noise ({seeds}) "
+        f"{shows} {by_chance}; only what is worth more than {bound:.0f} nats is told"
+    )
+
+
+def _p_value(told: float, shown: Sequence[float]) -> float:
+    """The chance of what is told, by its rank among the copies."""
+    as_much = sum(nats >= told for nats in shown)
+    return (1.0 + as_much) / (1.0 + len(shown))
+
+
+def _agreeing(
+    answered: Answered, problem: Problem, start: NullFit, said: str, p_value: float
+) -> Diagnosis:
+    """The answer of the calibration alone, with what was counted in the readings."""
+    found = answered.found
+    counted = tuple(one for one in found.findings if not _fitted(one))
+    fitted = {one.term for one in found.findings if _fitted(one)}
+    terms = tuple(term for k, term in enumerate(found.terms) if k not in fitted)
+    model, drawn = model_at_rate(start.model, problem), found.drawn
+    if drawn is not None:
+        drawn = replace(drawn, after=drawn.before, after_gauss=drawn.before_gauss, contributions=())
+    more = () if counted else would_have_shown(problem.recorded)
+    return replace(
+        found,
+        mismatch=bool(counted),
+        p_value=found.p_value if counted else p_value,
+        findings=counted,
+        unexplained=Unexplained(False),
+        posterior_predictive=checks(start, start, ()),
+        notes=(*found.notes, said, *more),
+        model=model,
+        noise=forward.noise_of(model),
+        terms=terms,
+        drawn=drawn,
+        omnibus={k: replace(one, p_after=one.p_before) for k, one in found.omnibus.items()},
+        validation=None,
+        regime_map=tuple(replace(one, after=one.before) for one in found.regime_map),
+    )

@@ -1,0 +1,67 @@
+"""What is told beside a gyro that is louder than the magnetometer is beyond chance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracks import experiment, track_of, true_model
+
+from ahrsd.diagnosis.chance import copy_of, loudness, motion_of
+from ahrsd.diagnosis.engine import diagnose
+from ahrsd.simulation import Experiment
+
+STEP_GAUSS = np.array([1.6e-3, -1.2e-3, 0.0])
+
+
+def _made(sigma_mag: float, sigma_gyro: float, scenario: str = "wam", seed: int = 0) -> Experiment:
+    return experiment(
+        scenario,
+        motion="slow",
+        seed=seed,
+        samples=3000,
+        sigma_mag=sigma_mag,
+        sigma_gyro=sigma_gyro,
+    )
+
+
+def test_a_step_far_beyond_what_simulations_show_is_told() -> None:
+    """2 mG of hard iron beside 0.1 mG and 50 mrad/s."""
+    track = track_of(_made(1e-4, 5e-2))
+    since = (np.arange(len(track)) >= 1500)[:, None]
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS))
+    assert [one.effect for one in found.findings] == ["hard_iron_step"]
+    sizes = [value.value for value in found.findings[0].parameters]
+    assert sizes == pytest.approx(STEP_GAUSS.tolist(), abs=3e-4)
+    assert any("(seeds 0 to 4) show nothing" in note for note in found.notes)
+
+
+def test_where_the_gyro_is_the_quieter_sensor_nothing_is_simulated() -> None:
+    track = track_of(_made(1e-3, 5e-3))
+    since = (np.arange(len(track)) >= 1500)[:, None]
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + 5 * since * STEP_GAUSS))
+    assert found.mismatch
+    assert not any("louder than the magnetometer's" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("sigma_mag", "sigma_gyro", "ratio"), [(1e-3, 5e-3, 0.1), (1e-4, 5e-2, 10.0)]
+)
+def test_how_loud_a_gyro_is(sigma_mag: float, sigma_gyro: float, ratio: float) -> None:
+    """Of half a gauss, 25 times a second: 50 mrad/s turn it by 1 mG."""
+    made = _made(sigma_mag, sigma_gyro)
+    assert loudness(track_of(made), true_model(made)) == pytest.approx(ratio, rel=0.1)
+
+
+def test_a_copy_has_the_motion_the_noise_and_the_stamps() -> None:
+    made = _made(1e-4, 5e-2)
+    track, model = track_of(made), true_model(made)
+    truth = motion_of(track, model)
+    clean = track_of(_made(0.0, 0.0)).gyro_b_rad_s
+    assert np.std(truth.gyro_b_rad_s - clean) < 0.1 * 5e-2
+    one = copy_of(track, truth, model, seed=3)
+    assert np.array_equal(one.time_s, track.time_s)
+    assert np.std(one.gyro_b_rad_s - truth.gyro_b_rad_s) == pytest.approx(5e-2, rel=0.03)
+    assert np.std(one.mag_b_gauss - truth.mag_b_gauss) == pytest.approx(1e-4, rel=0.03)
+    assert np.array_equal(one.mag_b_gauss, copy_of(track, truth, model, 3).mag_b_gauss)
