@@ -44,7 +44,7 @@ class GateLimits:
     field_spread_ram_percent: float = 2.0
     field_spread_flash_percent: float = 1.0
     max_inclination_error_deg: float = 3.0
-    max_place_deg: float = 0.1
+    max_place_deg: float = 0.03
     holdout_segments: float = 2.0
     min_holdout_excursion_deg: float = 280.0
     holdout_rms_deg: float = 1.5

@@ -1,12 +1,15 @@
 """Answers in worlds of another author: how often is one wrong beyond its sigmas, and silent?
 
-    python tests/benchmarks/estimator/bench_worlds.py [--seeds N] [--first SEED] [--json FILE]
+    python tests/benchmarks/estimator/bench_worlds.py [--seeds N] [--first N] [--chance] [--json F]
 
 The generator and its scores are in ../shared/worlds, written apart from this project; the command
 says so and ends where they are not. Six motions by thirteen troubles for each seed, some .2 s each;
 and three further troubles that are put onto these worlds here.
 An answer is silent where it is converged and nothing warns. `any3`: some number beyond 3 sigma (3 %
 by chance); `h3`: a heading beyond 3 x its expected error; `h3&1`: and by more than a degree.
+`--chance` says how many h3 there were if every answer's covariance were right: the worst of some
+650 headings and tilts is held against one sigma, so that a motion which shows all attitudes has
+more than 0.3 %.
 """
 
 from __future__ import annotations
@@ -22,10 +25,12 @@ from typing import Any
 
 import numpy as np
 
+from ahrsd.estimator.chain import symmetric
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.samples import Array, SampleBlock
 
 WORLDS = Path(__file__).resolve().parents[4] / "shared" / "worlds"
+DRAWS = 20  # of errors by each answer's covariance
 COLUMNS = ("worlds", "converged", "silent", "any3", "h3", "h3&1")
 
 
@@ -99,6 +104,7 @@ def answered(data: Array) -> dict[str, Any]:
         "hard_iron_gauss": found.hard_iron_gauss,
         "soft_iron": found.soft_iron,
         "gyro_bias_rad_s": found.gyro_bias_rad_s,
+        "covariance": found.covariance,
         "correction_matrix": np.linalg.inv(found.soft_iron),
         "standard_deviation": {
             "soft_iron": sigma[:6],
@@ -108,6 +114,26 @@ def answered(data: Array) -> dict[str, Any]:
         "heading_error_deg": {"expected_worst": found.heading_sigma_deg},
         "observability": {"unobservable": []},
     }
+
+
+def by_chance(answer: dict[str, Any], truth: dict[str, Any], worst: Callable[..., float]) -> float:
+    """Share of h3 among errors that an answer's own covariance makes; `worst` is the scorer's."""
+    iron, hard = answer["soft_iron"], answer["hard_iron_gauss"]
+    rng = np.random.default_rng(truth["seed"])
+    errors = rng.multivariate_normal(np.zeros(9), answer["covariance"][:9, :9], DRAWS, method="svd")
+    limit = 3.0 * answer["heading_error_deg"]["expected_worst"]
+    found = [
+        worst(
+            answer["correction_matrix"],
+            hard,
+            iron + symmetric(error[:6]),
+            hard + error[6:],
+            np.array(truth["h"]),
+            truth["tilt_deg"],
+        )
+        for error in errors
+    ]
+    return float(np.mean(np.array(found) > limit))
 
 
 def counted(scores: list[dict[str, Any]]) -> list[int]:
@@ -129,6 +155,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--first", type=int, default=1000)
+    parser.add_argument("--chance", action="store_true")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     if not WORLDS.is_dir():
@@ -137,23 +164,32 @@ def main() -> int:
     sys.path.insert(0, str(WORLDS))
     worlds, scorer = importlib.import_module("worlds"), importlib.import_module("score_worlds")
     cells: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    chances: list[float] = []
+
+    def judged(rows: Array, truths: list[dict[str, Any]]) -> dict[str, Any]:
+        answer = answered(rows)
+        scores = [scorer.score(answer, one) for one in truths]
+        score = min(scores, key=lambda one: one.get("head", 0.0))
+        if options.chance and score["conv"] and not score["warn"]:
+            chances.append(by_chance(answer, truths[0], scorer.heading_err))
+        return score
+
     for seed in range(options.first, options.first + options.seeds):
         for motion in worlds.MOTIONS:
             for trouble in worlds.TROUBLES:
                 data, truth = worlds.world(motion, trouble, seed)
-                cells[trouble].append(scorer.score(answered(data), truth))
+                cells[trouble].append(judged(data, [truth]))
             for number, (name, beneath, put_on) in enumerate(FURTHER):
                 data, truth = worlds.world(motion, beneath, seed)
                 rng = np.random.default_rng([seed, number])
-                rows, truths = put_on(data, truth, rng)
-                answer = answered(rows)
-                scores = [scorer.score(answer, one) for one in truths]
-                cells[name].append(min(scores, key=lambda score: score.get("head", 0.0)))
+                cells[name].append(judged(*put_on(data, truth, rng)))
     table = {trouble: counted(scores) for trouble, scores in cells.items()}
     table["all"] = np.sum(list(table.values()), axis=0).tolist()
     print(f"| trouble | {' | '.join(COLUMNS)} |\n|---|{'---|' * len(COLUMNS)}")
     for trouble, row in table.items():
         print(f"| {trouble} | {' | '.join(map(str, row))} |")
+    if options.chance:
+        print(f"h3 by chance, were every covariance right: {sum(chances):.1f} of {len(chances)}")
     if options.json:
         body = {"first_seed": options.first, "seeds": options.seeds, "columns": COLUMNS} | table
         options.json.write_text(json.dumps(body, indent=1) + "\n", encoding="utf-8")
