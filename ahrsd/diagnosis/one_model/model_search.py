@@ -257,7 +257,11 @@ def exchanged(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
     """The likeliest of a set and those with another name in place of one, while one is likelier.
 
     A name is added beside noise that has swallowed the others; what it is, is told in its own.
+    Beside an ordinary remainder nothing is exchanged: there a set is likelier for what its laws
+    lack as well, and a hand's magnet was a step of the iron and one of the field.
     """
+    if all_sets.is_real(best.names):
+        return best
     for _ in range(MOST_MOVES):
         names = [key for key in best.names if all_sets.component(key).row is not None]
         bases = [best.names - {key} for key in names if key != LAG]
@@ -274,10 +278,11 @@ def sharpened(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
     """The set with onsets and scales of its names sought on where each is likelier.
 
     Of what has a thousand nats a time constant that is off by a tenth leaves a hundred, and a free
-    course beside it explains them: it is sought without courses as well, which may then go.
+    course beside it explains them: it is sought without courses as well, which may then go.  What
+    has a form of its own, as a step that takes a while, has no sharper onset.
     """
     for key in sorted(best.names):
-        if key == LAG or all_sets.component(key).row is None:
+        if key == LAG or key in all_sets.forms or all_sets.component(key).row is None:
             continue
         tried = [best]
         for rest in {best.names, best.names - set(space.courses)}:
