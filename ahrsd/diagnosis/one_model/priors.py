@@ -75,7 +75,7 @@ TRANSITION_S = 2.0
 APPROACH_S = 4.0
 #: of a further step of a kind that is there: what was put on is taken off
 AGAIN = 0.3
-#: steps of a kind from which on they are one source that changes, which has no name
+#: steps of a kind, or spells, from which on they are one source that changes, which has no name
 CHANGES = 3
 #: of a course in time that nothing names, in one frame
 COURSE = 1.0 / 20.0
@@ -91,9 +91,9 @@ DRIFT_CORNER = 3.0
 #: of a source that comes and goes: s that it is on and off at a time, of which its course is free
 #: in such pieces; half waves a second between which its corner is
 SPELL_S, BETWEEN_S, SPELL_PIECE_S, SPELL_CORNERS = 2.0, 20.0, 0.2, (0.1, 10.0)
-#: spells of it: fewer is something that happened; part of the time that it is on, beyond which it
-#: does not come and go; and half waves of all of them, at most
-FEWEST_SPELLS, MOST_ON, MOST_WAVES = 2, 0.3, 100
+#: part of the time that it is on, beyond which it does not come and go; and half waves of all of
+#: its spells, at most
+MOST_ON, MOST_WAVES = 0.3, 100
 #: how often what switches is outside of the vehicle;  source: the rules' three nats
 SWITCHES_OUTSIDE = 0.05
 #: square of a jump of the mean, in its deviations, of three axes: one in 1e6 by chance

@@ -98,8 +98,9 @@ def switching(all_sets: Hypotheses, here: Hypothesis) -> list[Component]:
     # of what is often alike noise of a colour would leave nothing
     quiet = replace(here.at, log_noise=np.full(len(here.at.log_noise), here.at.log_noise[-1]))
     found: list[Component] = []
-    if len(spells) >= priors.FEWEST_SPELLS:
+    if len(spells) >= priors.CHANGES:
         spells = _closest(all_sets, here, quiet, spells, rows)
+        log_odds -= 2 * len(spells) * float(np.log(rows))  # ends are sought to a row, not a piece
         found += [_coming(made.context, frame, spells, log_odds) for frame in FRAMES]
     left = made.left_by(here.keys, quiet) / made.point.loud.amplitude[:, None]
     left = np.where(made.point.filtered.used[:, None], left, 0.0)
