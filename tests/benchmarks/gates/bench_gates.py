@@ -19,13 +19,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_worlds import WORLDS
 
 from ahrsd import events
 from ahrsd.calibration import Estimate
 from ahrsd.config.config import Config
 from ahrsd.gates import Level, for_level
 from ahrsd.offline.replay import replay
+
+sys.path.append(str(Path(__file__).parents[1] / "estimator"))
+
+from bench_worlds import WORLDS
 
 #: gates that ask for what a world has not
 LEFT_OUT = (

@@ -11,13 +11,17 @@ from __future__ import annotations
 import argparse
 import importlib
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_worlds import WORLDS
 
 from ahrsd.core.sensor_checks import SensorChecks
 from ahrsd.samples import Array, SampleBlock
+
+sys.path.append(str(Path(__file__).parents[1] / "estimator"))
+
+from bench_worlds import WORLDS
 
 #: what is done to the gyroscope: the worlds' trouble, and the factor of each axis
 CASES: dict[str, tuple[str, tuple[int, int, int]]] = {
