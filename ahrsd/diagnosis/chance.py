@@ -151,12 +151,13 @@ def _words(found: Diagnosis, told: float, shown: Sequence[float], bound: float) 
     made = "a simulation" if count == 1 else f"{count} simulations"
     shows = "shows" if count == 1 else "show"
     by_chance = f"up to {largest:.0f} nats of such" if largest > 0.0 else "nothing"
-    by_chance = by_chance if np.isfinite(largest) else "evidence without bound"
-    return (
+    seen = (
         f"the gyro's noise is louder than the magnetometer's: {', '.join(names)} is worth "
         f"{told:.0f} nats here; {made} of the model alone with this noise ({seeds}) "
-        f"{shows} {by_chance}; only what is worth more than {bound:.0f} nats is told"
     )
+    if not np.isfinite(largest):
+        return f"{seen}cannot be fitted, so that nothing can be told beside it"
+    return f"{seen}{shows} {by_chance}; only what is worth more than {bound:.0f} nats is told"
 
 
 def _p_value(told: float, shown: Sequence[float]) -> float:

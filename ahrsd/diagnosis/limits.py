@@ -39,8 +39,8 @@ class Limits:
                     (docs/validation/blind-trials.md, "calibration error of the confidence")
     chance_loud:    gyro beside magnetometer: turns of the field by its noise in a step, in the
                     deviations of a reading, from which on evidence is held against simulations.
-                    1.0 at most in 34 real recordings, 4.7 and more in the simulations that were
-                    told to differ from themselves
+                    Above every real recording that was looked at, below the simulations that
+                    were told to differ from themselves
     chance_copies, chance_times: how many, and how many times the largest evidence of these must be
                     surpassed: 1 in 126 of what chance makes does (`chance`)
     most_terms:     rounds of naming; real recordings beyond this are another model, not a repair
