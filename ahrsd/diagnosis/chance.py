@@ -27,16 +27,20 @@ import numpy as np
 from ahrsd.diagnosis import forward, wiener
 from ahrsd.diagnosis.context import Given, attitude, build_context, smoothed_rate
 from ahrsd.diagnosis.descent import NullFit
-from ahrsd.diagnosis.diagnosis import Diagnosis, Finding, Unexplained
+from ahrsd.diagnosis.diagnosis import Check, Diagnosis, Finding, Unexplained
 from ahrsd.diagnosis.effects.base import Readings
 from ahrsd.diagnosis.hygiene import would_have_shown
 from ahrsd.diagnosis.innovation import bearings, carried_along
 from ahrsd.diagnosis.limits import LIMITS, Limits
-from ahrsd.diagnosis.predictive import checks
-from ahrsd.diagnosis.problem import Problem, model_at_rate
+from ahrsd.diagnosis.null import fit_null
+from ahrsd.diagnosis.predictive import beside_refitted, checks
+from ahrsd.diagnosis.problem import Problem, model_at_rate, problem_of
+from ahrsd.diagnosis.spoken import failed_checks
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
+
+LOUD = "the gyro's noise is louder than the magnetometer's"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,33 +55,68 @@ class Answered:
     start: NullFit | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Alone:
+    """How the fit of the calibration alone compares with fits of simulations of it.
+
+    checks:  empty where fewer than half of the simulations could be fitted
+    p_value: of the recording's fit among those of the simulations
+    """
+
+    checks: dict[str, Check]
+    p_value: float
+    copies: int
+    fitted: int
+
+    @staticmethod
+    def of(problem: Problem, start: NullFit, copies: Sequence[Track]) -> Alone:
+        """Of the recording's fit, and of copies, to which a calibration is fitted as to it."""
+        fits = [fit for one in copies if (fit := _fit_of(one, problem)) is not None]
+        enough = 2 * len(fits) >= len(copies)
+        checked, p_value = beside_refitted(start, fits) if enough else ({}, 1.0)
+        return Alone(checked, p_value, len(copies), len(fits))
+
+    @property
+    def differs(self) -> bool:
+        """Whether the recording's fit leaves what those of simulations do not."""
+        return any(not check.inside_after for check in self.checks.values())
+
+
 def beyond_chance(
     track: Track, ask: Callable[[Track], Answered], limits: Limits = LIMITS
 ) -> Diagnosis:
     """The answer about a track; beside a loud gyro only what is clearly beyond chance is told.
 
-    ask: an engine.  It is asked again for at most `limits.chance_copies` copies, only where
-    something is told and the gyro is loud; the seeds are 0, 1, 2 and so on
+    ask: an engine.  Where the gyro is loud and something is told or a check fails, the calibration
+    is fitted to `limits.chance_fits` copies (seeds 0, 1, 2 and so on); where the recording's fit is
+    not like theirs, the engine is asked again for the first `limits.chance_copies` at most
     """
     first = ask(track)
     found, problem, start = first.found, first.problem, first.start
     told = _told_nats(found)
-    if problem is None or start is None or told <= 0.0:
+    if problem is None or start is None or not (told > 0.0 or failed_checks(found)):
         return found
     recorded = problem.recorded
     models = [model_at_rate(start.model, problem), *([found.model] if found.model else [])]
     model = max(models, key=lambda one: loudness(recorded, one))
     if loudness(recorded, model) < limits.chance_loud:
         return found
-    truth, shown = motion_of(recorded, model), list[float]()
-    while len(shown) < limits.chance_copies:
-        shown.append(_shown_by(copy_of(recorded, truth, model, len(shown)), ask))
+    truth = motion_of(recorded, model)
+    copies = [copy_of(recorded, truth, model, seed) for seed in range(limits.chance_fits)]
+    alone = Alone.of(problem, start, copies)
+    if not alone.differs:
+        return _agreeing(first, problem, start, alone, _alike(found, told, alone))
+    if told <= 0.0:
+        return replace(found, posterior_predictive=alone.checks)
+    shown = list[float]()
+    for copy in copies[: limits.chance_copies]:
+        shown.append(_shown_by(copy, ask))
         if limits.chance_times * shown[-1] >= told:
             break
     bound = limits.chance_times * max(limits.alone_nats, *shown)
     said = _words(found, told, shown, bound)
     if told <= bound:
-        return _agreeing(first, problem, start, said, _p_value(told, shown))
+        return _agreeing(first, problem, start, alone, said)
     weak = [one.effect for one in found.findings if _fitted(one) and one.evidence_nats <= bound]
     said = f"{said}; chance may be: {', '.join(weak)}" if weak else said
     return replace(found, notes=(*found.notes, said))
@@ -127,6 +166,35 @@ def _fitted(one: Finding) -> bool:
     return one.term is not None
 
 
+def _fit_of(copy: Track, problem: Problem) -> NullFit | None:
+    """The calibration alone fitted to a copy, as it was to the recording; None where it cannot."""
+    try:
+        made, cold = problem_of(copy, problem.spec, problem.library, problem.limits)
+        return fit_null(made.track, made.spec, cold, walk=False)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+
+
+def _alike(found: Diagnosis, told: float, alone: Alone) -> str:
+    """What was seen, and why it is not told."""
+    seen = f"{LOUD}: {_names(found)} is worth {told:.0f} nats here" if told > 0.0 else LOUD
+    if not alone.checks:
+        return (
+            f"{seen}; of {alone.copies} simulations of the model alone only {alone.fitted} can be "
+            "fitted, so that nothing can be told beside it"
+        )
+    return (
+        f"{seen}; {alone.fitted} simulations of the model alone with this noise (seeds 0 to "
+        f"{alone.copies - 1}), fitted as the recording was, look like it, so that nothing is told"
+    )
+
+
+def _names(found: Diagnosis) -> str:
+    """What is told and rests on a fit."""
+    names = [one.effect for one in found.findings if _fitted(one)]
+    return ", ".join([*names, *(["something unknown"] if found.unexplained.detected else [])])
+
+
 def _told_nats(found: Diagnosis) -> float:
     """The largest evidence of what is told and was fitted; 0 where nothing is."""
     nats = [one.evidence_nats for one in found.findings if _fitted(one)]
@@ -144,30 +212,22 @@ def _shown_by(copy: Track, ask: Callable[[Track], Answered]) -> float:
 
 def _words(found: Diagnosis, told: float, shown: Sequence[float], bound: float) -> str:
     """What was seen, what simulations show, and what is told beside that."""
-    names = [one.effect for one in found.findings if _fitted(one)]
-    names += ["something unknown"] if found.unexplained.detected else []
     count, largest = len(shown), max(shown)
     seeds = "seed 0" if count == 1 else f"seeds 0 to {count - 1}"
     made = "a simulation" if count == 1 else f"{count} simulations"
     shows = "shows" if count == 1 else "show"
     by_chance = f"up to {largest:.0f} nats of such" if largest > 0.0 else "nothing"
     seen = (
-        f"the gyro's noise is louder than the magnetometer's: {', '.join(names)} is worth "
-        f"{told:.0f} nats here; {made} of the model alone with this noise ({seeds}) "
+        f"{LOUD}: {_names(found)} is worth {told:.0f} nats here; {made} of the "
+        f"model alone with this noise ({seeds}) "
     )
     if not np.isfinite(largest):
         return f"{seen}cannot be fitted, so that nothing can be told beside it"
     return f"{seen}{shows} {by_chance}; only what is worth more than {bound:.0f} nats is told"
 
 
-def _p_value(told: float, shown: Sequence[float]) -> float:
-    """The chance of what is told, by its rank among the copies."""
-    as_much = sum(nats >= told for nats in shown)
-    return (1.0 + as_much) / (1.0 + len(shown))
-
-
 def _agreeing(
-    answered: Answered, problem: Problem, start: NullFit, said: str, p_value: float
+    answered: Answered, problem: Problem, start: NullFit, alone: Alone, said: str
 ) -> Diagnosis:
     """The answer of the calibration alone, with what was counted in the readings."""
     found = answered.found
@@ -181,10 +241,10 @@ def _agreeing(
     return replace(
         found,
         mismatch=bool(counted),
-        p_value=found.p_value if counted else p_value,
+        p_value=found.p_value if counted else alone.p_value,
         findings=counted,
         unexplained=Unexplained(False),
-        posterior_predictive=checks(start, start, ()),
+        posterior_predictive=alone.checks or checks(start, start, ()),
         notes=(*found.notes, said, *more),
         model=model,
         noise=forward.noise_of(model),

@@ -41,8 +41,11 @@ class Limits:
                     deviations of a reading, from which on evidence is held against simulations.
                     Above every real recording that was looked at, below the simulations that
                     were told to differ from themselves
-    chance_copies, chance_times: how many, and how many times the largest evidence of these must be
-                    surpassed: 1 in 126 of what chance makes does (`chance`)
+    chance_fits:    simulations to which the calibration alone is fitted, for the bands in which the
+                    recording's own fit has to be where nothing is told
+    chance_copies, chance_times: how many of these are diagnosed, and how many times the largest
+                    evidence that they show must be surpassed: 1 in 126 of what chance makes does
+                    (`chance`)
     most_terms:     rounds of naming; real recordings beyond this are another model, not a repair
     """
 
@@ -64,6 +67,7 @@ class Limits:
     alone_p: float = 1e-4
     doubt: float = 0.01
     chance_loud: float = 2.0
+    chance_fits: int = 16
     chance_copies: int = 5
     chance_times: float = 4.0
     most_terms: int = 5

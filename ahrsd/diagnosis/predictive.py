@@ -72,6 +72,33 @@ def checks(
     }
 
 
+def beside_refitted(null: NullFit, refitted: Sequence[NullFit]) -> tuple[dict[str, Check], float]:
+    """The statistics of what a calibration alone leaves, beside those of simulations of it.
+
+    refitted: fits of simulations of the calibration, each made as `null` was made of the recording:
+    their bands hold where a fit is not linear in the readings, as beside a loud gyro.  Two or more
+    Also the probability that one of the statistics is as far out, by its ranks (Bonferroni).
+    """
+    found = [_of_fit(one) for one in refitted]
+    value, expected = _of_fit(null), bands(found)
+    ranks = []
+    for name in expected:
+        above = sum(one[name] >= value[name] for one in found)
+        below = len(found) - above
+        ranks.append(2 * min(above, below) if name in _TWO_SIDED else above)
+    out = {
+        name: Check(value[name], band, inside := _inside(value[name], band), inside)
+        for name, band in expected.items()
+    }
+    return out, min(1.0, len(ranks) * (1 + min(ranks)) / (1 + len(found)))
+
+
+def _of_fit(fit: NullFit) -> dict[str, float]:
+    """The statistics of what a fit leaves."""
+    context = fit.context()
+    return statistics(_Fitted.of(fit, context).left(fit.filtered.whitened), scene_of(context))
+
+
 def noise_law(
     fit: NullFit,
     loud: Sequence[tuple[float, float]] = (),
