@@ -10,6 +10,7 @@ from tracks import experiment, track_of, true_model
 
 from ahrsd.diagnosis.chance import copy_of, loudness, motion_of
 from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.spoken import verdict
 from ahrsd.simulation import Experiment
 
 STEP_GAUSS = np.array([1.6e-3, -1.2e-3, 0.0])
@@ -35,6 +36,17 @@ def test_a_step_far_beyond_what_simulations_show_is_told() -> None:
     sizes = [value.value for value in found.findings[0].parameters]
     assert sizes == pytest.approx(STEP_GAUSS.tolist(), abs=3e-4)
     assert any("(seeds 0 to 4) show nothing" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(("scenario", "seed"), [("wam", 3), ("lam", 1)])
+def test_a_fit_like_those_of_simulations_is_no_mismatch(scenario: str, seed: int) -> None:
+    """Without this the engine is sure of something unknown in the first, by 1391 nats."""
+    found = diagnose(track_of(_made(3.2e-4, 5.5e-2, scenario, seed)))
+    assert not found.mismatch
+    assert verdict(found) == "recording and model agree"
+    assert found.p_value > 0.05
+    for name, check in found.posterior_predictive.items():
+        assert check.inside_after, name
 
 
 def test_where_the_gyro_is_the_quieter_sensor_nothing_is_simulated() -> None:
