@@ -676,12 +676,14 @@ class Considered:
 class Weighed:
     """All instruments that may be, at all places, against what the data say of them.
 
-    every (K, 19) their sigmas; evidence (K,); spread (K, 19, 19) and rest (K, 19) what the data
-    leave open of each and say that it is, beyond what is taken out already
+    every (K, 19) their sigmas; prior (K,) log of how likely they are without the data; evidence
+    (K,); spread (K, 19, 19) and rest (K, 19) what the data leave open of each and say that it is,
+    beyond what is taken out already
     """
 
     said: Considered
     every: Array
+    prior: Array
     evidence: Array
     spread: Array
     rest: Array
@@ -689,10 +691,18 @@ class Weighed:
     @staticmethod
     def of(said: Considered, graph: Graph, kinds: Kinds) -> Weighed:
         """What an imperfection makes the epochs disagree is no noise."""
-        every = instruments(*kinds)
+        may_be = instruments(*kinds)
+        every = may_be.sigmas
         temper = said.temper(every.max(axis=0), graph.temper)
         spread, rest = said.found(every, temper)
-        return Weighed(said, every, said.evidence(every, rest, temper), temper * spread, rest)
+        evidence = said.evidence(every, rest, temper)
+        return Weighed(said, every, may_be.log_prior, evidence, temper * spread, rest)
+
+    def likely(self) -> Array:
+        """How likely each is (K,), the data and all else taken together."""
+        told = self.evidence + self.prior
+        shares = np.exp(told - told.max())
+        return np.asarray(shares / shares.sum())
 
     def likelier(self, which: Array | slice, told: float = TOLD) -> int | None:
         """The likeliest of those in which some of `which` are larger than need be; None where it is
@@ -747,11 +757,10 @@ def considered(weighed: Weighed) -> Widening:
 
     The answer takes the instrument to be perfect. It is one of `instruments`, each as likely as
     the data make it. Of each, what the data leave open of the imperfections spreads the answer, and
-    what they say that they are is an error of it.
+    what they say that they are is an error of it. So their sizes, which a few numbers tell badly,
+    count as far as they are not known: the mean of the variances, not that of the likeliest.
     """
-    by_rest, rest = weighed.said.by_rest, weighed.rest
-    likely = np.exp(weighed.evidence - weighed.evidence.max())
-    likely /= likely.sum()
+    by_rest, rest, likely = weighed.said.by_rest, weighed.rest, weighed.likely()
     mean = np.tensordot(likely, weighed.spread, 1) + (likely * rest.T) @ rest
     added = by_rest @ mean @ by_rest.T
     each = [by_rest[:, i] @ mean[np.ix_(i, i)] @ by_rest[:, i].T for i in _EACH]

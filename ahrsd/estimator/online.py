@@ -566,8 +566,8 @@ class Estimator:
     def _explained(self, trial: Window, before: Window, told: float) -> bool:
         """Whether the data are explained once that is taken out; and, where the gyro was not likely
         to be wrong before, likely to be."""
-        most = instruments(*self.parameters.kinds)
-        limit = _MOST_OF_KIND * np.max(most, axis=0)[GYRO_OF_ALL]
+        most = np.max(instruments(*self.parameters.kinds).sigmas, axis=0)
+        limit = _MOST_OF_KIND * most[GYRO_OF_ALL]
         within = bool(np.all(np.abs(trial.taken.numbers) < limit))
         if not within or trial.unexplained >= _EXPLAINED or told == TOLD:
             return within and trial.unexplained < _EXPLAINED
@@ -688,7 +688,7 @@ class Estimator:
             return None
         if not self._is_copy:
             self._watch()
-        most = np.max(instruments(*self.parameters.kinds), axis=0)[:16]
+        most = np.max(instruments(*self.parameters.kinds).sigmas, axis=0)[:16]
         try:
             return left_over(
                 window.epochs,

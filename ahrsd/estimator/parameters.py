@@ -78,28 +78,71 @@ Kinds = tuple[tuple[Imperfections, ...], tuple[float, ...]]
 """Of instruments, and of places by the size of what differs there."""
 
 
+#: before the data, against a gyro that is of a better kind in all: one of which scales and axes are
+#: both of the worst kind, and one of which only the scales are. Chosen on motions in sight: so many
+#: nats as the data have to say (5) to be believed, for the size of a handful of numbers of which
+#: some are told is badly known, and a lucky draw is no better kind. Where the motion tells nothing
+#: the mean variance is then that of the worst kind, but for a hundredth
+_WORST_GYRO = 150.0
+_WRONG_SCALES_ALONE = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instruments:
+    """Instruments that may be, each at each of the places.
+
+    sigmas (K, 19): of turn (3), lag, scale, shape (5), place (6), bias (3)
+    log_prior (K,): of how likely each is before the data, up to a constant
+    """
+
+    sigmas: Array
+    log_prior: Array
+
+
 @lru_cache
-def instruments(kinds: tuple[Imperfections, ...], places: tuple[float, ...]) -> Array:
-    """Sigmas of turn (3), lag, scale, shape (5), place (6), bias (3): all instruments that may be.
+def instruments(kinds: tuple[Imperfections, ...], places: tuple[float, ...]) -> Instruments:
+    """All instruments that may be.
 
     Its axes are of one of the kinds, its lag is, its gyro's scales and its gyro's bias are, each
     whatever the others are: a sensor that was mounted askew need not be late. And so is the place
-    where it was driven.
+    where it was driven. The angles between its gyro's axes are of the kind of its scales, or of a
+    better one (`_gyros`).
     """
-    every = [
-        (
-            *[axes.turn_rad] * 3,
-            late.lag_s,
-            gyro.scale,
-            *[gyro.shape] * 5,
-            *[place] * 6,
-            *[bias.bias_rad_s] * 3,
+    every, prior = [], []
+    for (axes, late, bias), gyro, place in product(product(kinds, repeat=3), _gyros(kinds), places):
+        (scale, apart, askew), odds = gyro
+        every.append(
+            (
+                *[axes.turn_rad] * 3,
+                late.lag_s,
+                *[scale, apart, apart],
+                *[askew] * 3,
+                *[place] * 6,
+                *[bias.bias_rad_s] * 3,
+            )
         )
-        for (axes, late, gyro, bias), place in product(product(kinds, repeat=4), places)
-    ]
-    found = np.array(every)
-    found.flags.writeable = False
+        prior.append(math.log(odds))
+    found = Instruments(np.array(every), np.array(prior))
+    for each in (found.sigmas, found.log_prior):
+        each.flags.writeable = False
     return found
+
+
+def _gyros(kinds: tuple[Imperfections, ...]) -> list[tuple[tuple[float, float, float], float]]:
+    """Sigmas of a gyro's scale, of how its scales differ and of the angles between its axes, and
+    how likely it is.
+
+    A gyro whose axes are at right angles may have wrong scales; one that was calibrated, so that
+    its scales are right, has no axes that are not.
+    """
+    worst = max((kind.scale for kind in kinds), default=0.0)
+    every = [(kind, kind, _WORST_GYRO if kind.scale == worst else 1.0) for kind in kinds]
+    every += [
+        (scales, angles, _WRONG_SCALES_ALONE)
+        for scales, angles in product(kinds, repeat=2)
+        if angles.scale < scales.scale
+    ]
+    return [((scales.scale, scales.shape, angles.shape), odds) for scales, angles, odds in every]
 
 
 @dataclass(frozen=True, slots=True)
