@@ -572,6 +572,18 @@ def test_a_reading_that_came_late_is_no_stuck_magnetometer(
     assert facts[0].bad[2001 : 2000 + rows].all()
 
 
+def test_readings_that_came_late_again_and_again_are_a_stuck_magnetometer() -> None:
+    """Four times 95 ms at 200 Hz: none of them long, .38 s in all."""
+    made = track_of(experiment("wam", samples=8000, rate_hz=200.0, sigma_mag=5e-5))
+    mag = made.mag_b_gauss.copy()
+    for first in (1000, 3000, 5000, 7000):
+        mag[first : first + 20] = mag[first]
+    (fact,) = hygiene(replace(made, mag_b_gauss=mag))
+    assert fact.effect == "stuck_magnetometer"
+    assert fact.parameters[0].value == pytest.approx(0.38, abs=0.006)
+    assert matters(fact)
+
+
 def test_a_gyro_s_limit_near_its_noise(track: Track) -> None:
     """Fine numbers repeat at a limit only."""
     rate = 0.02 * np.sin(track.time_s)[:, None] * np.array([1.0, 0.5, 0.2])

@@ -51,7 +51,7 @@ class Hypotheses:
     remainder: keys of what every real recording leaves, in or out together
     start: noise (B,) and psi by key that the richest model has
     forms: key of what a component leaves of its form, which comes and goes with it
-    beside_delay: effects of which a delay is a part: they are asked beside it, not in its place
+    holding: key of what contains a delay, and of the same beside one, without it
     real: whether all sets are of a recording that leaves what real ones do, whatever is in them
     unknown_nats: evidence of a source that switches and was taken out: a rest of it is left
     """
@@ -61,7 +61,7 @@ class Hypotheses:
     start_noise: Array
     start_psi: Mapping[str, Array]
     forms: dict[str, str] = field(default_factory=dict)
-    beside_delay: frozenset[str] = frozenset()
+    holding: Mapping[str, str] = field(default_factory=dict)
     judged: dict[Names, Hypothesis] = field(default_factory=dict)
     real: bool = False
     unknown_nats: float = 0.0
@@ -110,12 +110,18 @@ class Hypotheses:
         return self.judged[members]
 
     def without(self, members: Names, key: str) -> Names:
-        """The set without a member, and without what is asked only beside it."""
-        if key != LAG:
-            return members - {key}
-        return (
-            members - {key} - {k for k in members if self.component(k).effect in self.beside_delay}
-        )
+        """The set without a member: without the delay what contains one is whole."""
+        whole = {other: key for key, other in self.holding.items()} if key == LAG else {}
+        return frozenset(whole.get(one, one) for one in members - {key})
+
+    def with_(self, members: Names, key: str) -> Names:
+        """The set with one more member: beside the delay what contains one is without it."""
+        beside = self.holding if key == LAG else {}
+        return frozenset(beside.get(one, one) for one in members | {key})
+
+    def is_asked(self, members: Names, key: str) -> bool:
+        """Whether a candidate may be asked beside a set: whole without the delay, else without it."""
+        return key not in self.holding if LAG in members else not self.component(key).beside
 
     def is_real(self, members: Names) -> bool:
         """Whether a set leaves what real recordings do."""
@@ -265,7 +271,9 @@ def exchanged(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
     for _ in range(MOST_MOVES):
         names = [key for key in best.names if all_sets.component(key).row is not None]
         bases = [best.names - {key} for key in names if key != LAG]
-        found = [base | {key} for base in bases for key in asked(all_sets, space, base, best)]
+        found = [
+            all_sets.with_(base, key) for base in bases for key in asked(all_sets, space, base, best)
+        ]
         judged = [all_sets.judge(one, best) for one in found]
         likelier = max((best, *judged), key=lambda one: one.score)
         if likelier is best:
@@ -314,7 +322,7 @@ def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
     bare = names - set(space.courses)
     for base in {names, bare}:
         ranked = asked(all_sets, space, base, here)
-        out += [base | {key} for key in ranked]
+        out += [all_sets.with_(base, key) for key in ranked]
     return list(dict.fromkeys(out))
 
 
@@ -358,9 +366,7 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
         for key in keys if key not in base
     ]  # fmt: skip
     candidates = [key for key in candidates if not _beside_its_like(all_sets, base, key)]
-    if LAG not in base:
-        part = all_sets.beside_delay
-        candidates = [key for key in candidates if all_sets.component(key).effect not in part]
+    candidates = [key for key in candidates if all_sets.is_asked(base, key)]
     if not candidates:
         return []
     scan = beside(all_sets.made, model.keys, at)

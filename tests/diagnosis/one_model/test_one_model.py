@@ -217,3 +217,21 @@ def test_a_line_that_wanders_in_frequency_is_no_alternating_field_but_unknown():
     assert found.findings == ()
     assert found.unexplained.detected
     assert found.unexplained.where.frame == "sensor"
+
+
+def test_eddy_currents_that_differ_by_axis_are_named_without_a_delay():
+    # the vehicle yaws: its field along one axis hardly changes, and a factor of that is none
+    one = made(Trial(seed=54, effects=(("eddy_current", 1.0),), samples=3000, rate_hz=25.0))
+    found = diagnose(one.track)
+    assert [finding.effect for finding in found.findings] == ["eddy_current"]
+    assert not found.unexplained.detected
+    _, truth, _ = one.truth[0]
+    size = np.array([p.value for p in found.findings[0].parameters])
+    np.testing.assert_allclose(size, truth, atol=3e-3)
+
+
+def test_a_delay_is_no_eddy_current():
+    one = made(Trial(seed=44, effects=(("mag_time_lag", 3.0),), samples=3000, rate_hz=25.0))
+    found = diagnose(one.track)
+    assert [finding.effect for finding in found.findings] == ["mag_time_lag"]
+    assert found.findings[0].parameters[0].value == pytest.approx(0.06, abs=3e-3)
