@@ -46,8 +46,8 @@ class Fact:
 #: not a difference from its simulation, which has the same stamps, unless there are so many
 MISSING_SHARE = 0.02
 JITTER_SHARE = 0.05  # of the step
-#: s, all together: a reading that is held for less came late, is not used, and no fault of the sensor;
-#: one that comes late again and again is one
+#: s, all together: a reading that is held for less came late and is not used; that is no fault of
+#: the sensor, but again and again it is
 STUCK_S = 0.25
 
 

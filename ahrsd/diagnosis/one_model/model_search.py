@@ -120,7 +120,7 @@ class Hypotheses:
         return frozenset(beside.get(one, one) for one in members | {key})
 
     def is_asked(self, members: Names, key: str) -> bool:
-        """Whether a candidate may be asked beside a set: whole without the delay, else without it."""
+        """Whether a candidate may be asked beside a set: whole where no delay is in it."""
         return key not in self.holding if LAG in members else not self.component(key).beside
 
     def is_real(self, members: Names) -> bool:
@@ -272,7 +272,9 @@ def exchanged(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
         names = [key for key in best.names if all_sets.component(key).row is not None]
         bases = [best.names - {key} for key in names if key != LAG]
         found = [
-            all_sets.with_(base, key) for base in bases for key in asked(all_sets, space, base, best)
+            all_sets.with_(base, key)
+            for base in bases
+            for key in asked(all_sets, space, base, best)
         ]
         judged = [all_sets.judge(one, best) for one in found]
         likelier = max((best, *judged), key=lambda one: one.score)
