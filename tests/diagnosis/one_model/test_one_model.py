@@ -11,10 +11,12 @@ from mismatch_trials import Trial, made
 from test_resting import standing, warming
 from tracks import experiment, track_of
 
+from ahrsd import so3
 from ahrsd.diagnosis.forward import context_along, contribution
 from ahrsd.diagnosis.model_file import from_text, of_diagnosis, to_text
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import NothingToFit
+from ahrsd.simulation import ScenarioSettings, simulate
 
 
 @pytest.mark.parametrize("scenario", ["wam", "mam"])
@@ -235,3 +237,22 @@ def test_a_delay_is_no_eddy_current():
     found = diagnose(one.track)
     assert [finding.effect for finding in found.findings] == ["mag_time_lag"]
     assert found.findings[0].parameters[0].value == pytest.approx(0.06, abs=3e-3)
+
+
+@pytest.mark.parametrize("straight_g", [None, [0.0, 0.0, -1.0]])
+def test_a_mount_that_was_aligned_under_its_load_is_no_crooked_gyro_as_well(straight_g):
+    run = simulate(ScenarioSettings("mam", "rov", 47, 6000, 25.0, 0.0, 0.0))
+    track, rng = track_of(run), np.random.default_rng(47)
+    rest_g = np.zeros(3) if straight_g is None else np.array(straight_g)
+    bend = np.array([[0.004, 0.016, -0.006], [-0.018, 0.003, 0.008], [0.004, -0.006, 0.002]])
+    load_g = track.accel_b_m_s2 / 9.80665 - rest_g
+    turned = np.einsum("nij,nj->ni", so3.exp(load_g @ bend.T), run.field_b)
+    mag = track.mag_b_gauss + (turned - run.field_b) @ run.truth.soft_iron.T
+    mag = mag + 3e-4 * rng.normal(size=mag.shape)
+    gyro = track.gyro_b_rad_s + 3e-4 * rng.normal(size=mag.shape)
+    found = diagnose(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro))
+    assert [one.effect for one in found.findings] == ["flexible_mount"]
+    np.testing.assert_allclose(
+        found.findings[0].setting.get("straight_g", np.zeros(3)), rest_g, atol=0.1
+    )
+    assert not found.unexplained.detected
