@@ -12,12 +12,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
+from scipy.special import log_ndtr
 
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import LAG
 from ahrsd.diagnosis.one_model.evidence import At, reached
-from ahrsd.diagnosis.one_model.linearised import CALIBRATION, Linearised
+from ahrsd.diagnosis.one_model.linearised import CALIBRATION, Linearised, by_key
 from ahrsd.samples import Array
 
 BEAM, ASKED, MOST_MOVES = 2, 4, 8
@@ -106,6 +107,7 @@ class Hypotheses:
             at = reached(products, laws, (noise, start), asked - odds)
             if at is None:
                 return None
+            odds += self._believed(keys, at)
             self.judged[members] = Hypothesis(members, keys, at, at.nats + odds)
         return self.judged[members]
 
@@ -145,6 +147,25 @@ class Hypotheses:
         ]
         more = len(rows) - len(set(rows))
         return more * float(np.log(priors.AGAIN / priors.EFFECT))
+
+    def _believed(self, keys: Sequence[str], at: At) -> float:
+        """What it costs that a name's coefficient has a least value: its law has none below.
+
+        The probability that it is above, by the readings, over that by its law before them.
+        """
+        nats, values = 0.0, by_key(self.made, keys, at)
+        deviations, begin = by_key(self.made, keys, replace(at, mean=at.deviation)), 0
+        for key in keys:
+            one = self.component(key)
+            psi = at.psi[begin : begin + len(one.law.start)]
+            begin += len(psi)
+            if one.row is None or key == LAG:
+                continue
+            least = np.array([parameter.least for parameter in one.row.parameters])
+            own = np.exp(0.5 * one.law.log_variance(psi))
+            above = log_ndtr((values[key] - least) / deviations[key]) - log_ndtr(-least / own)
+            nats += float(np.sum(above))
+        return nats
 
     def _of_class(self, members: Names) -> float:
         real = self.is_real(members)

@@ -256,3 +256,17 @@ def test_a_mount_that_was_aligned_under_its_load_is_no_crooked_gyro_as_well(stra
         found.findings[0].setting.get("straight_g", np.zeros(3)), rest_g, atol=0.1
     )
     assert not found.unexplained.detected
+
+
+def test_a_scale_that_creeps_is_no_compensation_on_board():
+    """A compensation takes hard iron away: a part of it below a hundredth is another source."""
+    track = track_of(experiment("wam", seed=12, samples=4000))
+    since_s = track.time_s - track.time_s[0]
+    warmer = 0.012 * (1.0 - np.exp(-since_s / 50.0))
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss * (1.0 + warmer[:, None])))
+    assert found.findings == ()
+    assert found.unexplained.detected
+    one = made(Trial(seed=62, effects=(("onboard_calibration_active", 1.0),), samples=4000))
+    (told,) = diagnose(one.track).findings
+    assert told.effect == "onboard_calibration_active"
+    assert told.parameters[0].value == pytest.approx(one.truth[0][1][0], abs=0.1)
