@@ -241,8 +241,8 @@ class Space:
     """What a search may put into a set: candidates by effect, and free courses.
 
     finer: neighbours of a setting;  form: what a component leaves of its form;  steps_at: of a time
-    sources: that switch, of which one at most is in a set, and beside a remainder none: how large
-             they are in rooms is not measured
+    sources: that switch or have one direction, of which one at most is added, and none beside a
+             remainder: how large they are in rooms is not measured
     """
 
     effects: dict[str, list[str]]

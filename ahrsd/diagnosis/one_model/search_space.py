@@ -18,6 +18,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
     neighbours,
 )
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, Space, searched
+from ahrsd.diagnosis.one_model.one_direction import one_direction
 from ahrsd.diagnosis.one_model.rich import Judged, psi_by_key
 from ahrsd.diagnosis.one_model.switching import switching
 
@@ -52,8 +53,9 @@ def best_at(
 
 
 def _offered(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[str]:
-    """Keys of the sources that switch as a set leaves them, put among what may be in one."""
-    new = switching(all_sets, here)
+    """Keys of the sources that switch or have one direction as a set leaves them, put among what
+    may be in one."""
+    new = [*switching(all_sets, here), *one_direction(all_sets, here)]
     all_sets.made.add(new)
     space.sources.extend(one.key for one in new if one.key not in space.sources)
     return [one.key for one in new]
