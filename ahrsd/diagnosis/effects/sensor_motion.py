@@ -203,7 +203,8 @@ class FlexibleMount(Effect):
 
 def _load_g(readings: Readings, setting: Setting) -> Array:
     """(N, 3) specific force beyond that under which a mount is straight, g."""
-    return shapes.specific_force_g(readings) - np.array(setting.get("straight_g", (0.0, 0.0, 0.0)))
+    straight_g = np.array(setting.get("straight_g", np.zeros(3)), dtype=np.float64)
+    return np.asarray(shapes.specific_force_g(readings) - straight_g)
 
 
 class MagGyroMisalignment(Effect):

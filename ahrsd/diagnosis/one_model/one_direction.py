@@ -46,7 +46,7 @@ def one_direction(all_sets: Hypotheses, here: Hypothesis) -> list[Component]:
 
 
 def unalike(rows: Array) -> tuple[float, Array]:
-    """Nats by which rows (n, 3) have a covariance and not one power, and their loudest direction."""
+    """Nats by which rows (n, 3) have a covariance and not one power; the loudest direction."""
     powers, axes = np.linalg.eigh(rows.T @ rows / len(rows))
     powers = np.maximum(powers, 1e-300)
     nats = 0.5 * len(rows) * (3.0 * np.log(np.mean(powers)) - np.sum(np.log(powers)))
