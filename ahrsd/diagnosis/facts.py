@@ -46,7 +46,8 @@ class Fact:
 #: not a difference from its simulation, which has the same stamps, unless there are so many
 MISSING_SHARE = 0.02
 JITTER_SHARE = 0.05  # of the step
-#: a reading that is held for less is one that came late: it is not used, and no fault of the sensor
+#: s, all together: a reading that is held for less came late and is not used; that is no fault of
+#: the sensor, but again and again it is
 STUCK_S = 0.25
 
 
@@ -55,7 +56,7 @@ def matters(fact: Fact) -> bool:
     if fact.effect == "dropped_samples" and not fact.setting:
         return fact.parameters[0].value > MISSING_SHARE
     if fact.effect == "stuck_magnetometer":
-        return any(end - begin >= STUCK_S for begin, end in fact.where.intervals_s)
+        return fact.parameters[0].value >= STUCK_S
     if fact.effect == "stuck_gyro":  # no name of the library
         return False
     if fact.effect == "timestamp_jitter" and not fact.stops:

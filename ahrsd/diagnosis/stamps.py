@@ -17,10 +17,12 @@ from ahrsd.printable import counted
 from ahrsd.samples import Array, in_periods
 
 _MISSING_SHARE = 1e-3
-_JITTER = 0.03  # of the step
+#: of the step, from which on scatter is jitter unless the field says that the steps are as stamped;
+#: below, only where the field says that they are even
+_JITTER = 0.03
 _PIECE = 30  # rows over which a host's clock is straight
 _OPPOSED = -0.25  # correlation of neighbouring steps
-_TRUE_NATS = 5.0  # for steps as stamped, against steps of a regular clock
+_TRUE_NATS = 5.0  # for steps as stamped, against steps of a regular clock, or the reverse
 _OUTLIER = 5.0  # deviations
 _CLOCK = 2e-4  # relative rate between two clocks that is worth a word
 #: other clocks that a recording may carry
@@ -82,7 +84,9 @@ def _jitter(track: Track) -> list[Fact]:
     if variance == 0.0:
         return []
     opposed = float(np.mean(off[1:] * off[:-1])) / variance
-    if jitter < _JITTER * usual or opposed > _OPPOSED or _stamped_well(track) > _TRUE_NATS:
+    # scatter that is small for a clock is large beside a gyro that turns quickly
+    asked = -_TRUE_NATS if jitter < _JITTER * usual else _TRUE_NATS
+    if opposed > _OPPOSED or _stamped_well(track) > asked:
         return []
     where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), (), "link")
     words = f"the time stamps scatter by {1e3 * jitter:.2g} ms about a regular clock"

@@ -146,13 +146,17 @@ class MagLowPass(Linear):
 
 
 class FlexibleMount(Effect):
-    """M22.  Exact: a rotation by C a."""
+    """M22.  Exact: a rotation by C (a - a0).
+
+    A mount is straight without a load, or under the one that it was aligned under: level, or its
+    mean.  These differ by constant turns, which are a crooked gyro if they have no part here.
+    """
 
     identifier = "flexible_mount"
     code = "M22"
     family = "sensor"
     words = "the magnetometer's mount gives under its weight and acceleration"
-    equation = "m = A Exp(C a) h + b, a: specific force in g"
+    equation = "m = A Exp(C (a - a0)) h + b, a: specific force in g, a0: where it is straight"
     parameters = shapes.matrix("bend", "rad/g", 0.01, 0.2)
     typical = (0.0, 0.008, 0.002, -0.009, 0.0, 0.001, 0.002, -0.003, 0.0)
     needs = ("accel",)
@@ -171,19 +175,23 @@ class FlexibleMount(Effect):
     unseen = (tuple(np.eye(3).ravel() / np.sqrt(3.0)),)
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """Nothing to choose, where there is an accelerometer."""
-        return ({},) if context.track.accel_b_m_s2 is not None else ()
+        """Straight without a load, level, or under the mean load; where there are loads."""
+        if context.track.accel_b_m_s2 is None:
+            return ()
+        mean_g = np.mean(shapes.specific_force_g(readings_of(context)), axis=0)
+        mean = [round(float(one), 4) for one in mean_g]
+        return {}, {"straight_g": [0.0, 0.0, -1.0]}, {"straight_g": mean}
 
     def columns(self, context: Context, setting: Setting) -> Columns:
-        """A ((C a) x h)."""
+        """A ((C (a - a0)) x h)."""
         readings = readings_of(context)
-        force = shapes.specific_force_g(readings)
+        force = _load_g(readings, setting)
         turn = readings.soft_iron @ shapes.turned_by(readings.field_b)  # (N, 3, 3)
         return Columns(mag=np.einsum("nka,nb->nkab", turn, force).reshape(len(force), 3, 9))
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """The field seen from the bent mount."""
-        bend = shapes.specific_force_g(readings) @ value.reshape(3, 3).T
+        bend = _load_g(readings, setting) @ value.reshape(3, 3).T
         return with_field(readings, np.einsum("nij,nj->ni", so3.exp(bend), readings.field_b))
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
@@ -191,6 +199,12 @@ class FlexibleMount(Effect):
         if not shapes.has_accel(readings):
             raise ValueError(f"{self.identifier} needs an accelerometer")
         return strength * np.array(self.typical), {}
+
+
+def _load_g(readings: Readings, setting: Setting) -> Array:
+    """(N, 3) specific force beyond that under which a mount is straight, g."""
+    straight_g = np.array(setting.get("straight_g", np.zeros(3)), dtype=np.float64)
+    return np.asarray(shapes.specific_force_g(readings) - straight_g)
 
 
 class MagGyroMisalignment(Effect):

@@ -55,8 +55,11 @@ def lone_parts(all_parts: Iterable[Component]) -> list[Component]:
 def varying(known: Component, added: Array, context: Context) -> list[Component]:
     """What a name adds (N, 3), by a factor that is free in time, and by one free in attitude.
 
-    Both are relative to its coefficient.
+    Both are relative to its coefficient, and 0 in the mean: where an attitude hardly changes, a
+    factor that is free in it were else the name again, of one coefficient in place of many.
     """
+    weight = np.sum(added**2, axis=1)
+    weight = weight / max(float(np.sum(weight)), 1e-300)
     time_s = context.track.time_s
     order = np.arange(1, _WAVES + 1)
     phase = np.pi * (time_s - time_s[0]) / (time_s[-1] - time_s[0])
@@ -71,7 +74,7 @@ def varying(known: Component, added: Array, context: Context) -> list[Component]
     ]
     found = []
     for key, (factor, law) in zip(form_keys(known.key), factors, strict=True):
-        flat = added[:, :, None] * factor[:, None, :]
+        flat = added[:, :, None] * (factor - weight @ factor)[:, None, :]
         columns = Columns(gyro=flat) if known.columns.mag is None else Columns(mag=flat)
         found.append(Component(key, known.frame, columns, law, float(np.log(priors.COURSE))))
     return found

@@ -60,6 +60,8 @@ class Component:
     law:     of the coefficients
     prior:   log odds of being there
     row, setting: of the library, where it is one
+    beside: key of another that it holds and that is taken out of its columns: it is asked beside
+            that alone
     """
 
     key: str
@@ -69,6 +71,7 @@ class Component:
     prior: float = 0.0
     row: Effect | None = None
     setting: dict[str, Any] = field(default_factory=dict)
+    beside: str = ""
 
     @property
     def effect(self) -> str | None:

@@ -401,6 +401,7 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
     fewer = all_sets.judge(best.names - {key})
     named = {all_sets.component(k).effect for k in fewer.names}
     asked = [k for name, keys in space.effects.items() if name not in named for k in keys]
+    asked = [k for k in asked if all_sets.is_asked(fewer.names, k)]
     scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
     worth = scan.worth([*dict.fromkeys([*asked, key])])
     by_name: dict[str, float] = {}
@@ -416,7 +417,8 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
         # the scan knows sizes and noise but roughly: both as sets of their own
         off = best.score - fewer.score - by_name[mine]
         by_name = {name: nats + off for name, nats in by_name.items()}
-        by_name[named_so] = all_sets.judge(fewer.names | {rival}, best).score - fewer.score
+        instead = all_sets.judge(all_sets.with_(fewer.names, rival), best)
+        by_name[named_so] = instead.score - fewer.score
     for name, keys in space.effects.items():
         wider = all_sets.component(keys[0])
         if name in by_name and name != mine and holds(wider, own, TO_THE_DIGIT):

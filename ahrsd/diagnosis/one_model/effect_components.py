@@ -21,6 +21,7 @@ from ahrsd.samples import Array
 #: the delay that stands for all delays: which of them it is, is asked at the end
 LAG = "delay"
 LAG_FORM = "form of the delay"
+_BESIDE = ", beside the delay"
 #: part of the squares that may be left where one component's columns hold another's
 _ALIKE = 1e-3
 #: parts in which the transition of a step is free
@@ -111,7 +112,7 @@ def anew(known: Component, context: Context, library: Mapping[str, Effect]) -> C
     if known.row is None or known.key == LAG:
         return known
     made = replace(known, columns=known.row.columns(context, known.setting))
-    return beyond(made, delay(context, library))
+    return beyond(made, delay(context, library)) if known.beside else made
 
 
 def delay(context: Context, library: Mapping[str, Effect]) -> Component:
@@ -142,11 +143,17 @@ def holds(one: Component, part: Component, least: float = _ALIKE) -> bool:
 
 def beyond(one: Component, part: Component) -> Component:
     """A component that holds another, without it: both in one set would share what they have."""
-    if one.columns.mag is None or part.columns.mag is None or not holds(one, part):
-        return one
+    if one.columns.mag is None or part.columns.mag is None:
+        raise ValueError(f"{one.key} and {part.key} are not of the magnetometer")
     X, y = one.columns.mag, part.columns.mag[:, :, 0]
     along = np.einsum("nia,ni->a", X, y) / np.sum(y**2)
-    return replace(one, columns=Columns(mag=X - y[:, :, None] * along))
+    rest = Columns(mag=X - y[:, :, None] * along)
+    return replace(one, key=beside_key(one.key), columns=rest, beside=part.key)
+
+
+def beside_key(key: str) -> str:
+    """Key of what a component has beyond the delay that it holds."""
+    return key if key.endswith(_BESIDE) else f"{key}{_BESIDE}"
 
 
 def delay_form(context: Context, lag_s: float) -> Component:

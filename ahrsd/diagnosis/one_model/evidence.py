@@ -47,8 +47,9 @@ _FLAT, _STEPS, _LONGEST = 0.02, 40, 2.0
 _HOPED = 5.0
 #: parts of a step that are tried
 _PARTS = (1.0, 0.3, 0.1, 0.02)
-#: curvature of a logarithm that nothing tells of
-_LOOSE = 0.02
+#: curvature of a logarithm that nothing tells of;  parts of the curvature's diagonal that are added
+#: to it until a step leads up
+_LOOSE, _DAMPED = 0.02, (0.0, 0.1, 1.0, 10.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,9 +245,23 @@ def reached(
 
 
 def _newton(at: At, x: Array, low: Array, high: Array) -> Array:
-    """The step to the maximum of the quadratic that this point shows, inside of what is allowed."""
+    """The step to the maximum of the quadratic that this point shows, inside of what is allowed.
+
+    Where a logarithm ends at what is allowed and hardly differs from another, as the size and the
+    corner of a course, what is left of the step may lead down: then a shorter one is taken.
+    """
+    step = np.zeros(len(x))
+    for damped in _DAMPED:
+        step = _bounded(at, x, low, high, damped)
+        if float(at.gradient @ step) >= 0.0:
+            break
+    return step
+
+
+def _bounded(at: At, x: Array, low: Array, high: Array, damped: float) -> Array:
+    """The step with so much of the curvature's diagonal added to it, end after end held."""
     g = at.gradient
-    H = at.curvature + _LOOSE * np.eye(len(x))
+    H = at.curvature + np.diag(_LOOSE + damped * np.diag(at.curvature))
     step = np.zeros(len(x))
     free = ~(((x <= low) & (g < 0.0)) | ((x >= high) & (g > 0.0)))
     while np.any(free):

@@ -31,6 +31,7 @@ class CourseLaw:
     """psi: logarithms of the size, in units of `unit`, and of the corner, in half waves.
 
     order (q,): of each coefficient;  mean, spread: of the log size; spread 0: even;  most: units
+    corners: between which the corner is
     """
 
     order: Array
@@ -38,6 +39,7 @@ class CourseLaw:
     mean: float = 0.0
     spread: float = 0.0
     most: float = priors.COURSE_SIZES[1]
+    corners: tuple[float, float] = priors.COURSE_CORNERS
 
     @property
     def start(self) -> Array:
@@ -47,12 +49,12 @@ class CourseLaw:
     @property
     def low(self) -> Array:
         """Lowest psi."""
-        return np.log([priors.COURSE_SIZES[0], priors.COURSE_CORNERS[0]])
+        return np.log([priors.COURSE_SIZES[0], self.corners[0]])
 
     @property
     def high(self) -> Array:
         """Highest psi."""
-        return np.log([self.most, priors.COURSE_CORNERS[1]])
+        return np.log([self.most, self.corners[1]])
 
     @property
     def stiffness(self) -> Array:

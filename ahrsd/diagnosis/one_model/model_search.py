@@ -12,12 +12,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
+from scipy.special import log_ndtr
 
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import LAG
 from ahrsd.diagnosis.one_model.evidence import At, reached
-from ahrsd.diagnosis.one_model.linearised import CALIBRATION, Linearised
+from ahrsd.diagnosis.one_model.linearised import CALIBRATION, Linearised, by_key
 from ahrsd.samples import Array
 
 BEAM, ASKED, MOST_MOVES = 2, 4, 8
@@ -51,7 +52,7 @@ class Hypotheses:
     remainder: keys of what every real recording leaves, in or out together
     start: noise (B,) and psi by key that the richest model has
     forms: key of what a component leaves of its form, which comes and goes with it
-    beside_delay: effects of which a delay is a part: they are asked beside it, not in its place
+    holding: key of what contains a delay, and of the same beside one, without it
     real: whether all sets are of a recording that leaves what real ones do, whatever is in them
     unknown_nats: evidence of a source that switches and was taken out: a rest of it is left
     """
@@ -61,7 +62,7 @@ class Hypotheses:
     start_noise: Array
     start_psi: Mapping[str, Array]
     forms: dict[str, str] = field(default_factory=dict)
-    beside_delay: frozenset[str] = frozenset()
+    holding: Mapping[str, str] = field(default_factory=dict)
     judged: dict[Names, Hypothesis] = field(default_factory=dict)
     real: bool = False
     unknown_nats: float = 0.0
@@ -106,16 +107,23 @@ class Hypotheses:
             at = reached(products, laws, (noise, start), asked - odds)
             if at is None:
                 return None
+            odds += self._believed(keys, at)
             self.judged[members] = Hypothesis(members, keys, at, at.nats + odds)
         return self.judged[members]
 
     def without(self, members: Names, key: str) -> Names:
-        """The set without a member, and without what is asked only beside it."""
-        if key != LAG:
-            return members - {key}
-        return (
-            members - {key} - {k for k in members if self.component(k).effect in self.beside_delay}
-        )
+        """The set without a member: without the delay what contains one is whole."""
+        whole = {other: key for key, other in self.holding.items()} if key == LAG else {}
+        return frozenset(whole.get(one, one) for one in members - {key})
+
+    def with_(self, members: Names, key: str) -> Names:
+        """The set with one more member: beside the delay what contains one is without it."""
+        beside = self.holding if key == LAG else {}
+        return frozenset(beside.get(one, one) for one in members | {key})
+
+    def is_asked(self, members: Names, key: str) -> bool:
+        """Whether a candidate may be asked beside a set: whole where no delay is in it."""
+        return key not in self.holding if LAG in members else not self.component(key).beside
 
     def is_real(self, members: Names) -> bool:
         """Whether a set leaves what real recordings do."""
@@ -139,6 +147,25 @@ class Hypotheses:
         ]
         more = len(rows) - len(set(rows))
         return more * float(np.log(priors.AGAIN / priors.EFFECT))
+
+    def _believed(self, keys: Sequence[str], at: At) -> float:
+        """What it costs that a name's coefficient has a least value: its law has none below.
+
+        The probability that it is above, by the readings, over that by its law before them.
+        """
+        nats, values = 0.0, by_key(self.made, keys, at)
+        deviations, begin = by_key(self.made, keys, replace(at, mean=at.deviation)), 0
+        for key in keys:
+            one = self.component(key)
+            psi = at.psi[begin : begin + len(one.law.start)]
+            begin += len(psi)
+            if one.row is None or key == LAG:
+                continue
+            least = np.array([parameter.least for parameter in one.row.parameters])
+            own = np.exp(0.5 * one.law.log_variance(psi))
+            above = log_ndtr((values[key] - least) / deviations[key]) - log_ndtr(-least / own)
+            nats += float(np.sum(above))
+        return nats
 
     def _of_class(self, members: Names) -> float:
         real = self.is_real(members)
@@ -214,8 +241,8 @@ class Space:
     """What a search may put into a set: candidates by effect, and free courses.
 
     finer: neighbours of a setting;  form: what a component leaves of its form;  steps_at: of a time
-    sources: that switch, of which one at most is in a set, and beside a remainder none: how large
-             they are in rooms is not measured
+    sources: that switch or have one direction, of which one at most is added, and none beside a
+             remainder: how large they are in rooms is not measured
     """
 
     effects: dict[str, list[str]]
@@ -265,7 +292,11 @@ def exchanged(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
     for _ in range(MOST_MOVES):
         names = [key for key in best.names if all_sets.component(key).row is not None]
         bases = [best.names - {key} for key in names if key != LAG]
-        found = [base | {key} for base in bases for key in asked(all_sets, space, base, best)]
+        found = [
+            all_sets.with_(base, key)
+            for base in bases
+            for key in asked(all_sets, space, base, best)
+        ]
         judged = [all_sets.judge(one, best) for one in found]
         likelier = max((best, *judged), key=lambda one: one.score)
         if likelier is best:
@@ -314,7 +345,7 @@ def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
     bare = names - set(space.courses)
     for base in {names, bare}:
         ranked = asked(all_sets, space, base, here)
-        out += [base | {key} for key in ranked]
+        out += [all_sets.with_(base, key) for key in ranked]
     return list(dict.fromkeys(out))
 
 
@@ -358,9 +389,7 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
         for key in keys if key not in base
     ]  # fmt: skip
     candidates = [key for key in candidates if not _beside_its_like(all_sets, base, key)]
-    if LAG not in base:
-        part = all_sets.beside_delay
-        candidates = [key for key in candidates if all_sets.component(key).effect not in part]
+    candidates = [key for key in candidates if all_sets.is_asked(base, key)]
     if not candidates:
         return []
     scan = beside(all_sets.made, model.keys, at)

@@ -94,6 +94,9 @@ SPELL_S, BETWEEN_S, SPELL_PIECE_S, SPELL_CORNERS = 2.0, 20.0, 0.2, (0.1, 10.0)
 #: part of the time that it is on, beyond which it does not come and go; and half waves of all of
 #: its spells, at most
 MOST_ON, MOST_WAVES = 0.3, 100
+#: nats by which a residual is unlike along its three axes: twice that is one in 1e6 by chance, of
+#: five degrees of freedom;  and directions that a source of one may have
+UNALIKE, DIRECTIONS = 18.0, 100.0
 #: how often what switches is outside of the vehicle;  source: the rules' three nats
 SWITCHES_OUTSIDE = 0.05
 #: square of a jump of the mean, in its deviations, of three axes: one in 1e6 by chance

@@ -9,6 +9,7 @@ from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
     LAG_FORM,
+    beside_key,
     beyond,
     component,
     form_of,
@@ -17,6 +18,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
     neighbours,
 )
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, Space, searched
+from ahrsd.diagnosis.one_model.one_direction import one_direction
 from ahrsd.diagnosis.one_model.rich import Judged, psi_by_key
 from ahrsd.diagnosis.one_model.switching import switching
 
@@ -34,7 +36,7 @@ def best_at(
     base = rich.base
     all_sets, space = space_at(rich, library, named)
     real = frozenset(base.remainder)
-    known = frozenset(one.key for one in named)
+    known = all_sets.without(frozenset(one.key for one in named), LAG)
     lag = frozenset([LAG])
     starts: list[Names] = [frozenset(), lag, real | lag, real | lag | {COURSES[0]}]
     if known:
@@ -51,8 +53,9 @@ def best_at(
 
 
 def _offered(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[str]:
-    """Keys of the sources that switch as a set leaves them, put among what may be in one."""
-    new = switching(all_sets, here)
+    """Keys of the sources that switch or have one direction as a set leaves them, put among what
+    may be in one."""
+    new = [*switching(all_sets, here), *one_direction(all_sets, here)]
     all_sets.made.add(new)
     space.sources.extend(one.key for one in new if one.key not in space.sources)
     return [one.key for one in new]
@@ -65,11 +68,11 @@ def space_at(
     base = rich.base
     made, context = base.made, base.made.context
     found = library_components(context, library)
-    effects = {name: [one.key for one in parts] for name, parts in found.items()}
     delay = made.seen[LAG].component
-    nested = frozenset(name for name, parts in found.items() if holds(parts[0], delay))
-    for name in nested:
-        found[name] = [beyond(one, delay) for one in found[name]]
+    whole = [one for parts in found.values() if holds(parts[0], delay) for one in parts]
+    for one in whole:
+        found[one.effect or ""].append(beyond(one, delay))
+    effects = {name: [one.key for one in parts] for name, parts in found.items()}
     made.add([one for parts in found.values() for one in parts])
     effects[delay.effect or LAG] = [LAG]
     forms = {}
@@ -84,7 +87,8 @@ def space_at(
     if LAG_FORM in made.seen:
         forms[LAG] = LAG_FORM
     psi = psi_by_key(made, base.whole, rich.at)
-    all_sets = Hypotheses(made, base.remainder, rich.at.log_noise, psi, forms, nested)
+    holding = {one.key: beside_key(one.key) for one in whole}
+    all_sets = Hypotheses(made, base.remainder, rich.at.log_noise, psi, forms, holding)
     length_s = context.track.duration_s
 
     def finer(one: Component, round_: int) -> list[Component]:

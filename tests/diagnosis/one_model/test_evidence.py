@@ -217,3 +217,24 @@ def test_bands_that_stand_alone_may_have_any_power() -> None:
         assert slope[k] == pytest.approx((up - down) / 2e-4, abs=1e-6)
     expected = -noise_model.stiffness(len(loud), STEP, alone) @ loud
     np.testing.assert_allclose(slope, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [0.03, 0.1])
+def test_a_climb_goes_on_where_size_and_corner_are_nearly_one(size: float) -> None:
+    """As many half waves as are seen, one as loud as the other: the corner ends at its highest."""
+    rng, count, known = np.random.default_rng(1), 200, 1e4
+    w = size * rng.normal(size=count)
+    s = known * w + np.sqrt(known) * rng.normal(size=count)
+    rows = 3.0 * count
+    said = Products(
+        np.diag(np.full(count, known))[None],
+        s[None],
+        np.array([s @ s / known + rows - count]),
+        np.array([rows]),
+        STEP,
+    )
+    law = CourseLaw(np.arange(1, count + 1).astype(float), 1.0)
+    starts = [np.array([0.0, np.log(corner)]) for corner in (4.0, 36.0)]
+    low, high = (maximised(said, [law], (np.zeros(1), start)) for start in starts)
+    assert low.nats == pytest.approx(high.nats, abs=0.05)
+    assert np.exp(low.psi[1]) == pytest.approx(40.0, rel=0.01)

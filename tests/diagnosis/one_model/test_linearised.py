@@ -83,6 +83,8 @@ def test_eddy_currents_hold_a_delay_and_no_other_effect_does(bare):
     parts = library_components(bare.base.made.context, EFFECTS)
     assert [name for name, some in parts.items() if holds(some[0], delay)] == ["eddy_current"]
     eddy = beyond(parts["eddy_current"][0], delay)
+    assert eddy.beside == LAG
+    assert eddy.key != parts["eddy_current"][0].key
     assert not holds(eddy, delay)
     shared = np.einsum("nia,ni->a", eddy.columns.mag, delay.columns.mag[:, :, 0])
     np.testing.assert_allclose(shared, 0.0, atol=1e-9)

@@ -11,10 +11,12 @@ from mismatch_trials import Trial, made
 from test_resting import standing, warming
 from tracks import experiment, track_of
 
+from ahrsd import so3
 from ahrsd.diagnosis.forward import context_along, contribution
 from ahrsd.diagnosis.model_file import from_text, of_diagnosis, to_text
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import NothingToFit
+from ahrsd.simulation import ScenarioSettings, simulate
 
 
 @pytest.mark.parametrize("scenario", ["wam", "mam"])
@@ -217,3 +219,54 @@ def test_a_line_that_wanders_in_frequency_is_no_alternating_field_but_unknown():
     assert found.findings == ()
     assert found.unexplained.detected
     assert found.unexplained.where.frame == "sensor"
+
+
+def test_eddy_currents_that_differ_by_axis_are_named_without_a_delay():
+    # the vehicle yaws: its field along one axis hardly changes, and a factor of that is none
+    one = made(Trial(seed=54, effects=(("eddy_current", 1.0),), samples=3000, rate_hz=25.0))
+    found = diagnose(one.track)
+    assert [finding.effect for finding in found.findings] == ["eddy_current"]
+    assert not found.unexplained.detected
+    _, truth, _ = one.truth[0]
+    size = np.array([p.value for p in found.findings[0].parameters])
+    np.testing.assert_allclose(size, truth, atol=3e-3)
+
+
+def test_a_delay_is_no_eddy_current():
+    one = made(Trial(seed=44, effects=(("mag_time_lag", 3.0),), samples=3000, rate_hz=25.0))
+    found = diagnose(one.track)
+    assert [finding.effect for finding in found.findings] == ["mag_time_lag"]
+    assert found.findings[0].parameters[0].value == pytest.approx(0.06, abs=3e-3)
+
+
+@pytest.mark.parametrize("straight_g", [None, [0.0, 0.0, -1.0]])
+def test_a_mount_that_was_aligned_under_its_load_is_no_crooked_gyro_as_well(straight_g):
+    run = simulate(ScenarioSettings("mam", "rov", 47, 6000, 25.0, 0.0, 0.0))
+    track, rng = track_of(run), np.random.default_rng(47)
+    rest_g = np.zeros(3) if straight_g is None else np.array(straight_g)
+    bend = np.array([[0.004, 0.016, -0.006], [-0.018, 0.003, 0.008], [0.004, -0.006, 0.002]])
+    load_g = track.accel_b_m_s2 / 9.80665 - rest_g
+    turned = np.einsum("nij,nj->ni", so3.exp(load_g @ bend.T), run.field_b)
+    mag = track.mag_b_gauss + (turned - run.field_b) @ run.truth.soft_iron.T
+    mag = mag + 3e-4 * rng.normal(size=mag.shape)
+    gyro = track.gyro_b_rad_s + 3e-4 * rng.normal(size=mag.shape)
+    found = diagnose(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro))
+    assert [one.effect for one in found.findings] == ["flexible_mount"]
+    np.testing.assert_allclose(
+        found.findings[0].setting.get("straight_g", np.zeros(3)), rest_g, atol=0.1
+    )
+    assert not found.unexplained.detected
+
+
+def test_a_scale_that_creeps_is_no_compensation_on_board():
+    """A compensation takes hard iron away: a part of it below a hundredth is another source."""
+    track = track_of(experiment("wam", seed=12, samples=4000))
+    since_s = track.time_s - track.time_s[0]
+    warmer = 0.012 * (1.0 - np.exp(-since_s / 50.0))
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss * (1.0 + warmer[:, None])))
+    assert found.findings == ()
+    assert found.unexplained.detected
+    one = made(Trial(seed=62, effects=(("onboard_calibration_active", 1.0),), samples=4000))
+    (told,) = diagnose(one.track).findings
+    assert told.effect == "onboard_calibration_active"
+    assert told.parameters[0].value == pytest.approx(one.truth[0][1][0], abs=0.1)

@@ -1,0 +1,49 @@
+"""Quick sources of one direction: what noise of a colour, which is alike on all axes, swallows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracks import experiment, track_of
+
+from ahrsd.diagnosis.one_model import priors
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.one_model.one_direction import unalike
+
+
+def test_what_is_alike_along_all_axes_has_no_direction():
+    rng, most = np.random.default_rng(1), 0.0
+    for _ in range(300):
+        most = max(most, unalike(rng.normal(size=(60, 3)))[0])
+    assert 5.0 < most < priors.UNALIKE
+
+
+def test_the_direction_is_the_loudest():
+    rng, axis = np.random.default_rng(2), np.array([0.6, -0.7, 0.39])
+    axis /= np.linalg.norm(axis)
+    rows = rng.normal(size=(120, 3)) + 2.0 * rng.normal(size=(120, 1)) * axis
+    nats, direction = unalike(rows)
+    assert abs(direction @ axis) > 0.98
+    assert nats > 50.0
+    powers = np.linalg.eigvalsh(rows.T @ rows / 120)
+    assert nats == pytest.approx(60.0 * (3 * np.log(powers.mean()) - np.log(powers).sum()))
+
+
+def test_iron_on_a_joint_that_nobody_logged_is_unknown_on_the_sensor():
+    track = track_of(experiment("wam", seed=14, samples=6000, sigma_mag=5e-4))
+    rng, rate_hz = np.random.default_rng(5), 25.0
+    angle = np.fft.rfft(rng.normal(size=len(track)))
+    hertz = np.fft.rfftfreq(len(track), 1 / rate_hz)
+    angle *= (hertz > 0.1) & (hertz < 0.4)  # it moves to and fro in some seconds
+    angle = np.fft.irfft(angle, len(track))
+    axis = np.array([0.6, -0.7, 0.39]) / np.linalg.norm([0.6, -0.7, 0.39])
+    added = 7e-4 * (angle / angle.std())[:, None] * axis
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    assert found.findings == ()
+    left = found.unexplained
+    assert left.detected
+    assert left.where.frame == "sensor"
+    assert abs(np.array(left.where.direction) @ axis) > 0.95
+    assert left.evidence_nats > 30.0
