@@ -435,7 +435,8 @@ def _which_delay(
     A filter's where its form is there in full; half a step's where the delay is that and no other.
     """
     tau, unsure = float(lag_s[0]), float(deviation_s[0])
-    plain = plain_delay(library, 1.0 if tau >= 0.0 else -1.0)
+    late = cast("Effect", all_sets.component(LAG).row)
+    plain = plain_delay(library, 1.0 if tau >= 0.0 else -1.0) or late
     nats = {plain.identifier: 0.0}
     half_s = _half_step_s(all_sets)
     for row in library.values() if tau > 0.0 else ():

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
@@ -16,7 +16,15 @@ from ahrsd.diagnosis.one_model.effect_components import (
     library_components,
     neighbours,
 )
-from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, Space, searched
+from ahrsd.diagnosis.one_model.model_search import (
+    Beside,
+    Hypotheses,
+    Hypothesis,
+    Names,
+    Space,
+    searched,
+)
+from ahrsd.diagnosis.one_model.remembered import remembered
 from ahrsd.diagnosis.one_model.rich import Judged, psi_by_key
 from ahrsd.diagnosis.one_model.switching import switching
 
@@ -31,11 +39,11 @@ def best_at(
     rich: Judged, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
 ) -> tuple[Hypotheses, Space, Hypothesis]:
     """The likeliest set at a richest model, searched from what is known and from nothing."""
-    base = rich.base
+    base, made = rich.base, rich.base.made
     all_sets, space = space_at(rich, library, named)
     real = frozenset(base.remainder)
     known = frozenset(one.key for one in named)
-    lag = frozenset([LAG])
+    lag = frozenset([LAG]) & made.seen.keys()
     starts: list[Names] = [frozenset(), lag, real | lag, real | lag | {COURSES[0]}]
     if known:
         here = known | real if was_real else known
@@ -66,12 +74,14 @@ def space_at(
     made, context = base.made, base.made.context
     found = library_components(context, library)
     effects = {name: [one.key for one in parts] for name, parts in found.items()}
-    delay = made.seen[LAG].component
-    nested = frozenset(name for name, parts in found.items() if holds(parts[0], delay))
-    for name in nested:
-        found[name] = [beyond(one, delay) for one in found[name]]
+    nested: frozenset[str] = frozenset()
+    if LAG in made.seen:
+        delay = made.seen[LAG].component
+        nested = frozenset(name for name, parts in found.items() if holds(parts[0], delay))
+        for name in nested:
+            found[name] = [beyond(one, delay) for one in found[name]]
+        effects[delay.effect or LAG] = [LAG]
     made.add([one for parts in found.values() for one in parts])
-    effects[delay.effect or LAG] = [LAG]
     forms = {}
     for one in named:
         listed = effects.setdefault(one.effect or one.key, [])
@@ -87,17 +97,25 @@ def space_at(
     all_sets = Hypotheses(made, base.remainder, rich.at.log_noise, psi, forms, nested)
     length_s = context.track.duration_s
 
-    def finer(one: Component, round_: int) -> list[Component]:
+    def made_of(one: Component, settings: Iterable[Setting]) -> list[Component]:
         if one.row is None or one.key == LAG:
             return []
         row, tried = one.row, max(_SOUGHT, len(effects[one.row.identifier]))
-        near = neighbours(one.setting, length_s, round_)
-        return [component(context, row, setting, tried) for setting in near]
+        return [component(context, row, setting, tried) for setting in settings]
+
+    def finer(one: Component, round_: int) -> list[Component]:
+        return made_of(one, neighbours(one.setting, length_s, round_))
+
+    def closer(scan: Beside, one: Component, round_: int) -> list[Component]:
+        return made_of(one, remembered(scan, one, round_))
+
+    def left_of(one: Component) -> Component | None:
+        return form_of(one, context, library)
 
     def steps_at(time_s: float) -> list[Component]:
         setting = {"onset_s": round(time_s, 3)}
         jumping = [row for row in library.values() if row.jumps]
         return [component(context, row, setting, _ONSETS) for row in jumping]
 
-    space = Space(effects, COURSES, finer, lambda one: form_of(one, context, library), steps_at)
+    space = Space(effects, COURSES, finer, closer, left_of, steps_at)
     return all_sets, space
