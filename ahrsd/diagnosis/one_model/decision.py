@@ -21,7 +21,13 @@ from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.intervals import departures
 from ahrsd.diagnosis.locate import Frame, single_source, unit_columns
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.alternatives import form_keys, lone_parts, other_courses, varying
+from ahrsd.diagnosis.one_model.alternatives import (
+    by_heading,
+    form_keys,
+    lone_parts,
+    other_courses,
+    varying,
+)
 from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
@@ -68,6 +74,7 @@ def decided(
 ) -> Answer:
     """The answer of a search."""
     best = _with_one_part(all_sets, space, best)
+    best = _with_heading(all_sets, space, best)
     best, rivals = _borne_out(all_sets, space, best)
     best, rivals = _beside_others(all_sets, space, best, rivals)
     best, rivals = _held_to_form(all_sets, space, best, rivals)
@@ -201,6 +208,19 @@ def _with_one_part(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypo
     bare = best.names - rest
     judged = [all_sets.judge(bare | {one.key}) for one in found]
     return max((best, *judged), key=lambda one: one.score)
+
+
+def _with_heading(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+    """The set with a field by heading, where that is likelier and nothing else is unknown.
+
+    Of rooms it is not asked: where one walks in a circle, the heading is the place.
+    """
+    unknown = any(all_sets.component(key).row is None for key in best.names)
+    if unknown or all_sets.real or not space.courses:
+        return best
+    heading = by_heading(all_sets.made.context)
+    all_sets.made.add([heading])
+    return max((best, all_sets.judge(best.names | {heading.key}, best)), key=lambda one: one.score)
 
 
 def _names(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
