@@ -38,6 +38,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
 )
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
+from ahrsd.diagnosis.one_model.near_settings import changed, opened
 from ahrsd.diagnosis.one_model.remainder import still_spells
 from ahrsd.diagnosis.prior import prior_of
 from ahrsd.diagnosis.validate import heading_error_deg
@@ -345,6 +346,7 @@ def _told(
     """A member as a finding and as a term of the repaired model."""
     one = all_sets.component(key)
     value, deviation = coefficients(all_sets, best, key)
+    deviation = np.maximum(deviation, _left_open(all_sets, best, key, value))
     effect = library[one.effect or key]
     if key == LAG:
         shares = _which_delay(all_sets, best, value, deviation, library)
@@ -360,6 +362,21 @@ def _told(
     found = _found(effect, shares, where, value, deviation, setting, odds, library)
     found = replace(found, cost_if_left_out=_cost(all_sets, best, key))
     return found, Term(effect.identifier, value, deviation, setting)
+
+
+def _left_open(all_sets: Hypotheses, best: Hypothesis, key: str, value: Array) -> Array:
+    """(q,) deviations of a member's coefficients whatever its setting is nearby.
+
+    What has a form of its own, as the way of a hand, has no setting that is sharper.
+    """
+    one, made = all_sets.component(key), all_sets.made
+    near = {} if key in all_sets.forms else changed(one, made.context)
+    whole = opened(one, made.context, value, near)
+    if whole is None:
+        return np.zeros(len(value))
+    fewer = all_sets.judge(best.names - {key}, best)
+    at = replace(fewer.at, log_noise=best.at.log_noise)
+    return beside(made, fewer.keys, at).likeliest(whole)[1][: len(value)]
 
 
 def _found(

@@ -172,14 +172,15 @@ class Beside:
         noise = np.minimum(self.at.log_noise, self.at.log_noise[-1])
         return beside(self.made, self.keys, replace(self.at, log_noise=noise))
 
-    def likeliest(self, one: Component) -> Array:
-        """(q,) coefficients of a candidate of the largest size."""
+    def likeliest(self, one: Component) -> tuple[Array, Array]:
+        """(q,) coefficients of a candidate of the largest size, and their deviations."""
         self.made.add([one])
         C, own, s = self.made.candidates(self.keys, [one.key], self.inverse)
         W = self.projected(C)
         G = own[0] - W.T @ W
         G[np.diag_indices_from(G)] += np.exp(-one.law.log_variance(one.law.high))
-        return np.asarray(np.linalg.solve(G, s - self.seen @ W))
+        covariance = np.linalg.inv(G)
+        return covariance @ (s - self.seen @ W), np.sqrt(np.diagonal(covariance))
 
     def worth(self, candidates: Sequence[str]) -> dict[str, float]:
         """Log Bayes factor of each candidate, sizes averaged."""
