@@ -38,8 +38,8 @@ from ahrsd.diagnosis.hygiene import would_have_shown
 from ahrsd.diagnosis.levels import without_levels
 from ahrsd.diagnosis.likelier_forms import without_likelier_forms
 from ahrsd.diagnosis.limits import LIMITS, Limits
-from ahrsd.diagnosis.lost import believed, beyond_lost, differ, lost_beside
-from ahrsd.diagnosis.missing import lost_turns
+from ahrsd.diagnosis.lost import believed, beyond_lost, lost_beside
+from ahrsd.diagnosis.missing import differ, lost_turns
 from ahrsd.diagnosis.name import Judged
 from ahrsd.diagnosis.noise import level_facts
 from ahrsd.diagnosis.null import baseline, fit_null

@@ -14,16 +14,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from ahrsd.diagnosis.delay import without_lag
 from ahrsd.diagnosis.descent import FittedTerm
 from ahrsd.diagnosis.facts import Fact
-from ahrsd.diagnosis.missing import LONG, UNSEEN, missing_turns
+from ahrsd.diagnosis.missing import LONG, UNSEEN, missing_turns, price
 from ahrsd.diagnosis.null import at_model
 from ahrsd.diagnosis.problem import Problem
 from ahrsd.diagnosis.search import STEPS, State, refitted
-from ahrsd.diagnosis.turns import LONGER_NATS
 from ahrsd.diagnosis.unknown import Remainder, detected
 
 #: a step so near to a turn that was put right may be its answer
@@ -57,15 +54,6 @@ def _without_answers(state: State, lost: Sequence[Fact]) -> tuple[FittedTerm, ..
     )
 
 
-def differ(lost: Sequence[Fact], beside: Sequence[Fact]) -> bool:
-    """Whether the two searches put other turns right."""
-    first, then = (
-        [fact.turned for fact in facts if fact.turned is not None] for facts in (lost, beside)
-    )
-    pairs = zip(first, then, strict=False)
-    return len(first) != len(then) or not all(np.array_equal(a, b) for a, b in pairs)
-
-
 def believed(
     lost: Sequence[Fact], put_right: State, beside: Sequence[Fact], otherwise: State
 ) -> bool:
@@ -77,17 +65,6 @@ def believed(
     if not lost:
         return False
     return _as_seen(put_right) - price(lost) > _as_seen(otherwise) - price(beside)
-
-
-def price(facts: Sequence[Fact]) -> float:
-    """Nats that lost turns cost: which rows of all they are, and each further step of a gap."""
-    turned = [fact.turned for fact in facts if fact.turned is not None]
-    steps = np.round(np.concatenate([np.empty(0), *turned]) - 1.0)
-    rows = int(np.count_nonzero(steps > 0))
-    if not rows:
-        return 0.0
-    longer = float(np.sum(steps[steps > 0] - 1.0))
-    return rows * float(np.log(len(steps) / rows)) + longer * LONGER_NATS
 
 
 def _as_seen(state: State) -> float:

@@ -7,7 +7,7 @@ Noise does that as often backwards as forwards, which tells how many of the jump
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,7 @@ from ahrsd.diagnosis.diagnosis import Value, Where
 from ahrsd.diagnosis.facts import Fact
 from ahrsd.diagnosis.innovation import Filtered, run_filter
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.turns import QUARTER, Turns, recovered, some_lost
+from ahrsd.diagnosis.turns import LONGER_NATS, QUARTER, Turns, recovered, some_lost
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.printable import counted
 from ahrsd.samples import Array
@@ -73,6 +73,26 @@ def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
         if np.count_nonzero(turns.lost) >= _FEWEST:
             return [_fact(track, turns, {UNSEEN: expected})]
     return []
+
+
+def differ(lost: Sequence[Fact], beside: Sequence[Fact]) -> bool:
+    """Whether the two searches put other turns right."""
+    first, then = (
+        [fact.turned for fact in facts if fact.turned is not None] for facts in (lost, beside)
+    )
+    pairs = zip(first, then, strict=False)
+    return len(first) != len(then) or not all(np.array_equal(a, b) for a, b in pairs)
+
+
+def price(facts: Sequence[Fact]) -> float:
+    """Nats that lost turns cost: which rows of all they are, and each further step of a gap."""
+    turned = [fact.turned for fact in facts if fact.turned is not None]
+    steps = np.round(np.concatenate([np.empty(0), *turned]) - 1.0)
+    rows = int(np.count_nonzero(steps > 0))
+    if not rows:
+        return 0.0
+    longer = float(np.sum(steps[steps > 0] - 1.0))
+    return rows * float(np.log(len(steps) / rows)) + longer * LONGER_NATS
 
 
 @dataclass(frozen=True, slots=True, eq=False)

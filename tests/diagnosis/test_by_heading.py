@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis import refined
 from ahrsd.diagnosis.by_heading import HARMONICS, heading_columns, heading_nats
+from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.null import fit_null
@@ -48,13 +50,19 @@ def test_what_a_turret_is_worth_and_what_noise_is() -> None:
     assert heading_nats(basis_of(turret(5e-4))) > np.log(1e6)
 
 
-def test_a_weak_turret_is_unknown_and_on_the_vehicle(monkeypatch) -> None:
+@pytest.mark.parametrize("library", [{}, EFFECTS])
+def test_a_weak_turret_is_unknown_and_on_the_vehicle(library, ask) -> None:
     """Of 60 uG, 29 nats: courses in time and forms of the library's own see nothing."""
-    track = turret(6e-5)
-    found = diagnose(track, library={})
+    found = ask(turret(6e-5), library=library)
     assert found.findings == ()
     assert found.unexplained.detected
     assert found.unexplained.where.frame == "sensor"
-    assert not diagnose(turret(0.0), library={}).unexplained.detected
+
+
+def test_what_does_not_turn_with_the_heading_is_no_turret(ask) -> None:
+    assert not ask(turret(0.0), library={}).unexplained.detected
+
+
+def test_without_a_field_by_heading_a_weak_turret_is_not_seen(monkeypatch) -> None:
     monkeypatch.setattr(refined, "heading_nats", lambda _: -1.0)
-    assert not diagnose(track, library={}).unexplained.detected
+    assert not diagnose(turret(6e-5), library={}).unexplained.detected

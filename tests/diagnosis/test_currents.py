@@ -69,7 +69,7 @@ def test_the_steps_of_an_unlogged_current_are_no_lost_samples(seed: int) -> None
 
 
 @pytest.mark.parametrize("seed", [5, 6])
-def test_lost_samples_are_told_beside_a_current(seed: int) -> None:
+def test_lost_samples_are_told_beside_a_current(seed: int, ask) -> None:
     """Without the current turns are put right where none was lost; of 5, steps are named there."""
     track = track_of(experiment("wam", seed=seed, samples=3000))
     track = _disturbed(track, SHAPES["square"](track.time_s), logged=True)
@@ -83,7 +83,7 @@ def test_lost_samples_are_told_beside_a_current(seed: int) -> None:
         {name: values[keep] for name, values in track.covariates.items()},
         (slice(0, len(keep)),),
     )
-    found = {one.effect: one for one in diagnose(cut).findings}
+    found = {one.effect: one for one in ask(cut).findings}
     assert found.keys() == {"motor_current_field", "dropped_samples"}
     assert found["dropped_samples"].parameters[0].value == pytest.approx(0.01, abs=0.005)
 

@@ -232,11 +232,11 @@ LIBRARY = {
 }
 
 
-def test_a_source_that_swells_is_unknown_and_a_step_a_step() -> None:
-    swelled = diagnose(with_field(swelling), library=LIBRARY)
+def test_a_source_that_swells_is_unknown_and_a_step_a_step(ask) -> None:
+    swelled = ask(with_field(swelling), library=LIBRARY)
     assert [one.effect for one in swelled.findings] == []
     assert swelled.unexplained.detected and swelled.unexplained.where.frame == "sensor"
-    stepped = diagnose(with_field(stepping), library=LIBRARY)
+    stepped = ask(with_field(stepping), library=LIBRARY)
     assert [one.effect for one in stepped.findings] == ["hard_iron_step"]
     assert not stepped.unexplained.detected
 
@@ -247,6 +247,15 @@ def test_a_sensor_that_warms_is_no_iron_that_remembers() -> None:
     warm = diagnose(with_field(warming), library=library)
     assert [one.effect for one in warm.findings] == []
     assert warm.unexplained.detected and warm.unexplained.where.frame == "sensor"
-    iron = diagnose(made(Trial(4, (("viscous_magnetisation", 1.0),))).track, library=library)
+
+
+def test_a_sensor_that_warms_drifts_and_iron_that_remembers_does_not(ask) -> None:
+    """What iron had not settled of when the recording began fades alike; a drift is likelier."""
+    names = ("viscous_magnetisation", "hard_iron_step", "hard_iron_drift")
+    library = {name: EFFECTS[name] for name in names}
+    (warm,) = ask(with_field(warming), library=library).findings
+    assert (warm.effect, warm.setting["shape"]) == ("hard_iron_drift", "settling")
+    assert warm.setting["time_constant_s"] == pytest.approx(250.0, rel=0.2)
+    iron = ask(made(Trial(4, (("viscous_magnetisation", 1.0),))).track, library=library)
     assert [one.effect for one in iron.findings] == ["viscous_magnetisation"]
     assert not iron.unexplained.detected

@@ -9,7 +9,6 @@ import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis.effects import series
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.forward import contribution
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.values import Term
@@ -23,13 +22,13 @@ def test_play_begins_where_it_was_left() -> None:
 
 
 @pytest.mark.parametrize("memory", [(1.0, -1.0, 1.0), (0.5, -0.75, 1.0)])
-def test_the_memory_is_found_and_nothing_else_is_named(memory) -> None:
+def test_the_memory_is_found_and_nothing_else_is_named(memory, ask) -> None:
     track = made(Trial(5, scenario="wam", samples=6000)).track
     setting = {"radius_gauss": 0.03, "memory": memory}
     value = np.array([2e-3, 2.5e-3, 3e-3])
     term = Term("hysteresis", value, np.zeros(3), setting)
     added, _ = contribution(fit_null(track).context(), [term])
-    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    found = ask(replace(track, mag_b_gauss=track.mag_b_gauss + added))
     assert [one.effect for one in found.findings] == ["hysteresis"]
     assert not found.unexplained.detected
     assert found.findings[0].setting["memory"] == pytest.approx(memory, abs=0.26)
@@ -44,13 +43,13 @@ def test_a_low_pass_begins_where_it_was_left() -> None:
     np.testing.assert_allclose(slow, expected, atol=1e-12)
 
 
-def test_iron_that_had_not_settled_is_no_step_and_no_drift() -> None:
+def test_iron_that_had_not_settled_is_no_step_and_no_drift(ask) -> None:
     track = made(Trial(6, scenario="wam", samples=6000)).track
     setting = {"time_constant_s": 25.0, "memory": (0.3, -0.25, 0.2)}
     value = np.array([0.02, 0.012, -0.008, 0.004, -0.006, 0.005])
     term = Term("viscous_magnetisation", value, np.zeros(6), setting)
     added, _ = contribution(fit_null(track).context(), [term])
-    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    found = ask(replace(track, mag_b_gauss=track.mag_b_gauss + added))
     assert [one.effect for one in found.findings] == ["viscous_magnetisation"]
     assert not found.unexplained.detected
     seen = found.findings[0]
@@ -58,8 +57,8 @@ def test_iron_that_had_not_settled_is_no_step_and_no_drift() -> None:
     assert abs(seen.setting["time_constant_s"] / 25.0 - 1) < 0.15
 
 
-def test_iron_that_had_settled_is_given_no_memory() -> None:
+def test_iron_that_had_settled_is_given_no_memory(ask) -> None:
     track = made(Trial(6, (("viscous_magnetisation", 2.0),), scenario="wam", samples=6000)).track
-    (seen,) = diagnose(track).findings
+    (seen,) = ask(track).findings
     assert seen.effect == "viscous_magnetisation"
     assert "memory" not in seen.setting

@@ -90,6 +90,8 @@ class Effect(ABC):
                  what such leave; 0 where hardly any has it
                  (`python tests/benchmarks/diagnosis/bench_remainder_priors.py`)
     ordinary_part: of what real recordings ordinarily leave, the part whose form it is
+    remembers:   the most of what each axis may have from before the recording (setting `memory`),
+                 in that setting's unit; 0 where it remembers nothing
     stands_for:  effects that look like it, each a further way to it where its column was not logged
     loose:       prior of its parameters in the joint fit, in their own prior deviations: next to
                  none, unless the columns themselves follow what is fitted
@@ -125,6 +127,7 @@ class Effect(ABC):
     of_step: bool = False
     ordinary: float = 0.0
     ordinary_part: str | None = None
+    remembers: float = 0.0
     stands_for: tuple[str, ...] = ()
     loose: float = 30.0
 

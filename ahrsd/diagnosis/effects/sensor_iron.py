@@ -146,6 +146,7 @@ class Hysteresis(Linear):
     size = "0.1 to 3 mG"
     source = "play operator (Preisach); Bowditch on retentive error (dossier M16)"
     ordinary = 1.4
+    remembers = 1.0  # at one end of the slot
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Radii from the noise of a few readings to more than half of the field's usual swing."""
@@ -178,6 +179,7 @@ class ViscousMagnetisation(Linear):
     size = "0.1 to 5 mG"
     source = "Gaussin error (dossier M18)"
     ordinary = 13.0
+    remembers = 0.5  # gauss: the field along another axis
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Time constants a factor of three and a half apart."""

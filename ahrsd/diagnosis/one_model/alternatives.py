@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ahrsd.diagnosis.by_heading import heading_columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Law, Sized
 from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw, course
@@ -20,7 +21,7 @@ from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.estimator.locked import harmonics, on_each_axis
 from ahrsd.samples import Array
 
-BY_RATE, QUICK = "free by_rate", "free quick"
+BY_RATE, BY_HEADING, QUICK = "free by_rate", "free by_heading", "free quick"
 #: half waves of a coefficient that is free in time
 _WAVES = 16
 
@@ -37,6 +38,17 @@ def other_courses(context: Context) -> list[Component]:
     odds = float(np.log(priors.COURSE))
     by_rate = Component(BY_RATE, "sensor", Columns(mag=flat), law, odds)
     return [by_rate, course(context, "sensor", quick=QUICK)]
+
+
+def by_heading(context: Context) -> Component:
+    """A field on the sensor in waves of the heading, as a turret's or a crane's that turns back.
+
+    Of a few seconds each time and of many directions it is noise of a colour in time.
+    """
+    columns, unit = heading_columns(context), priors.COURSE_UNIT["sensor"]
+    low, high = (np.array([np.log(unit * one)]) for one in priors.COURSE_SIZES)
+    law = Sized(np.ones(columns.width), low, high, mean=float(np.log(unit)))
+    return Component(BY_HEADING, "sensor", columns, law, float(np.log(priors.COURSE)))
 
 
 def lone_parts(all_parts: Iterable[Component]) -> list[Component]:

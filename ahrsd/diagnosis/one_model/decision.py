@@ -21,7 +21,13 @@ from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.intervals import departures
 from ahrsd.diagnosis.locate import Frame, single_source, unit_columns
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.alternatives import form_keys, lone_parts, other_courses, varying
+from ahrsd.diagnosis.one_model.alternatives import (
+    by_heading,
+    form_keys,
+    lone_parts,
+    other_courses,
+    varying,
+)
 from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
@@ -32,6 +38,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
 )
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
+from ahrsd.diagnosis.one_model.near_settings import changed, opened
 from ahrsd.diagnosis.one_model.remainder import still_spells
 from ahrsd.diagnosis.prior import prior_of
 from ahrsd.diagnosis.validate import heading_error_deg
@@ -68,6 +75,7 @@ def decided(
 ) -> Answer:
     """The answer of a search."""
     best = _with_one_part(all_sets, space, best)
+    best = _with_heading(all_sets, space, best)
     best, rivals = _borne_out(all_sets, space, best)
     best, rivals = _beside_others(all_sets, space, best, rivals)
     best, rivals = _held_to_form(all_sets, space, best, rivals)
@@ -203,6 +211,19 @@ def _with_one_part(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypo
     return max((best, *judged), key=lambda one: one.score)
 
 
+def _with_heading(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+    """The set with a field by heading, where that is likelier and nothing else is unknown.
+
+    Of rooms it is not asked: where one walks in a circle, the heading is the place.
+    """
+    unknown = any(all_sets.component(key).row is None for key in best.names)
+    if unknown or all_sets.real or not space.courses:
+        return best
+    heading = by_heading(all_sets.made.context)
+    all_sets.made.add([heading])
+    return max((best, all_sets.judge(best.names | {heading.key}, best)), key=lambda one: one.score)
+
+
 def _names(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
     """Members that the library has, without the delay."""
     known = [key for key in best.names if all_sets.component(key).row is not None]
@@ -325,6 +346,7 @@ def _told(
     """A member as a finding and as a term of the repaired model."""
     one = all_sets.component(key)
     value, deviation = coefficients(all_sets, best, key)
+    deviation = np.maximum(deviation, _left_open(all_sets, best, key, value))
     effect = library[one.effect or key]
     if key == LAG:
         shares = _which_delay(all_sets, best, value, deviation, library)
@@ -340,6 +362,21 @@ def _told(
     found = _found(effect, shares, where, value, deviation, setting, odds, library)
     found = replace(found, cost_if_left_out=_cost(all_sets, best, key))
     return found, Term(effect.identifier, value, deviation, setting)
+
+
+def _left_open(all_sets: Hypotheses, best: Hypothesis, key: str, value: Array) -> Array:
+    """(q,) deviations of a member's coefficients whatever its setting is nearby.
+
+    What has a form of its own, as the way of a hand, has no setting that is sharper.
+    """
+    one, made = all_sets.component(key), all_sets.made
+    near = {} if key in all_sets.forms else changed(one, made.context)
+    whole = opened(one, made.context, value, near)
+    if whole is None:
+        return np.zeros(len(value))
+    fewer = all_sets.judge(best.names - {key}, best)
+    at = replace(fewer.at, log_noise=best.at.log_noise)
+    return beside(made, fewer.keys, at).likeliest(whole)[1][: len(value)]
 
 
 def _found(
@@ -437,7 +474,8 @@ def _which_delay(
     A filter's where its form is there in full; half a step's where the delay is that and no other.
     """
     tau, unsure = float(lag_s[0]), float(deviation_s[0])
-    plain = plain_delay(library, 1.0 if tau >= 0.0 else -1.0)
+    late = cast("Effect", all_sets.component(LAG).row)
+    plain = plain_delay(library, 1.0 if tau >= 0.0 else -1.0) or late
     nats = {plain.identifier: 0.0}
     half_s = _half_step_s(all_sets)
     for row in library.values() if tau > 0.0 else ():

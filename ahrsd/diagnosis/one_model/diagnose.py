@@ -18,11 +18,12 @@ from ahrsd.diagnosis.diagnosis import Diagnosis
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.missing import lost_turns
+from ahrsd.diagnosis.missing import differ, lost_turns
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.one_model import rich
 from ahrsd.diagnosis.one_model.answer.whole_answer import whole_answer
 from ahrsd.diagnosis.one_model.column_clocks import wrong_clock
+from ahrsd.diagnosis.one_model.lost_beside import lost_beside, nats
 from ahrsd.diagnosis.one_model.recorded_rate import Quick, quick
 from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
 from ahrsd.diagnosis.one_model.search_rounds import Searched, answered
@@ -67,8 +68,9 @@ def _answered(
     if (nothing := asked.stopped("", library)) is not None:
         return Answered(nothing)
     problem, start = begun(asked.put_right(), spec, library)
-    if lost := lost_turns(problem.recorded, problem.cold):
-        asked = asked.with_facts(lost)
+    came, counted = problem.recorded, asked
+    if lost := lost_turns(came, problem.cold):
+        asked = counted.with_facts(lost)
         problem, start = begun(asked.put_right(), spec, library)
     richest = rich.richest(problem, start.filtered, library)
     if clocks and (clock := wrong_clock(richest)) is not None:
@@ -82,6 +84,14 @@ def _answered(
     still = resting(start.context(), library, LIMITS) if at_rest(start) else ()
     searched = told_at_rest(library, still) if at_rest(start) else library
     found, fast = _found(problem, richest, start, searched)
+    beside = lost_beside(came, found, fast, lost)
+    if differ(lost, beside):
+        other = counted.with_facts(beside)
+        otherwise, begin = begun(other.put_right(), spec, library)
+        richest = rich.richest(otherwise, begin.filtered, library)
+        again, quickly = _found(otherwise, richest, begin, searched)
+        if nats(again, beside) > nats(found, lost):
+            asked, problem, start, found, fast = other, otherwise, begin, again, quickly
     told = whole_answer(
         asked,
         start,

@@ -96,6 +96,7 @@ def component(context: Context, effect: Effect, setting: Setting, tried: int) ->
     """An effect in one setting.  tried: settings among which it is chosen."""
     searched = int(setting.get("searched", 1))
     odds = float(np.log(priors.EFFECT) - np.log(max(1, tried) * max(1, searched)))
+    odds += np.count_nonzero(setting.get("memory", ())) * float(np.log(priors.REMEMBERED))
     return Component(
         key_of(effect.identifier, setting),
         effect.frame or effect.family,
@@ -112,19 +113,23 @@ def anew(known: Component, context: Context, library: Mapping[str, Effect]) -> C
     if known.row is None or known.key == LAG:
         return known
     made = replace(known, columns=known.row.columns(context, known.setting))
-    return beyond(made, delay(context, library)) if known.beside else made
+    lag = delay(context, library) if known.beside else None
+    return made if lag is None else beyond(made, lag)
 
 
-def delay(context: Context, library: Mapping[str, Effect]) -> Component:
-    """The delay between the sensors, of either sign."""
+def delay(context: Context, library: Mapping[str, Effect]) -> Component | None:
+    """The delay between the sensors, of either sign; None where the library has no late field."""
     row, odds = plain_delay(library, 1.0), float(np.log(priors.DELAY))
+    if row is None:
+        return None
     law = Fixed(np.array([priors.ORDINARY_LAG_S**2]))
     return Component(LAG, "sensor", row.columns(context, {}), law, odds, row)
 
 
-def plain_delay(library: Mapping[str, Effect], sign: float) -> Effect:
+def plain_delay(library: Mapping[str, Effect], sign: float) -> Effect | None:
     """The library's delay of a sign that is told where nothing speaks for another."""
-    return next(one for one in library.values() if one.plain and one.delay * sign > 0.0)
+    plain = (one for one in library.values() if one.plain and one.delay * sign > 0.0)
+    return next(plain, None)
 
 
 def holds(one: Component, part: Component, least: float = _ALIKE) -> bool:

@@ -7,6 +7,7 @@ reached by adding or by dropping.  A beam of a few sets moves by add, drop and s
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -24,6 +25,8 @@ from ahrsd.samples import Array
 BEAM, ASKED, MOST_MOVES = 2, 4, 8
 #: rounds in which settings are sought of what may be added, and on of what is there
 FINER, SHARPEST = 3, 7
+#: steps in a round to what an effect has from before the recording
+REMEMBERED = 3
 #: moments at which steps are proposed, and how far apart, of the recording's length
 MOMENTS, APART = 4, 0.02
 
@@ -176,11 +179,13 @@ class Hypotheses:
 class Beside:
     """A model in its noise, beside which candidates are asked.
 
+    at: its coefficients and noise
     root: lower, of the information of its coefficients with their prior;  seen: root^-1 s
     """
 
     made: Linearised
     keys: Sequence[str]
+    at: At
     inverse: Array
     root: Array
     seen: Array
@@ -188,6 +193,21 @@ class Beside:
     def projected(self, products: Array) -> Array:
         """(q, p) root^-1 times products of the model with candidates."""
         return np.asarray(solve_triangular(self.root, products, lower=True, check_finite=False))
+
+    def in_quiet(self) -> Beside:
+        """The same in the sensor's own noise: what a candidate explains is noise still."""
+        noise = np.minimum(self.at.log_noise, self.at.log_noise[-1])
+        return beside(self.made, self.keys, replace(self.at, log_noise=noise))
+
+    def likeliest(self, one: Component) -> tuple[Array, Array]:
+        """(q,) coefficients of a candidate of the largest size, and their deviations."""
+        self.made.add([one])
+        C, own, s = self.made.candidates(self.keys, [one.key], self.inverse)
+        W = self.projected(C)
+        G = own[0] - W.T @ W
+        G[np.diag_indices_from(G)] += np.exp(-one.law.log_variance(one.law.high))
+        covariance = np.linalg.inv(G)
+        return covariance @ (s - self.seen @ W), np.sqrt(np.diagonal(covariance))
 
     def worth(self, candidates: Sequence[str]) -> dict[str, float]:
         """Log Bayes factor of each candidate, sizes averaged."""
@@ -216,7 +236,7 @@ def beside(made: Linearised, keys: Sequence[str], at: At) -> Beside:
     A[np.diag_indices_from(A)] += np.exp(-np.concatenate(phi))
     root = cholesky(A, lower=True, check_finite=False)
     seen = solve_triangular(root, inverse @ products.s, lower=True, check_finite=False)
-    return Beside(made, tuple(keys), inverse, root, seen)
+    return Beside(made, tuple(keys), at, inverse, root, seen)
 
 
 def averaged(G: Array, s: Array, component: Component) -> float:
@@ -240,7 +260,8 @@ def averaged(G: Array, s: Array, component: Component) -> float:
 class Space:
     """What a search may put into a set: candidates by effect, and free courses.
 
-    finer: neighbours of a setting;  form: what a component leaves of its form;  steps_at: of a time
+    finer: neighbours of a setting;  remembered: those in what is from before the recording
+    form: what a component leaves of its form;  steps_at: of a time
     sources: that switch or have one direction, of which one at most is added, and none beside a
              remainder: how large they are in rooms is not measured
     """
@@ -248,6 +269,7 @@ class Space:
     effects: dict[str, list[str]]
     courses: Sequence[str]
     finer: Callable[[Component, int], list[Component]]
+    remembered: Callable[[Beside, Component, int], list[Component]]
     form: Callable[[Component], Component | None]
     steps_at: Callable[[float], list[Component]]
     sources: list[str] = field(default_factory=list)
@@ -422,13 +444,16 @@ def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
 def sought(
     all_sets: Hypotheses, space: Space, scan: Beside, key: str, rounds: Iterable[int] = range(FINER)
 ) -> str:
-    """The candidate with its onset and scale sought more and more finely."""
-    made = all_sets.made
+    """The candidate with onset, scale and what it remembers sought more and more finely."""
+    made, row = all_sets.made, all_sets.component(key).row
+    remembers = row is not None and row.remembers > 0.0
+    scan = scan.in_quiet() if remembers else scan
     worth = scan.worth([key])[key] + all_sets.component(key).prior
-    for round_ in rounds:
-        near = space.finer(all_sets.component(key), round_)
+    for round_, again in itertools.product(rounds, range(1 + REMEMBERED * remembers)):
+        one = all_sets.component(key)
+        near = space.remembered(scan, one, round_) if again else space.finer(one, round_)
         if not near:
-            break
+            continue
         made.add(near)
         found = scan.worth([one.key for one in near])
         total = {one: nats + all_sets.component(one).prior for one, nats in found.items()}

@@ -112,6 +112,8 @@ LOGGED_LATE_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
 ON_TIME_S = 1.0
 #: s over which a logger ordinarily takes its mean: a battery's monitor filters over a tenth
 LOGGED_BLUR_S = 0.05
+#: that iron has something along an axis from before the recording, and of twenty values this one
+REMEMBERED = 1.0 / 20.0
 #: relative size of what an effect leaves of its form, its second order
 FORM = 0.03
 

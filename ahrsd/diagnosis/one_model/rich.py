@@ -18,7 +18,14 @@ from ahrsd.diagnosis.innovation import Filtered
 from ahrsd.diagnosis.locate import FRAMES
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
-from ahrsd.diagnosis.one_model.effect_components import LAG, anew, causes, delay, delay_form
+from ahrsd.diagnosis.one_model.effect_components import (
+    LAG,
+    anew,
+    causes,
+    delay,
+    delay_form,
+    plain_delay,
+)
 from ahrsd.diagnosis.one_model.evidence import At, maximised
 from ahrsd.diagnosis.one_model.gaussian_process import course
 from ahrsd.diagnosis.one_model.linearised import (
@@ -68,7 +75,8 @@ def base_of(
     """
     context = point.context
     rest = ordinary_remainder(context) if whole else []
-    lags = [delay(context, library)]
+    lag = delay(context, library)
+    lags = [] if lag is None else [lag]
     if point.problem.lag_s != 0.0:
         lags.append(delay_form(context, point.problem.lag_s))
     known = [anew(one, context, library) for one in named]
@@ -124,8 +132,11 @@ def _likeliest_delay(problem: Problem, filtered: Filtered, library: Mapping[str,
     """The small model at the likeliest of some delays, sought up and down from none.
 
     Beside a calibration that a long delay has bent, what is linear in it may point the other way.
-    A gyro's values are means of the rate, or where that is likelier rates at instants.
+    A gyro's values are means of the rate, or where that is likelier rates at instants.  A library
+    without a late magnetometer has no delay.
     """
+    if plain_delay(library, 1.0) is None:
+        return judged(first_point(problem, filtered, ()), library, (), whole=False)
 
     def at(lag_s: float, *, instants: bool) -> Judged:
         if lag_s == 0.0 and not instants:

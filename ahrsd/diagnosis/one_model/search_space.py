@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
@@ -17,8 +17,16 @@ from ahrsd.diagnosis.one_model.effect_components import (
     library_components,
     neighbours,
 )
-from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, Space, searched
+from ahrsd.diagnosis.one_model.model_search import (
+    Beside,
+    Hypotheses,
+    Hypothesis,
+    Names,
+    Space,
+    searched,
+)
 from ahrsd.diagnosis.one_model.one_direction import one_direction
+from ahrsd.diagnosis.one_model.remembered import remembered
 from ahrsd.diagnosis.one_model.rich import Judged, psi_by_key
 from ahrsd.diagnosis.one_model.switching import switching
 
@@ -33,11 +41,11 @@ def best_at(
     rich: Judged, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
 ) -> tuple[Hypotheses, Space, Hypothesis]:
     """The likeliest set at a richest model, searched from what is known and from nothing."""
-    base = rich.base
+    base, made = rich.base, rich.base.made
     all_sets, space = space_at(rich, library, named)
     real = frozenset(base.remainder)
     known = all_sets.without(frozenset(one.key for one in named), LAG)
-    lag = frozenset([LAG])
+    lag = frozenset([LAG]) & made.seen.keys()
     starts: list[Names] = [frozenset(), lag, real | lag, real | lag | {COURSES[0]}]
     if known:
         here = known | real if was_real else known
@@ -68,13 +76,16 @@ def space_at(
     base = rich.base
     made, context = base.made, base.made.context
     found = library_components(context, library)
-    delay = made.seen[LAG].component
-    whole = [one for parts in found.values() if holds(parts[0], delay) for one in parts]
-    for one in whole:
-        found[one.effect or ""].append(beyond(one, delay))
+    whole: list[Component] = []
+    if LAG in made.seen:
+        delay = made.seen[LAG].component
+        whole = [one for parts in found.values() if holds(parts[0], delay) for one in parts]
+        for one in whole:
+            found[one.effect or ""].append(beyond(one, delay))
     effects = {name: [one.key for one in parts] for name, parts in found.items()}
+    if LAG in made.seen:
+        effects[made.seen[LAG].component.effect or LAG] = [LAG]
     made.add([one for parts in found.values() for one in parts])
-    effects[delay.effect or LAG] = [LAG]
     forms = {}
     for one in named:
         listed = effects.setdefault(one.effect or one.key, [])
@@ -91,17 +102,25 @@ def space_at(
     all_sets = Hypotheses(made, base.remainder, rich.at.log_noise, psi, forms, holding)
     length_s = context.track.duration_s
 
-    def finer(one: Component, round_: int) -> list[Component]:
+    def made_of(one: Component, settings: Iterable[Setting]) -> list[Component]:
         if one.row is None or one.key == LAG:
             return []
         row, tried = one.row, max(_SOUGHT, len(effects[one.row.identifier]))
-        near = neighbours(one.setting, length_s, round_)
-        return [component(context, row, setting, tried) for setting in near]
+        return [component(context, row, setting, tried) for setting in settings]
+
+    def finer(one: Component, round_: int) -> list[Component]:
+        return made_of(one, neighbours(one.setting, length_s, round_))
+
+    def closer(scan: Beside, one: Component, round_: int) -> list[Component]:
+        return made_of(one, remembered(scan, one, round_))
+
+    def left_of(one: Component) -> Component | None:
+        return form_of(one, context, library)
 
     def steps_at(time_s: float) -> list[Component]:
         setting = {"onset_s": round(time_s, 3)}
         jumping = [row for row in library.values() if row.jumps]
         return [component(context, row, setting, _ONSETS) for row in jumping]
 
-    space = Space(effects, COURSES, finer, lambda one: form_of(one, context, library), steps_at)
+    space = Space(effects, COURSES, finer, closer, left_of, steps_at)
     return all_sets, space
