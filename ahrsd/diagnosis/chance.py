@@ -32,12 +32,13 @@ from ahrsd.diagnosis.effects.base import Readings
 from ahrsd.diagnosis.hygiene import would_have_shown
 from ahrsd.diagnosis.innovation import bearings, carried_along
 from ahrsd.diagnosis.limits import LIMITS, Limits
+from ahrsd.diagnosis.noise_fit import FLOOR_MAG_GAUSS
 from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.predictive import beside_refitted, checks
+from ahrsd.diagnosis.predictive import beside_refitted, checks, usual_noise
 from ahrsd.diagnosis.problem import Problem, model_at_rate, problem_of
 from ahrsd.diagnosis.spoken import failed_checks
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import NullModel
+from ahrsd.diagnosis.values import Noise, NullModel
 from ahrsd.samples import Array
 
 LOUD = "the gyro's noise is louder than the magnetometer's"
@@ -102,8 +103,11 @@ def beyond_chance(
     if loudness(recorded, model) < limits.chance_loud:
         return found
     truth = motion_of(recorded, model)
-    copies = [copy_of(recorded, truth, model, seed) for seed in range(limits.chance_fits)]
-    alone = Alone.of(problem, start, copies)
+    for noise in _noises_of(model, start):
+        copies = [copy_of(recorded, truth, noise, seed) for seed in range(limits.chance_fits)]
+        alone = Alone.of(problem, start, copies)
+        if not alone.differs:
+            break
     if not alone.differs:
         return _agreeing(first, problem, start, alone, _alike(found, told, alone))
     if told <= 0.0:
@@ -142,9 +146,19 @@ def motion_of(track: Track, model: NullModel) -> Readings:
     return forward.truth_along(along)
 
 
-def copy_of(track: Track, truth: Readings, model: NullModel, seed: int) -> Track:
-    """The track with other readings: those of the truth with the model's noise."""
-    made = forward.simulated(truth, (), forward.noise_of(model), seed)
+def _noises_of(model: NullModel, start: NullFit) -> list[Noise]:
+    """The noise of a model; where the magnetometer has less than a fit believes at least, how much
+    is not known: what the innovations say, and none."""
+    noise = forward.noise_of(model)
+    if start.model.sigma_mag_gauss > FLOOR_MAG_GAUSS:
+        return [noise]
+    less = min(1.0, usual_noise(start).mag_gauss / forward.noise_of(start.model).mag_gauss)
+    return [replace(noise, mag_gauss=less * noise.mag_gauss), replace(noise, mag_gauss=0.0)]
+
+
+def copy_of(track: Track, truth: Readings, noise: Noise, seed: int) -> Track:
+    """The track with other readings: those of the truth with noise."""
+    made = forward.simulated(truth, (), noise, seed)
     read = np.isfinite(track.mag_b_gauss)
     mag = np.where(read, made.mag_b_gauss, track.mag_b_gauss)
     return replace(track, mag_b_gauss=mag, gyro_b_rad_s=made.gyro_b_rad_s)

@@ -76,11 +76,12 @@ def beside_refitted(null: NullFit, refitted: Sequence[NullFit]) -> tuple[dict[st
     """The statistics of what a calibration alone leaves, beside those of simulations of it.
 
     refitted: fits of simulations of the calibration, each made as `null` was made of the recording:
-    their bands hold where a fit is not linear in the readings, as beside a loud gyro.  Two or more
+    their bands hold where a fit is not linear in the readings, as beside a loud gyro, and are of
+    factors: what the error of a fit leaves is as large as that error.  Two or more.
     Also the probability that one of the statistics is as far out, by its ranks (Bonferroni).
     """
     found = [_of_fit(one) for one in refitted]
-    value, expected = _of_fit(null), bands(found)
+    value, expected = _of_fit(null), bands(found, by_factor=True)
     ranks = []
     for name in expected:
         above = sum(one[name] >= value[name] for one in found)
@@ -398,20 +399,28 @@ def _joined(tracks: Sequence[Track]) -> Track:
     )
 
 
-def bands(found: Sequence[Mapping[str, float]]) -> dict[str, tuple[float, float]]:
-    """Where one more simulation would be, for every statistic."""
+def bands(
+    found: Sequence[Mapping[str, float]], *, by_factor: bool = False
+) -> dict[str, tuple[float, float]]:
+    """Where one more simulation would be, for every statistic.
+
+    by_factor: whether the largest of many differences are spread in the logarithm as well
+    """
     count, names = len(found), list(found[0])
     outside = _OUTSIDE / len(names)
     two_sided = student_quantile(1 - outside / 2, count - 1) * np.sqrt(1 + 1 / count)
     out = {}
     for name in names:
         values = np.array([one[name] for one in found])
-        if name not in _TWO_SIDED:
-            out[name] = (0.0, float(values.mean() + _LARGEST_REACH * values.std(ddof=1)))
-            continue
         logs = np.log(np.maximum(values, _LEAST))
-        middle, width = float(np.mean(logs)), two_sided * float(np.std(logs, ddof=1))
-        out[name] = (float(np.exp(middle - width)), float(np.exp(middle + width)))
+        middle, spread = float(np.mean(logs)), float(np.std(logs, ddof=1))
+        if name in _TWO_SIDED:
+            width = two_sided * spread
+            out[name] = (float(np.exp(middle - width)), float(np.exp(middle + width)))
+        elif by_factor:
+            out[name] = (0.0, float(np.exp(middle + _LARGEST_REACH * spread)))
+        else:
+            out[name] = (0.0, float(values.mean() + _LARGEST_REACH * values.std(ddof=1)))
     return out
 
 

@@ -10,6 +10,7 @@ from tracks import experiment, track_of, true_model
 
 from ahrsd.diagnosis.chance import copy_of, loudness, motion_of
 from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.forward import noise_of
 from ahrsd.diagnosis.spoken import verdict
 from ahrsd.simulation import Experiment
 
@@ -49,6 +50,11 @@ def test_a_fit_like_those_of_simulations_is_no_mismatch(scenario: str, seed: int
         assert check.inside_after, name
 
 
+def test_a_magnetometer_without_noise_is_like_its_simulations() -> None:
+    found = diagnose(track_of(_made(0.0, 5e-3, "lam", 2)))
+    assert verdict(found) == "recording and model agree"
+
+
 def test_where_the_gyro_is_the_quieter_sensor_nothing_is_simulated() -> None:
     track = track_of(_made(1e-3, 5e-3))
     since = (np.arange(len(track)) >= 1500)[:, None]
@@ -72,8 +78,8 @@ def test_a_copy_has_the_motion_the_noise_and_the_stamps() -> None:
     truth = motion_of(track, model)
     clean = track_of(_made(0.0, 0.0)).gyro_b_rad_s
     assert np.std(truth.gyro_b_rad_s - clean) < 0.1 * 5e-2
-    one = copy_of(track, truth, model, seed=3)
+    one = copy_of(track, truth, noise_of(model), seed=3)
     assert np.array_equal(one.time_s, track.time_s)
     assert np.std(one.gyro_b_rad_s - truth.gyro_b_rad_s) == pytest.approx(5e-2, rel=0.03)
     assert np.std(one.mag_b_gauss - truth.mag_b_gauss) == pytest.approx(1e-4, rel=0.03)
-    assert np.array_equal(one.mag_b_gauss, copy_of(track, truth, model, 3).mag_b_gauss)
+    assert np.array_equal(one.mag_b_gauss, copy_of(track, truth, noise_of(model), 3).mag_b_gauss)
