@@ -81,7 +81,7 @@ Kinds = tuple[tuple[Imperfections, ...], tuple[float, ...]]
 #: by how much likelier than each of the others a gyro is, before the data, of which scales and axes
 #: are both of the worst of the kinds. Chosen on motions in sight: the size of a handful of numbers
 #: of which some are told is badly known itself, and a lucky draw must not pass for a better kind;
-#: where the motion tells nothing the mean variance is that of the worst kind, but for a fortieth
+#: where the motion tells nothing the mean variance is that of the worst kind, but for a twentieth
 _WORST_GYRO = 40.0
 
 

@@ -106,7 +106,7 @@ def test_wrong_scales_that_the_motion_hardly_tells(motion):
     for seed in range(12):
         made = pieces.drive(motion, seed)
         off.append(beyond(made, answer(made, troubled(made, scales(seed)))))
-    assert max(off) < 3.0
+    assert max(off) < 3.5
 
 
 def test_a_gyro_that_nothing_is_known_of_is_of_the_worst_kind():
