@@ -78,13 +78,11 @@ Kinds = tuple[tuple[Imperfections, ...], tuple[float, ...]]
 """Of instruments, and of places by the size of what differs there."""
 
 
-#: before the data, against a gyro that is of a better kind in all: one of which scales and axes are
-#: both of the worst kind, and one of which only the scales are. Chosen on motions in sight: so many
-#: nats as the data have to say (5) to be believed, for the size of a handful of numbers of which
-#: some are told is badly known, and a lucky draw is no better kind. Where the motion tells nothing
-#: the mean variance is then that of the worst kind, but for a hundredth
-_WORST_GYRO = 150.0
-_WRONG_SCALES_ALONE = 4.0
+#: by how much likelier than each of the others a gyro is, before the data, of which scales and axes
+#: are both of the worst of the kinds. Chosen on motions in sight: the size of a handful of numbers
+#: of which some are told is badly known itself, and a lucky draw must not pass for a better kind;
+#: where the motion tells nothing the mean variance is that of the worst kind, but for a twentieth
+_WORST_GYRO = 40.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,13 +134,14 @@ def _gyros(kinds: tuple[Imperfections, ...]) -> list[tuple[tuple[float, float, f
     its scales are right, has no axes that are not.
     """
     worst = max((kind.scale for kind in kinds), default=0.0)
-    every = [(kind, kind, _WORST_GYRO if kind.scale == worst else 1.0) for kind in kinds]
-    every += [
-        (scales, angles, _WRONG_SCALES_ALONE)
+    return [
+        (
+            (scales.scale, scales.shape, angles.shape),
+            _WORST_GYRO if scales is angles and scales.scale == worst else 1.0,
+        )
         for scales, angles in product(kinds, repeat=2)
-        if angles.scale < scales.scale
+        if angles.scale <= scales.scale
     ]
-    return [((scales.scale, scales.shape, angles.shape), odds) for scales, angles, odds in every]
 
 
 @dataclass(frozen=True, slots=True)
