@@ -126,13 +126,13 @@ def test_what_rides_with_the_sensor_is_averaged_as_it_is() -> None:
     assert told.covariates == {}
 
 
-def test_a_rover_s_field_by_its_speed_is_named() -> None:
+def test_a_rover_s_field_by_its_speed_is_named(ask) -> None:
     """50 mG per m/s over drive motors without a logged current."""
     track = track_of(experiment("wam", seed=6, samples=2500))
     k = np.array([0.04, -0.02, 0.022])
     speed = 0.2 * SHAPES["ramps"](track.time_s) * (track.time_s % 40 > 8)
     mag = track.mag_b_gauss + np.outer(speed, k)
-    found = diagnose(replace(track, mag_b_gauss=mag, covariates={"speed_m_s": speed}))
+    found = ask(replace(track, mag_b_gauss=mag, covariates={"speed_m_s": speed}))
     assert [one.effect for one in found.findings] == ["speed_field"]
     assert not found.unexplained.detected
     values = [one.value for one in found.findings[0].parameters]

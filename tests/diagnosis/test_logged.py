@@ -9,7 +9,6 @@ import pytest
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis import roles
-from ahrsd.diagnosis.logged import diagnose_logged
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
@@ -80,10 +79,10 @@ def test_a_clock_that_is_wrong_is_said_and_the_cause_named(
 @pytest.mark.parametrize(
     "seed", [11, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (12, 13))]
 )
-def test_another_column_is_no_cause_at_any_time(driven, seed: int) -> None:
+def test_another_column_is_no_cause_at_any_time(driven, seed: int, ask_logged) -> None:
     track, _ = driven
     other = levels(track.time_s - track.time_s[0], seed)
-    found = diagnose_logged(logged(track, "shaft_rpm", 100 * other))
+    found = ask_logged(logged(track, "shaft_rpm", 100 * other))
     assert found.findings == ()
     assert found.unexplained.detected
     assert not any("runs" in note for note in found.notes)

@@ -22,7 +22,7 @@ from ahrsd.simulation import simulate
 PLACES = ("position_north_m", "position_east_m", "position_down_m")
 
 
-def test_a_field_along_a_way_that_nobody_logged_is_no_set_of_names():
+def test_a_field_along_a_way_that_nobody_logged_is_no_set_of_names(ask):
     """Three gains of an on-board calibration followed it to a quarter of a hundredth."""
     trial = made(Trial(2, (), PLACES, scenario="lam", samples=6000))
     R_nb = simulate(trial.settings).R_nb
@@ -33,7 +33,7 @@ def test_a_field_along_a_way_that_nobody_logged_is_no_set_of_names():
         for j in range(2, 9)
     )
     mag = track.mag_b_gauss + np.einsum("nji,nj->ni", R_nb, field_n)
-    found = diagnose(replace(track, mag_b_gauss=mag))
+    found = ask(replace(track, mag_b_gauss=mag))
     assert found.findings == ()
     assert found.unexplained.detected
     assert found.unexplained.where.frame == "world"

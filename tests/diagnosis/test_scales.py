@@ -116,13 +116,13 @@ def test_a_way_through_a_gradient_is_unknown_where_no_position_is_logged() -> No
     assert answer.unexplained.where.frame == "world"
 
 
-def test_a_field_that_falls_off_by_e_in_metres_of_height_is_one_name() -> None:
+def test_a_field_that_falls_off_by_e_in_metres_of_height_is_one_name(ask) -> None:
     track, readings = _quiet(6)
     passed = (track.time_s - track.time_s[0]) / np.ptp(track.time_s)
     height = 7.0 + 5.0 * np.sin(2 * np.pi * 2.3 * passed + 1.0) * np.cos(2 * np.pi * 0.7 * passed)
     course = np.exp(-height / 3.0)[:, None] * np.array([0.012, -0.01, 0.015])
     changed = np.einsum("nji,nj->ni", readings.R_nb, course) @ readings.soft_iron.T
-    answer = diagnose(
+    answer = ask(
         replace(track, mag_b_gauss=track.mag_b_gauss + changed, covariates={"altitude_m": height})
     )
     assert [one.effect for one in answer.findings] == ["altitude_field"]

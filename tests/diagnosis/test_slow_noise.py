@@ -86,11 +86,11 @@ def test_noise_that_forgets_in_two_seconds_is_no_unknown(quiet: Track, seed: int
     assert not answer.unexplained.detected
 
 
-def test_a_source_is_told_beside_slow_noise(quiet: Track) -> None:
+def test_a_source_is_told_beside_slow_noise(quiet: Track, ask) -> None:
     noise = 5e-4 * slow(np.random.default_rng(1), len(quiet), 25.0, 2.0)
     on = (quiet.time_s % 97.0) < 41.0
     field = on[:, None] * np.array([1.5e-3, 1e-3, -1.5e-3])
-    answer = diagnose(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + noise + field))
+    answer = ask(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + noise + field))
     assert answer.findings == ()
     where = answer.unexplained.where
     assert where is not None
