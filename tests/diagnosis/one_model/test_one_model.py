@@ -270,3 +270,14 @@ def test_a_scale_that_creeps_is_no_compensation_on_board():
     (told,) = diagnose(one.track).findings
     assert told.effect == "onboard_calibration_active"
     assert told.parameters[0].value == pytest.approx(one.truth[0][1][0], abs=0.1)
+
+
+def test_beside_a_large_unknown_of_one_sensor_a_small_name_of_the_other_is_not_told():
+    track = made(Trial(seed=71, effects=(("gyro_g_sensitivity", 1.0),), samples=3000)).track
+    assert [one.effect for one in diagnose(track).findings] == ["gyro_g_sensitivity"]
+    t = track.time_s - track.time_s[0]
+    level = sum(np.sin(2 * np.pi * t / period + k) for k, period in enumerate((23.0, 41.0, 71.0)))
+    added = 3e-3 * level[:, None] * [0.6, -0.7, 0.39]
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    assert found.findings == ()
+    assert found.unexplained.where.frame == "sensor"
