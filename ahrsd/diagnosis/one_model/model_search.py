@@ -258,7 +258,6 @@ def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> lis
 
     Sets with the ordinary remainder and without are moved in turn, each kind with a beam of its
     own: where a simulation has two effects, the remainder is likelier than either of them alone.
-    The reverse is not so: what a name gains beside the remainder it gains without.
     """
     first = [all_sets.judge(one) for one in starts]
     beams = {real: _best(all_sets, first, real=real) for real in (False, True)}
@@ -267,8 +266,6 @@ def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> lis
         beam = beams[bool(k % 2)]
         todo = [one for one in beam if one.names not in done]
         if not todo or todo[0].score < beam[0].score - 10 * priors.MOVE:
-            continue
-        if k % 2 and beams[False] and beam[0].score < beams[False][0].score - priors.BEHIND:
             continue
         here = todo[0]
         done.add(here.names)

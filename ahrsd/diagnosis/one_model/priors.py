@@ -158,9 +158,8 @@ SAME_FORM = 0.5
 #: part of the evidence of what is unknown that a name beside it must have;  source: stand-ins .25
 #: and .46 there, the one that is there .75
 BESIDE_UNKNOWN = 0.5
-#: nats that a move of the search must gain;  by which a set with the ordinary remainder may be less
-#: likely than one without for it to be moved
-MOVE, BEHIND = 2.0, 50.0
+#: nats that a move of the search must gain
+MOVE = 2.0
 #: how near to all of a delay must be a filter's to be called one
 NEARLY_ALL = 0.25
 #: of a delay to be half a step of the recording: a gyro that tells the rate of the moment
