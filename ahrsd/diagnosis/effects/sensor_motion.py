@@ -148,8 +148,8 @@ class MagLowPass(Linear):
 class FlexibleMount(Effect):
     """M22.  Exact: a rotation by C (a - a0).
 
-    A mount is straight without a load, or under the one that it was aligned under: level, or its
-    mean.  These differ by constant turns, which are a crooked gyro if they have no part here.
+    A mount is straight without a load, or under the one that it was aligned under: its mean.  The
+    two differ by a constant turn, which is a crooked gyro if it has no part here.
     """
 
     identifier = "flexible_mount"
@@ -175,12 +175,12 @@ class FlexibleMount(Effect):
     unseen = (tuple(np.eye(3).ravel() / np.sqrt(3.0)),)
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """Straight without a load, level, or under the mean load; where there are loads."""
+        """Straight without a load or under the mean one, where there is an accelerometer."""
         if context.track.accel_b_m_s2 is None:
             return ()
         mean_g = np.mean(shapes.specific_force_g(readings_of(context)), axis=0)
         mean = [round(float(one), 4) for one in mean_g]
-        return {}, {"straight_g": [0.0, 0.0, -1.0]}, {"straight_g": mean}
+        return {}, {"straight_g": mean}
 
     def columns(self, context: Context, setting: Setting) -> Columns:
         """A ((C (a - a0)) x h)."""

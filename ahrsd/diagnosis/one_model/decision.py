@@ -284,8 +284,8 @@ def _held_to_form(
 def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     """Log odds from which on a member is told.
 
-    Beside something unknown in its sensor a name has to be the larger part: a source that no law
-    here has leaves a rest, and names take that.
+    Beside something unknown a name has to be the larger part: a source that no law here has leaves
+    a rest, and names take that, of either sensor: a gyro's error by force for what slides by it.
     """
     one = all_sets.component(key)
     if key == LAG:
@@ -298,9 +298,7 @@ def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     asked = max(asked, priors.BESIDE_UNKNOWN * all_sets.unknown_nats)
     unknown = [
         other for other in best.names - frozenset(all_sets.remainder)
-        if (course := all_sets.component(other)).row is None
-        and (course.columns.mag is None) == (one.columns.mag is None)
-        and not _is_ordinary(all_sets, best, other)
+        if all_sets.component(other).row is None and not _is_ordinary(all_sets, best, other)
     ]  # fmt: skip
     if not unknown:
         return asked

@@ -5,7 +5,9 @@ moves, a current.  Such a source rides with the vehicle or stands in the world, 
 
     x(t) = u sum_k w_k cos(pi k (t - t0) / T),    k up to MOST
 
-The direction is that along which the residual is loudest, where that is beyond chance.
+The direction is that along which the residual is loudest, where that is beyond chance.  Along the
+field and across it noise differs: across, a filter follows what is slow.  So the residual is first
+made as loud along as across.
 """
 
 from __future__ import annotations
@@ -33,16 +35,33 @@ def one_direction(all_sets: Hypotheses, here: Hypothesis) -> list[Component]:
     made = all_sets.made
     left = made.left_by(here.keys, here.at) / made.point.loud.amplitude[:, None]
     left = np.where(made.point.filtered.used[:, None], left, 0.0)
+    among = [count for count in _AMONG if count <= len(left) // 4]
+    even = {count: as_loud_along(left, made.context.field_b, count) for count in among}
     found = []
     for frame in FRAMES:
-        turned = np.einsum("nia,ni->na", unit_columns(made.context, frame), left)
-        rows = dct(turned, axis=0, norm="ortho")[1:]
-        among = [count for count in _AMONG if count <= len(rows) // 4]
-        seen = {count: unalike(rows[:count]) for count in among}
+        axes = unit_columns(made.context, frame)
+        turned = {count: np.einsum("nia,ni->na", axes, one) for count, one in even.items()}
+        seen = {count: unalike(_slow(one, count)) for count, one in turned.items()}
         count = max(seen, key=lambda one: seen[one][0], default=0)
         if count and seen[count][0] > priors.UNALIKE:
             found.append(along(made.context, frame, seen[count][1], min(_TIMES * count, MOST)))
     return found
+
+
+def _slow(left: Array, count: int) -> Array:
+    """The first so many cosines of a residual, but for the constant."""
+    return np.asarray(dct(left, axis=0, norm="ortho")[1 : count + 1])
+
+
+def as_loud_along(left: Array, field_b: Array, count: int) -> Array:
+    """A residual (N, 3) with as much power along the field as on each axis across, of its cosines.
+
+    field_b: (N, 3);  count: of the cosines
+    """
+    unit = field_b / np.linalg.norm(field_b, axis=1, keepdims=True)
+    along = np.sum(left * unit, axis=1, keepdims=True) * unit
+    own, across = (float(np.sum(_slow(one, count) ** 2)) for one in (along, left - along))
+    return np.asarray(left - along + along * np.sqrt(across / 2.0 / max(own, 1e-300)))
 
 
 def unalike(rows: Array) -> tuple[float, Array]:

@@ -157,8 +157,8 @@ ODDS_REAL = 12.0
 #: odds that what one effect explains is a wider one's in just that form, which no reading tells:
 #: one cause may make a gyro's axes all be off alike, but more often they differ
 SAME_FORM = 0.5
-#: part of the evidence of what is unknown in a sensor that a name beside it must have;  source:
-#: stand-ins .25 and .46 there, the one that is there .75
+#: part of the evidence of what is unknown that a name beside it must have;  source: stand-ins .25
+#: and .46 there, the one that is there .75
 BESIDE_UNKNOWN = 0.5
 #: nats that a move of the search must gain
 MOVE = 2.0

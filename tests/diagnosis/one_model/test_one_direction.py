@@ -10,7 +10,7 @@ from tracks import experiment, track_of
 
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.diagnose import diagnose
-from ahrsd.diagnosis.one_model.one_direction import unalike
+from ahrsd.diagnosis.one_model.one_direction import as_loud_along, unalike
 
 
 def test_what_is_alike_along_all_axes_has_no_direction():
@@ -29,6 +29,18 @@ def test_the_direction_is_the_loudest():
     assert nats > 50.0
     powers = np.linalg.eigvalsh(rows.T @ rows / 120)
     assert nats == pytest.approx(60.0 * (3 * np.log(powers.mean()) - np.log(powers).sum()))
+
+
+def test_noise_that_is_louder_along_the_field_has_no_direction():
+    """Across the field a filter follows what is slow, and slow noise is left along it alone."""
+    made_one = experiment("wam", seed=15, samples=4000)
+    unit = made_one.field_b / np.linalg.norm(made_one.field_b, axis=1, keepdims=True)
+    rng = np.random.default_rng(6)
+    left = rng.normal(size=unit.shape) + 3.0 * rng.normal(size=(len(unit), 1)) * unit
+    into_world = np.einsum("nij,nj->ni", made_one.R_nb, left)
+    assert unalike(into_world[:200])[0] > 50.0
+    even = as_loud_along(left, made_one.field_b, 200)
+    assert unalike(np.einsum("nij,nj->ni", made_one.R_nb, even)[:200])[0] < priors.UNALIKE
 
 
 def test_iron_on_a_joint_that_nobody_logged_is_unknown_on_the_sensor():
