@@ -1,8 +1,9 @@
 """The null: calibration and noise that explain a recording best, alone or with named terms.
 
 `descent` finds the lowest cost from where it is set down.  The cold start descends on a thinned
-track (`coarse`) from two starts, a sphere and a linear fit with the gyro, with the gyro's noise
-inflated 30, 10, 3, 1 times: a short memory forgives a wrong bias and soft iron.  Where that noise
+track (`coarse`) from a sphere, from no iron and from a linear fit with the gyro, with the gyro's
+noise inflated 30, 10, 3, 1 times: a short memory forgives a wrong bias and soft iron.  Where none
+of these explains the data nor two agree, it begins anew at 100 times.  Where that noise
 turns up more field than the magnetometer's own, the size of the field says where the iron is, by a
 valley too narrow to be followed in straight steps: there it begins at the ellipsoid of the
 readings, as it is.
@@ -17,6 +18,7 @@ only when the likelihood says so, and not faster than WALK_CAP.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -42,7 +44,9 @@ from ahrsd.estimator import chain
 from ahrsd.estimator.chain import linear_start
 from ahrsd.samples import Array
 
-_INFLATIONS = (30.0, 10.0, 3.0, 1.0)
+#: inflations of the gyro's noise by which a cold start descends, and most steps at each; where no
+#: start of the first comes to what explains the data, from a shorter memory and with more steps
+_LADDERS = (((30.0, 10.0, 3.0), 2), ((100.0, 30.0, 10.0, 3.0), 6))
 _FEWEST = 15  # steps that a fit needs
 _SHORTEST_RUN = 8  # samples of a run that the linear start can use
 _STEPS = 60  # most; a fit ends where it has converged
@@ -91,7 +95,7 @@ def fit_null(
     again = noise_fit.rescaled(fit.filtered, known)
     if noise_fit.alike(again, fit.model):
         return fit
-    return descended(replace(problem, terms=fit.terms), again, 2)
+    return descended(replace(problem, terms=fit.terms), again, _STEPS)
 
 
 def at_model(track: Track, model: NullModel, terms: Sequence[FittedTerm]) -> NullFit:
@@ -124,8 +128,9 @@ def cold_start(track: Track, spec: Spec) -> NullModel:
         best = descended(problem, by_size, _STEPS)
         if best.filtered.normalised_innovation < _GOOD:
             return _of_noise(best.model, first)
-    for model in _starts(coarse, base):
-        fit = _loosely(problem, model, quiet)
+    starts = _starts(coarse, base)
+    for ladder, model in itertools.product(_LADDERS, starts):
+        fit = _loosely(problem, model, quiet, *ladder)
         agreed = best is not None and abs(fit.cost - best.cost) < _WORTH
         if best is None or fit.cost < best.cost - _WORTH:
             best = fit
@@ -149,11 +154,13 @@ def _by_size(track: Track, base: NullModel) -> NullModel | None:
     return replace(base, soft_iron=found[0], hard_iron_gauss=found[1])
 
 
-def _loosely(problem: FitProblem, model: NullModel, quiet: float) -> NullFit:
+def _loosely(
+    problem: FitProblem, model: NullModel, quiet: float, inflations: Sequence[float], steps: int
+) -> NullFit:
     """Descend with less and less inflation of the gyro's noise."""
-    for inflation in _INFLATIONS[:-1]:
+    for inflation in inflations:
         loose = replace(model, sigma_gyro_rad_s=quiet * inflation)
-        model = descended(problem, loose, 2).model
+        model = descended(problem, loose, steps).model
     return descended(problem, replace(model, sigma_gyro_rad_s=quiet), _STEPS)
 
 
