@@ -39,7 +39,9 @@ def test_a_step_far_beyond_what_simulations_show_is_told() -> None:
     assert any("(seeds 0 to 4) show nothing" in note for note in found.notes)
 
 
-@pytest.mark.parametrize(("scenario", "seed"), [("wam", 3), ("lam", 1)])
+@pytest.mark.parametrize(
+    ("scenario", "seed"), [("wam", 3), pytest.param("lam", 1, marks=pytest.mark.slow)]
+)
 def test_a_fit_like_those_of_simulations_is_no_mismatch(scenario: str, seed: int) -> None:
     """Without this the engine is sure of something unknown in the first, by 1391 nats."""
     found = diagnose(track_of(_made(3.2e-4, 5.5e-2, scenario, seed)))

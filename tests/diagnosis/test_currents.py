@@ -47,7 +47,12 @@ def test_a_logged_current_alone_is_named(shape: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "shape", ["square", "quick square", "pulses", pytest.param("levels", marks=pytest.mark.slow)]
+    "shape",
+    [
+        "quick square",
+        "pulses",
+        *(pytest.param(shape, marks=pytest.mark.slow) for shape in ("square", "levels")),
+    ],
 )
 def test_an_unlogged_current_is_one_source_on_the_vehicle(shape: str, ask) -> None:
     track = track_of(experiment("wam", seed=6, samples=3000))
@@ -68,7 +73,7 @@ def test_the_steps_of_an_unlogged_current_are_no_lost_samples(seed: int) -> None
     assert found.unexplained.detected
 
 
-@pytest.mark.parametrize("seed", [5, 6])
+@pytest.mark.parametrize("seed", [pytest.param(5, marks=pytest.mark.slow), 6])
 def test_lost_samples_are_told_beside_a_current(seed: int, ask) -> None:
     """Without the current turns are put right where none was lost; of 5, steps are named there."""
     track = track_of(experiment("wam", seed=seed, samples=3000))
