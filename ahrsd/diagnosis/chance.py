@@ -5,9 +5,12 @@ by more from one reading to the next than the magnetometer scatters, that noise 
 and every evidence (a regression on noisy regressors), and the law by which evidence is judged
 elsewhere is not the one it follows.  So its law is measured (a parametric bootstrap): the fitted
 calibration alone is simulated along the recording's own motion, with its stamps, its columns and
-the noise that was fitted, and the same engine is asked about each copy.  Calibration and noise are
-those of the fit without any name or beside the names, whose magnetometer is the quieter one: what a
-missing name leaves is no noise, and louder copies show more by chance.
+the noise that was fitted.  First the calibration is fitted to each copy as it was to the recording:
+where what it leaves of the recording is like what it leaves of the copies, the two agree, whatever
+else an engine tells.  Where it is not, the same engine is asked about the first copies, and what it
+tells must be far beyond what it tells of these.  Calibration and noise are those of the fit without
+any name or beside the names, whose magnetometer is the quieter one: what a missing name leaves is
+no noise, and louder copies show more by chance.
 
 The motion is what the gyro's readings are expected to be without their noise (`wiener`), held by
 field and accelerometer.  Nothing is different in a copy, so whatever is told of one is chance.
