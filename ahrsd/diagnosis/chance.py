@@ -39,7 +39,6 @@ from ahrsd.diagnosis.noise_fit import FLOOR_MAG_GAUSS
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.predictive import beside_refitted, checks, usual_noise
 from ahrsd.diagnosis.problem import Problem, model_at_rate, problem_of
-from ahrsd.diagnosis.spoken import failed_checks
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Noise, NullModel
 from ahrsd.samples import Array
@@ -98,7 +97,7 @@ def beyond_chance(
     first = ask(track)
     found, problem, start = first.found, first.problem, first.start
     told = _told_nats(found)
-    if problem is None or start is None or not (told > 0.0 or failed_checks(found)):
+    if problem is None or start is None or not (told > 0.0 or found.failed_checks):
         return found
     recorded = problem.recorded
     models = [model_at_rate(start.model, problem), *([found.model] if found.model else [])]

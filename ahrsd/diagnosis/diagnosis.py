@@ -313,6 +313,11 @@ class Diagnosis:
     validation: Validation | None = None
     regime_map: tuple[RegimeMap, ...] = ()
 
+    @property
+    def failed_checks(self) -> list[str]:
+        """Statistics in which the recording is not like simulations of the repaired model."""
+        return [k for k, check in self.posterior_predictive.items() if not check.inside_after]
+
     def to_json(self) -> dict[str, Any]:
         """The contract's object, and what is beside it: tests, maps, notes, the repaired model."""
         out: dict[str, Any] = {

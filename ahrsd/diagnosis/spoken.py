@@ -38,7 +38,7 @@ def lines(found: Diagnosis) -> list[str]:
         out += ["", "left, and ordinary:", *_unexplained_lines(found.unexplained)]
     if not found.mismatch and found.sensitivity:
         out += ["", f"this recording would have shown: {sensitivity(found.sensitivity)}"]
-    failed = failed_checks(found)
+    failed = found.failed_checks
     if found.posterior_predictive:
         count = len(found.posterior_predictive)
         state = f"fails {', '.join(failed)}" if failed else "passes all of them"
@@ -58,15 +58,10 @@ def _whiteness(found: Diagnosis) -> str:
     return f"fail {', '.join(before) or 'nothing'} before; {left}"
 
 
-def failed_checks(found: Diagnosis) -> list[str]:
-    """Statistics in which the recording is not like simulations of the repaired model."""
-    return [k for k, check in found.posterior_predictive.items() if not check.inside_after]
-
-
 def verdict(found: Diagnosis) -> str:
     """One sentence."""
     names = len(found.findings)
-    failed, ordinary = failed_checks(found), ordinary_left(found)
+    failed, ordinary = found.failed_checks, ordinary_left(found)
     said = "" if ordinary is None else in_one_sentence(ordinary)
     if not found.mismatch and said:
         return (

@@ -12,7 +12,6 @@ from tracks import experiment, track_of
 
 from ahrsd.diagnosis.diagnosis import Check, Diagnosis, Heldout, Unexplained, Where, Whiteness
 from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.spoken import failed_checks
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.unknown import borne_out
 from ahrsd.simulation import Experiment
@@ -78,7 +77,7 @@ def test_noise_far_from_the_usual_is_no_mismatch(
     """Fifty times the noise, a magnetometer without any, a gyro ten times as loud as that."""
     found = diagnose(_with_reference(_made(kind)))
     _agrees(found)
-    assert failed_checks(found) == []
+    assert found.failed_checks == []
 
 
 def _turned(track: Track) -> Track:

@@ -22,7 +22,6 @@ from pathlib import Path
 
 from ahrsd.cli.recordings import simulate
 from ahrsd.diagnosis.diagnosis import Diagnosis
-from ahrsd.diagnosis.spoken import failed_checks
 from ahrsd.offline.diagnose import diagnose_recording
 
 SCENARIOS, MOTIONS = ("wam", "mam", "lam"), ("slow", "rov")
@@ -83,8 +82,8 @@ def main() -> None:
             found = diagnose_recording(path)
         count[kind] += 1
         false[kind] += found.mismatch
-        if found.mismatch or failed_checks(found):
-            words = told(found) or f"agrees, fails {', '.join(failed_checks(found))}"
+        if found.mismatch or found.failed_checks:
+            words = told(found) or f"agrees, fails {', '.join(found.failed_checks)}"
             took_s = time.process_time() - begin
             print(f"{scenario} {motion} seed {seed} {noise}: {words} ({took_s:.1f} s)", flush=True)
     rows = ["| scenario | motion | noise (mG, mrad/s) | recordings | told to differ |"]
