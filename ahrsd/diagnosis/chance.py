@@ -3,7 +3,12 @@
 The filter takes the measured rates for those that turn the field.  Where the gyro's noise turns it
 by more from one reading to the next than the magnetometer scatters, that noise is in every column
 and every evidence (a regression on noisy regressors), and the law by which evidence is judged
-elsewhere is not the one it follows.  So its law is measured (a parametric bootstrap): the fitted
+elsewhere is not the one it follows.  Where the motion hardly shows the calibration far less noise
+does the same: a sensor that turns slowly and is hardly tilted has the scale of its vertical axis
+from turns that are as small as the noise, and calibrations a tenth of a gauss off are likelier,
+with a mount that gives and iron that lags for the rest.
+
+So the law of what is told is measured (a parametric bootstrap): the fitted
 calibration alone is simulated along the recording's own motion, with its stamps, its columns and
 the noise that was fitted.  First the calibration is fitted to each copy as it was to the recording:
 where what it leaves of the recording is like what it leaves of the copies, the two agree, whatever
@@ -33,7 +38,13 @@ from ahrsd.diagnosis.descent import NullFit
 from ahrsd.diagnosis.diagnosis import Check, Diagnosis, Finding, Unexplained
 from ahrsd.diagnosis.effects.base import Readings
 from ahrsd.diagnosis.hygiene import would_have_shown
-from ahrsd.diagnosis.innovation import bearings, carried_along
+from ahrsd.diagnosis.innovation import (
+    bearings,
+    carried_along,
+    nuisance_columns,
+    regressing,
+    sensitivities,
+)
 from ahrsd.diagnosis.limits import LIMITS, Limits
 from ahrsd.diagnosis.noise_fit import FLOOR_MAG_GAUSS
 from ahrsd.diagnosis.null import fit_null
@@ -44,6 +55,7 @@ from ahrsd.diagnosis.values import Noise, NullModel
 from ahrsd.samples import Array
 
 LOUD = "the gyro's noise is louder than the magnetometer's"
+BENT = "the gyro's noise bends the calibration, which this motion hardly shows"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,20 +102,24 @@ def beyond_chance(
 ) -> Diagnosis:
     """The answer about a track; beside a loud gyro only what is clearly beyond chance is told.
 
-    ask: an engine.  Where the gyro is loud and something is told or a check fails, the calibration
-    is fitted to `limits.chance_fits` copies (seeds 0, 1, 2 and so on); where the recording's fit is
-    not like theirs, the engine is asked again for the first `limits.chance_copies` at most
+    ask: an engine.  Where the gyro is loud, by itself or for this motion, and something is told or
+    a check fails, the calibration is fitted to `limits.chance_fits` copies (seeds 0, 1, 2 and so
+    on); where the recording's fit is not like theirs, the engine is asked again for the first
+    `limits.chance_copies` at most
     """
     first = ask(track)
     found, problem, start = first.found, first.problem, first.start
     told = _told_nats(found)
-    if problem is None or start is None or not (told > 0.0 or found.failed_checks):
+    seen = told > 0.0 or found.failed_checks or found.p_value < limits.family_p
+    if problem is None or start is None or not seen:
         return found
     recorded = problem.recorded
     models = [model_at_rate(start.model, problem), *([found.model] if found.model else [])]
     model = max(models, key=lambda one: loudness(recorded, one))
-    if loudness(recorded, model) < limits.chance_loud:
+    loud = loudness(recorded, model) >= limits.chance_loud
+    if not loud and bent(start) < limits.chance_bent:
         return found
+    why = LOUD if loud else BENT
     truth = motion_of(recorded, model)
     for noise in _noises_of(model, start):
         copies = [copy_of(recorded, truth, noise, seed) for seed in range(limits.chance_fits)]
@@ -111,7 +127,7 @@ def beyond_chance(
         if not alone.differs:
             break
     if not alone.differs:
-        return _agreeing(first, problem, start, alone, _alike(found, told, alone))
+        return _agreeing(first, problem, start, alone, _alike(why, found, told, alone))
     if told <= 0.0:
         return replace(found, posterior_predictive=alone.checks)
     shown = list[float]()
@@ -120,7 +136,7 @@ def beyond_chance(
         if limits.chance_times * shown[-1] >= told:
             break
     bound = limits.chance_times * max(limits.alone_nats, *shown)
-    said = _words(found, told, shown, bound)
+    said = _words(why, found, told, shown, bound)
     if told <= bound:
         return _agreeing(first, problem, start, alone, said)
     weak = [one.effect for one in found.findings if _fitted(one) and one.evidence_nats <= bound]
@@ -133,6 +149,20 @@ def loudness(track: Track, model: NullModel) -> float:
     field_b = np.linalg.solve(model.soft_iron, (track.mag_b_gauss - model.hard_iron_gauss).T)
     size = float(np.nanmedian(np.linalg.norm(field_b, axis=0)))
     return size * model.sigma_gyro_rad_s * track.step_s / model.sigma_mag_gauss
+
+
+def bent(start: NullFit) -> float:
+    """How far the noise in the columns moves a calibration, in the deviations to which it is known.
+
+    The fit follows the slopes of the innovations, in which the gyro's noise is; slopes of the
+    smoothed motion have none, and what they say otherwise at the fit is what that noise does.
+    """
+    done = start.filtered
+    smooth = regressing(done, start.context().rate_b_rad_s)
+    noisy, clean = (sensitivities(one, nuisance_columns(one)) for one in (done, smooth))
+    score = np.einsum("nia,ni->a", noisy - clean, done.whitened)
+    known = start.covariance[: len(score), : len(score)]
+    return float(np.sqrt(max(score @ known @ score, 0.0)))
 
 
 def motion_of(track: Track, model: NullModel) -> Readings:
@@ -191,9 +221,9 @@ def _fit_of(copy: Track, problem: Problem) -> NullFit | None:
         return None
 
 
-def _alike(found: Diagnosis, told: float, alone: Alone) -> str:
+def _alike(why: str, found: Diagnosis, told: float, alone: Alone) -> str:
     """What was seen, and why it is not told."""
-    seen = f"{LOUD}: {_names(found)} is worth {told:.0f} nats here" if told > 0.0 else LOUD
+    seen = f"{why}: {_names(found)} is worth {told:.0f} nats here" if told > 0.0 else why
     if not alone.checks:
         return (
             f"{seen}; of {alone.copies} simulations of the model alone only {alone.fitted} can be "
@@ -226,7 +256,7 @@ def _shown_by(copy: Track, ask: Callable[[Track], Answered]) -> float:
         return float("inf")
 
 
-def _words(found: Diagnosis, told: float, shown: Sequence[float], bound: float) -> str:
+def _words(why: str, found: Diagnosis, told: float, shown: Sequence[float], bound: float) -> str:
     """What was seen, what simulations show, and what is told beside that."""
     count, largest = len(shown), max(shown)
     seeds = "seed 0" if count == 1 else f"seeds 0 to {count - 1}"
@@ -234,7 +264,7 @@ def _words(found: Diagnosis, told: float, shown: Sequence[float], bound: float) 
     shows = "shows" if count == 1 else "show"
     by_chance = f"up to {largest:.0f} nats of such" if largest > 0.0 else "nothing"
     seen = (
-        f"{LOUD}: {_names(found)} is worth {told:.0f} nats here; {made} of the "
+        f"{why}: {_names(found)} is worth {told:.0f} nats here; {made} of the "
         f"model alone with this noise ({seeds}) "
     )
     if not np.isfinite(largest):

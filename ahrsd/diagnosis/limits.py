@@ -41,6 +41,9 @@ class Limits:
                     deviations of a reading, from which on evidence is held against simulations.
                     Above every real recording that was looked at, below the simulations that
                     were told to differ from themselves
+    chance_bent:    the same where the gyro's noise moves the calibration by so many deviations to
+                    which it is known.  Simulations that hardly tilt have .6 to .9, those that do
+                    .2 at most, 33 real recordings .02 (and one that never moves 13)
     chance_fits:    simulations to which the calibration alone is fitted, for the bands in which the
                     recording's own fit has to be where nothing is told
     chance_copies, chance_times: how many of these are diagnosed, and how many times the largest
@@ -67,6 +70,7 @@ class Limits:
     alone_p: float = 1e-4
     doubt: float = 0.01
     chance_loud: float = 2.0
+    chance_bent: float = 0.3
     chance_fits: int = 16
     chance_copies: int = 5
     chance_times: float = 4.0

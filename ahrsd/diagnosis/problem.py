@@ -39,6 +39,7 @@ class Problem:
     averaged: readings of the magnetometer in a working row that has any: less than `thin` where it
               is read more seldom than the gyro
     notes:    what a person should know of how the rates were read
+    unread_s: spans, from and to, whose readings are left out: something was moved there
     """
 
     track: Track
@@ -53,6 +54,7 @@ class Problem:
     notes: tuple[str, ...] = ()
     riding: Array | None = None
     instants: bool = False
+    unread_s: tuple[tuple[float, float], ...] = ()
 
     @property
     def rate_hz(self) -> float:

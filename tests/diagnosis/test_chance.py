@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.chance import copy_of, loudness, motion_of
+from ahrsd.diagnosis.chance import bent, copy_of, loudness, motion_of
+from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.forward import noise_of
+from ahrsd.diagnosis.limits import LIMITS
+from ahrsd.diagnosis.null import fit_null
+from ahrsd.diagnosis.problem import problem_of
 from ahrsd.diagnosis.spoken import verdict
+from ahrsd.diagnosis.track import Spec
 from ahrsd.simulation import Experiment
 
 STEP_GAUSS = np.array([1.6e-3, -1.2e-3, 0.0])
@@ -72,6 +77,16 @@ def test_how_loud_a_gyro_is(sigma_mag: float, sigma_gyro: float, ratio: float) -
     """Of half a gauss, 25 times a second: 50 mrad/s turn it by 1 mG."""
     made = _made(sigma_mag, sigma_gyro)
     assert loudness(track_of(made), true_model(made)) == pytest.approx(ratio, rel=0.1)
+
+
+@pytest.mark.parametrize(("scenario", "is_bent"), [("lam", True), ("wam", False), ("mam", False)])
+def test_the_noise_bends_a_calibration_that_the_motion_hardly_shows(
+    scenario: str, is_bent: bool
+) -> None:
+    """Slow turns with a tilt of a few degrees; the same noise beside larger ones moves nothing."""
+    problem, cold = problem_of(track_of(_made(1e-3, 5e-3, scenario, 2)), Spec(), EFFECTS, LIMITS)
+    moved = bent(fit_null(problem.track, problem.spec, cold, walk=False))
+    assert moved == pytest.approx(0.62, abs=0.1) if is_bent else moved < 0.1
 
 
 def test_a_copy_has_the_motion_the_noise_and_the_stamps() -> None:

@@ -259,11 +259,25 @@ def unread(point: Point, spans_s: Sequence[tuple[float, float]]) -> Point:
     mag = recorded.mag_b_gauss.copy()
     for begin_s, end_s in spans_s:
         mag[(recorded.time_s >= begin_s) & (recorded.time_s <= end_s)] = np.nan
-    problem = replace(point.problem, recorded=replace(recorded, mag_b_gauss=mag))
-    problem = problem.lagging(problem.lag_s)
+    problem = replace(
+        point.problem,
+        recorded=replace(recorded, mag_b_gauss=mag),
+        unread_s=_together([*point.problem.unread_s, *spans_s]),
+    ).lagging(point.problem.lag_s)
     model = point.filtered.model
     filtered = run_filter(problem.track, model, point.terms_mag, point.terms_gyro)
     return replace(point, problem=problem, filtered=filtered)
+
+
+def _together(spans_s: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    """Spans in their order, those that overlap as one."""
+    out: list[tuple[float, float]] = []
+    for begin_s, end_s in sorted(spans_s):
+        if out and begin_s <= out[-1][1]:
+            out[-1] = (out[-1][0], max(end_s, out[-1][1]))
+        else:
+            out.append((begin_s, end_s))
+    return tuple(out)
 
 
 def regained(point: Point) -> Point:

@@ -140,6 +140,9 @@ def _notes(
     problem = found.all_sets.made.point.problem
     seen = () if something else would_have_shown(problem.recorded)
     how = (*asked.notes, *problem.notes, *((HARDLY_TURNED,) if still else ()))
+    if problem.unread_s:
+        when = ", ".join(f"{begin:.1f}-{end:.1f}" for begin, end in problem.unread_s)
+        how = (*how, f"readings at {when} s were left out: something was moved there")
     return (*how, *said, *asked.lesser, *seen, NOTE)
 
 
