@@ -410,6 +410,8 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
         key for name, keys in space.effects.items() if name not in had or name in again
         for key in keys if key not in base
     ]  # fmt: skip
+    changing = _changing(all_sets, base)
+    candidates = [key for key in candidates if _steps_of(all_sets, key) not in changing]
     candidates = [key for key in candidates if not _beside_its_like(all_sets, base, key)]
     candidates = [key for key in candidates if all_sets.is_asked(base, key)]
     if not candidates:
@@ -424,6 +426,28 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
             best[one.effect or key] = (total, key)
     ranked = sorted(best.values(), reverse=True)[:ASKED]
     return [sought(all_sets, space, scan, key) for total, key in ranked if total > 0.0]
+
+
+def _changing(all_sets: Hypotheses, base: Names) -> set[str]:
+    """Sensors with so many steps of one kind that they are one source that changes, unknown.
+
+    Further steps, of whatever kind, would be parts of it, and each brings a form of its own.
+    """
+    steps = [key for key in base if _steps_of(all_sets, key)]
+    kinds = [all_sets.component(key).effect for key in steps]
+    return {
+        _steps_of(all_sets, key)
+        for key, kind in zip(steps, kinds, strict=True)
+        if kinds.count(kind) >= priors.CHANGES
+    }
+
+
+def _steps_of(all_sets: Hypotheses, key: str) -> str:
+    """The sensor of which a candidate is a step; empty where it is none."""
+    one = all_sets.component(key)
+    if one.row is None or not one.row.recurs:
+        return ""
+    return "gyro" if one.columns.mag is None else "magnetometer"
 
 
 def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
