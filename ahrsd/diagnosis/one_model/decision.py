@@ -151,7 +151,7 @@ def _switching(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
 
     Those that are ordinary count as well.
     """
-    members = [all_sets.component(key) for key in best.names]
+    members = [all_sets.component(key) for key in sorted(best.names)]
     kinds = sorted(one.effect for one in members if one.effect is not None and one.jumps)
     many = [k for k in dict.fromkeys(kinds) if kinds.count(k) >= priors.CHANGES]
     return sorted(many, key=kinds.count, reverse=True)
@@ -161,7 +161,7 @@ def _jumping(
     all_sets: Hypotheses, best: Hypothesis, kind: str, odds: Mapping[str, float]
 ) -> tuple[tuple[str, ...], Unexplained]:
     """A source that goes in steps: its levels between the changes, along its direction."""
-    keys = [key for key in best.names if all_sets.component(key).effect == kind]
+    keys = [key for key in sorted(best.names) if all_sets.component(key).effect == kind]
     keys.sort(key=lambda key: float(all_sets.component(key).setting["onset_s"]))
     changes = np.array([coefficients(all_sets, best, key)[0] for key in keys])
     onsets = [float(all_sets.component(key).setting["onset_s"]) for key in keys]
@@ -182,7 +182,7 @@ def _borne_out(
     A name with a free factor beside it is a part of that: it stays as long.
     """
     while True:
-        own = [key for key in best.names if key not in all_sets.remainder]
+        own = [key for key in sorted(best.names) if key not in all_sets.remainder]
         own = [key for key in own if best.names.isdisjoint(form_keys(key))]
         asked = {key: asked_odds(all_sets, best, key) for key in own}
         rivals = {key: all_sets.judge(all_sets.without(best.names, key), best) for key in own}
@@ -226,8 +226,8 @@ def _with_heading(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypot
 
 def _names(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
     """Members that the library has, without the delay."""
-    known = [key for key in best.names if all_sets.component(key).row is not None]
-    return sorted(key for key in known if key != LAG)
+    known = [key for key in sorted(best.names) if all_sets.component(key).row is not None]
+    return [key for key in known if key != LAG]
 
 
 def _beside_others(
@@ -297,7 +297,7 @@ def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
         return asked
     asked = max(asked, priors.BESIDE_UNKNOWN * all_sets.unknown_nats)
     unknown = [
-        other for other in best.names - frozenset(all_sets.remainder)
+        other for other in sorted(best.names - frozenset(all_sets.remainder))
         if all_sets.component(other).row is None and not _is_ordinary(all_sets, best, other)
     ]  # fmt: skip
     if not unknown:

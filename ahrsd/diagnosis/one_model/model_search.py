@@ -91,9 +91,10 @@ class Hypotheses:
         noise what a member explains is noise still
         """
         members = frozenset(names)
+        ordered = sorted(members)
         if members not in self.judged:
-            forms = [self.forms[key] for key in members if key in self.forms]
-            keys = (CALIBRATION, *sorted(members), *sorted(forms))
+            forms = [self.forms[key] for key in ordered if key in self.forms]
+            keys = (CALIBRATION, *ordered, *sorted(forms))
             real = self.is_real(members)
             step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN
             products = self.made.products(keys, step)
@@ -105,7 +106,7 @@ class Hypotheses:
             start = np.concatenate([*psi, np.zeros(0)])
             if np.max(noise) > noise[-1] + priors.LOUD:
                 noise = np.minimum(noise, noise[-1])
-            odds = sum(self.component(key).prior for key in members)
+            odds = sum(self.component(key).prior for key in ordered)
             odds += self._again(members) + self._of_class(members)
             at = reached(products, laws, (noise, start), asked - odds)
             if at is None:
@@ -312,7 +313,7 @@ def exchanged(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
     if all_sets.is_real(best.names):
         return best
     for _ in range(MOST_MOVES):
-        names = [key for key in best.names if all_sets.component(key).row is not None]
+        names = [key for key in sorted(best.names) if all_sets.component(key).row is not None]
         bases = [best.names - {key} for key in names if key != LAG]
         found = [
             all_sets.with_(base, key)
@@ -338,7 +339,7 @@ def sharpened(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
         if key == LAG or key in all_sets.forms or all_sets.component(key).row is None:
             continue
         tried = [best]
-        for rest in {best.names, best.names - set(space.courses)}:
+        for rest in dict.fromkeys((best.names, best.names - set(space.courses))):
             fewer = all_sets.judge(rest - {key}, best)
             scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
             new = sought(all_sets, space, scan, key, range(FINER, SHARPEST))
@@ -356,7 +357,7 @@ def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
     """Sets that are one step away: a course or an effect more, one less, one for another."""
     names = here.names
     _propose_steps(all_sets, space, here)
-    own = [key for key in names if key not in all_sets.remainder]
+    own = [key for key in sorted(names) if key not in all_sets.remainder]
     out = [all_sets.without(names, key) for key in own]
     courses = [key for key in space.courses if key not in names]
     out += [names | {key} for key in courses]
@@ -365,7 +366,7 @@ def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
         out += [names - sources | {key} for key in space.sources if key not in names]
     out.append(names - rest if rest <= names else (names - sources) | rest)
     bare = names - set(space.courses)
-    for base in {names, bare}:
+    for base in dict.fromkeys((names, bare)):
         ranked = asked(all_sets, space, base, here)
         out += [all_sets.with_(base, key) for key in ranked]
     return list(dict.fromkeys(out))

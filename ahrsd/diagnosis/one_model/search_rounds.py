@@ -36,7 +36,7 @@ def answered(found: rich.Judged, library: Mapping[str, Effect]) -> Searched:
     answer = decision.decided(all_sets, space, best, library)
     for _ in range(ROUNDS - 1):
         before = decision.names_of(all_sets, answer.best)
-        members = [all_sets.component(key) for key in answer.best.names]
+        members = [all_sets.component(key) for key in sorted(answer.best.names)]
         named = [one for one in members if one.effect is not None and one.key != LAG]
         if not named:
             break
@@ -61,7 +61,9 @@ def moved_in(all_sets: Hypotheses, best: Hypothesis) -> list[tuple[float, float]
     point, half_s = all_sets.made.point, priors.APPROACH_S / 2 / PIECES
     track, sigma = point.filtered.track, point.filtered.model.sigma_mag_gauss
     read = np.isfinite(track.mag_b_gauss).all(axis=1)
-    starting = [one for key in best.names if "onset_s" in (one := all_sets.component(key)).setting]
+    starting = [
+        one for key in sorted(best.names) if "onset_s" in (one := all_sets.component(key)).setting
+    ]
     out = []
     for step in starting:
         form = all_sets.forms.get(step.key)

@@ -47,7 +47,9 @@ def _apart(
 def changes(all_sets: Hypotheses, known: Hypothesis, factor: float) -> Mapping[str, float]:
     """By what a set's score changes where each prior is so many times what it is, nats."""
     log, at = float(np.log(factor)), known.at
-    members = [all_sets.component(key) for key in known.names if key not in all_sets.remainder]
+    members = [
+        all_sets.component(key) for key in sorted(known.names) if key not in all_sets.remainder
+    ]
     named = sum(one.row is not None for one in members)
     real = all_sets.is_real(known.names)
     step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN
