@@ -213,11 +213,18 @@ def maximised(products: Products, laws: Sequence[Law], start: tuple[Array, Array
 
 
 def reached(
-    products: Products, laws: Sequence[Law], start: tuple[Array, Array], asked: float
+    products: Products,
+    laws: Sequence[Law],
+    start: tuple[Array, Array],
+    asked: float,
+    *,
+    small: Sequence[int] = (),
 ) -> At | None:
     """The same, None as soon as the climb will surely not reach so many nats.
 
     Newton's steps with the average information, between the ends of what is allowed.
+    small: laws that begin at their smallest where that is likelier: of many coefficients that
+    nothing tells a size comes down by half a logarithm a step, and a climb looks as if it ended
     """
     count = len(products.rows)
     low, high = noise_model.bounds(count)
@@ -225,6 +232,13 @@ def reached(
     high = np.concatenate([high, *(law.high for law in laws)])
     x = np.clip(np.concatenate(start), low, high)
     at = evaluated(products, laws, x[:count], x[count:])
+    if small:
+        first = np.cumsum([count, *(len(law.start) for law in laws)])
+        least = x.copy()
+        for k in small:
+            least[first[k] : first[k + 1]] = low[first[k] : first[k + 1]]
+        if (there := evaluated(products, laws, least[:count], least[count:])).nats > at.nats:
+            x, at = least, there
     for _ in range(_STEPS):
         step = _newton(at, x, low, high)
         gain = 0.5 * float(at.gradient @ step)

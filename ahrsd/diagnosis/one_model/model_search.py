@@ -108,7 +108,8 @@ class Hypotheses:
                 noise = np.minimum(noise, noise[-1])
             odds = sum(self.component(key).prior for key in ordered)
             odds += self._again(members) + self._of_class(members)
-            at = reached(products, laws, (noise, start), asked - odds)
+            small = [k for k, key in enumerate(keys) if key in forms and key not in known]
+            at = reached(products, laws, (noise, start), asked - odds, small=small)
             if at is None:
                 return None
             odds += self._believed(keys, at)

@@ -147,6 +147,8 @@ ORDINARY_COURSE: Mapping[str, float] = {"sensor": 0.017}
 # --- where it is linearised --------------------------------------------------------------------
 #: deviations of calibration and delay to which a point is where its model wants it
 NEAR = 0.7
+#: deviations by which the readings say at a delay that it is nearer to none, for it not to be one
+POINTS_BACK = 2.0
 
 # --- the decision -------------------------------------------------------------------------------
 #: log odds from which an effect is told: a false name costs more than a missed one;  from which

@@ -152,6 +152,8 @@ def _likeliest_delay(problem: Problem, filtered: Filtered, library: Mapping[str,
                 found = at(best.base.made.point.problem.lag_s + way, instants=instants)
                 if found.nats < best.nats + priors.ODDS_REAL:  # between samples is smoother
                     break
+                if _points_back(found):
+                    break
                 best = found
         return best
 
@@ -161,6 +163,17 @@ def _likeliest_delay(problem: Problem, filtered: Filtered, library: Mapping[str,
         return means
     instants = climbed(at(lag_s, instants=True), instants=True)
     return instants if instants.nats > means.nats + priors.ODDS_REAL else means
+
+
+def _points_back(here: Judged) -> bool:
+    """Whether readings say at a delay that it is nearer to none.
+
+    Moved in time a gyro's noise is another one, and in some the readings are likelier, whatever the
+    delay is; a delay that is there stays where it is.
+    """
+    lag_s = here.base.made.point.problem.lag_s
+    off, deviation = step_of(here.base.made, here.base.whole, here.at)  # of the delay the last
+    return bool(-off[-1] * np.sign(lag_s) > priors.POINTS_BACK * deviation[-1])
 
 
 def settled(point: Point, library: Mapping[str, Effect], named: Sequence[Component]) -> Judged:
