@@ -92,6 +92,16 @@ class Alone:
         return Alone(checked, p_value, len(copies), len(fits))
 
     @property
+    def undecided(self) -> str | None:
+        """Why the recording's fit cannot be compared with theirs; None where it can."""
+        if self.checks:
+            return None
+        return (
+            f"of {self.copies} simulations of the model alone with this noise only {self.fitted} "
+            "can be fitted"
+        )
+
+    @property
     def differs(self) -> bool:
         """Whether the recording's fit leaves what those of simulations do not."""
         return any(not check.inside_after for check in self.checks.values())
@@ -224,11 +234,8 @@ def _fit_of(copy: Track, problem: Problem) -> NullFit | None:
 def _alike(why: str, found: Diagnosis, told: float, alone: Alone) -> str:
     """What was seen, and why it is not told."""
     seen = f"{why}: {_names(found)} is worth {told:.0f} nats here" if told > 0.0 else why
-    if not alone.checks:
-        return (
-            f"{seen}; of {alone.copies} simulations of the model alone only {alone.fitted} can be "
-            "fitted, so that nothing can be told beside it"
-        )
+    if (untold := alone.undecided) is not None:
+        return f"{seen}; {untold}"
     return (
         f"{seen}; {alone.fitted} simulations of the model alone with this noise (seeds 0 to "
         f"{alone.copies - 1}), fitted as the recording was, look like it, so that nothing is told"
@@ -291,6 +298,7 @@ def _agreeing(
         findings=counted,
         unexplained=Unexplained(False),
         posterior_predictive=alone.checks or checks(start, start, ()),
+        undecided=None if counted else alone.undecided,
         notes=(*found.notes, said, *more),
         model=model,
         noise=forward.noise_of(model),

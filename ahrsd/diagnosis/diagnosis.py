@@ -293,6 +293,7 @@ class Drawn:
 class Diagnosis:
     """The whole answer.
 
+    undecided: why nothing can be told, None where it can: then it says neither yes nor no
     model, noise, terms: the repaired model, of single samples
     """
 
@@ -312,6 +313,7 @@ class Diagnosis:
     omnibus: dict[str, Whiteness] = field(default_factory=dict)
     validation: Validation | None = None
     regime_map: tuple[RegimeMap, ...] = ()
+    undecided: str | None = None
 
     @property
     def failed_checks(self) -> list[str]:
@@ -335,6 +337,8 @@ class Diagnosis:
             "sensitivity": [_plain(limit) for limit in self.sensitivity],
             "notes": list(self.notes),
         }
+        if self.undecided is not None:
+            out["undecided"] = self.undecided
         if self.model is not None:
             out["model"] = {**_plain(self.model), "terms": [_plain(term) for term in self.terms]}
         return out

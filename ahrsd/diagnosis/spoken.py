@@ -36,7 +36,7 @@ def lines(found: Diagnosis) -> list[str]:
         out += ["", "not in the library:", *_unexplained_lines(found.unexplained)]
     elif ordinary_left(found) is not None:
         out += ["", "left, and ordinary:", *_unexplained_lines(found.unexplained)]
-    if not found.mismatch and found.sensitivity:
+    if not found.mismatch and found.undecided is None and found.sensitivity:
         out += ["", f"this recording would have shown: {sensitivity(found.sensitivity)}"]
     failed = found.failed_checks
     if found.posterior_predictive:
@@ -63,6 +63,8 @@ def verdict(found: Diagnosis) -> str:
     names = len(found.findings)
     failed, ordinary = found.failed_checks, ordinary_left(found)
     said = "" if ordinary is None else in_one_sentence(ordinary)
+    if found.undecided is not None:
+        return f"nothing can be told: {found.undecided}"
     if not found.mismatch and said:
         return (
             f"nothing beyond the ordinary: what is left is {said}; it is there "

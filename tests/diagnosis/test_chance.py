@@ -15,7 +15,7 @@ from ahrsd.diagnosis.forward import noise_of
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.spoken import verdict
+from ahrsd.diagnosis.spoken import lines, verdict
 from ahrsd.diagnosis.track import Spec
 from ahrsd.simulation import Experiment
 
@@ -60,6 +60,26 @@ def test_a_fit_like_those_of_simulations_is_no_mismatch(scenario: str, seed: int
 def test_a_magnetometer_without_noise_is_like_its_simulations() -> None:
     found = diagnose(track_of(_made(0.0, 5e-3, "lam", 2)))
     assert verdict(found) == "recording and model agree"
+
+
+def test_where_no_simulation_can_be_fitted_neither_yes_nor_no_is_said(monkeypatch) -> None:
+    """What was seen may be chance, and nothing says how much chance makes."""
+    track = track_of(_made(1e-4, 5e-2))
+    since = (np.arange(len(track)) >= 1500)[:, None]
+    stepped = replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS)
+
+    def no_end(*_, **__):
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    monkeypatch.setattr("ahrsd.diagnosis.chance.fit_null", no_end)
+    found = diagnose(stepped)
+    assert found.findings == ()
+    assert verdict(found) == (
+        "nothing can be told: of 16 simulations of the model alone with this noise only 0 can be "
+        "fitted"
+    )
+    assert "would have shown" not in "\n".join(lines(found))
+    assert found.to_json()["undecided"].startswith("of 16 simulations")
 
 
 def test_where_the_gyro_is_the_quieter_sensor_nothing_is_simulated() -> None:

@@ -261,7 +261,7 @@ def _held_to_form(
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
     """With a free factor for each name that stands in for something: its coefficient varies."""
     while True:
-        asked = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.UNKNOWN_ODDS
+        asked = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.FORM_ODDS
         found, made = best, all_sets.made
         for key in _names(all_sets, best):
             one = all_sets.component(key)

@@ -151,9 +151,13 @@ NEAR = 0.7
 POINTS_BACK = 2.0
 
 # --- the decision -------------------------------------------------------------------------------
-#: log odds from which an effect is told: a false name costs more than a missed one;  from which
-#: something is called unknown
-NAME_ODDS, UNKNOWN_ODDS = 3.0, 3.0
+#: log odds from which an effect is told: a false name costs more than a missed one;  from which a
+#: factor that is free says that a name stands in for something else
+NAME_ODDS, FORM_ODDS = 3.0, 3.0
+#: from which something is called unknown: a course explains whatever the noise has that its law
+#: lacks;  source: nulls of other authors' generators had 4, 7, 9, 14 and 37 where others had less
+#: than 3 (slow noise, host stamps that jitter)
+UNKNOWN_ODDS = 12.0
 #: both on a recording with an ordinary remainder: its laws are not exact, a few nats say nothing
 ODDS_REAL = 12.0
 #: odds that what one effect explains is a wider one's in just that form, which no reading tells:

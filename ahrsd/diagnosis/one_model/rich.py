@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -47,6 +48,8 @@ from ahrsd.diagnosis.problem import Problem
 ROUNDS, NOISES, SETTLED = 6, 3, 5.0
 #: parts of a step that are tried, with the delay's or without
 STEPS: tuple[tuple[float, bool], ...] = ((1.0, True), (1.0, False), (0.3, False))
+#: deviations of an innovation beyond which a step has left every calibration that can be
+_RUN_AWAY = 1e6
 #: the sensor's course stands for all three where the remainder, with the other two, is in
 RICH_COURSES = ("free sensor",)
 #: of the ordinary remainder, by frame
@@ -191,14 +194,18 @@ def _settled(
     and the noise is estimated anew where they rest: what was not taken out yet is no noise.
     """
 
-    def judge(point: Point, near: Judged) -> Judged | None:
-        seen = np.isfinite(point.filtered.whitened).all()
+    def judge(make: Callable[[], Point], near: Judged) -> Judged | None:
+        try:
+            point = make()
+        except np.linalg.LinAlgError:  # a step too far
+            return None
+        seen = np.all(np.abs(point.filtered.whitened) < _RUN_AWAY)  # false of what is not finite
         return judged(point, library, named, whole=whole, near=near) if seen else None
 
     here = _moved_to_rest(here, judge)
     for _ in range(NOISES):
         for quieter in (_relevelled, _regained):
-            found = judge(quieter(here), here)
+            found = judge(partial(quieter, here), here)
             if found is not None and found.nats > here.nats + SETTLED:
                 here = _moved_to_rest(found, judge)
                 break
@@ -215,7 +222,9 @@ def _regained(here: Judged) -> Point:
     return regained(here.base.made.point)
 
 
-def _moved_to_rest(here: Judged, judge: Callable[[Point, Judged], Judged | None]) -> Judged:
+def _moved_to_rest(
+    here: Judged, judge: Callable[[Callable[[], Point], Judged], Judged | None]
+) -> Judged:
     """Moved while that makes the model likelier, gains held."""
     ways = STEPS
     for _ in range(ROUNDS):
@@ -223,7 +232,7 @@ def _moved_to_rest(here: Judged, judge: Callable[[Point, Judged], Judged | None]
             break
         for k, (share, delayed) in enumerate(ways):
             at = here.base.made, here.base.whole, here.at
-            found = judge(moved(*at, share, delayed=delayed), here)
+            found = judge(partial(moved, *at, share, delayed=delayed), here)
             if found is not None and found.nats > here.nats:
                 ways = ways[k:]
                 break
