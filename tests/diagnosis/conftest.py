@@ -15,13 +15,17 @@ from ahrsd.diagnosis.track import Spec, Track
 sys.path.insert(0, str(Path(__file__).parent))
 
 
-@pytest.fixture(params=ENGINES)
+#: the experimental engine has its own tests in `one_model/`; these are over both in the slow form
+BOTH = [pytest.param(one, marks=pytest.mark.slow if one == ONE_MODEL else ()) for one in ENGINES]
+
+
+@pytest.fixture(params=BOTH)
 def ask(request: pytest.FixtureRequest) -> Callable[..., Diagnosis]:
     """Each engine: a track and what is known of the sensor."""
     return one_model.diagnose if request.param == ONE_MODEL else engine.diagnose
 
 
-@pytest.fixture(params=ENGINES)
+@pytest.fixture(params=BOTH)
 def ask_logged(request: pytest.FixtureRequest) -> Callable[[Track], Diagnosis]:
     """Each engine with what badly logged columns can still say, as users have it."""
     rest = {"spec": Spec(), "recording": "", "simulated": False}

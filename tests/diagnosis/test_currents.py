@@ -11,6 +11,7 @@ from tracks import experiment, track_of, true_model
 from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.forward import simulated
 from ahrsd.diagnosis.injection import readings_of
+from ahrsd.diagnosis.one_model import diagnose as one_model
 from ahrsd.diagnosis.thin import thinned
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Noise, Term
@@ -74,8 +75,11 @@ def test_the_steps_of_an_unlogged_current_are_no_lost_samples(seed: int) -> None
 
 
 @pytest.mark.parametrize("seed", [pytest.param(5, marks=pytest.mark.slow), 6])
-def test_lost_samples_are_told_beside_a_current(seed: int, ask) -> None:
+def test_lost_samples_are_told_beside_a_current(seed: int, ask, request) -> None:
     """Without the current turns are put right where none was lost; of 5, steps are named there."""
+    if ask is one_model.diagnose:
+        why = "a step of the field is likelier beside what the lost turns leave"
+        request.applymarker(pytest.mark.xfail(reason=why, strict=True))
     track = track_of(experiment("wam", seed=seed, samples=3000))
     track = _disturbed(track, SHAPES["square"](track.time_s), logged=True)
     keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.01)
