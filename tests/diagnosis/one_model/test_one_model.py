@@ -204,6 +204,7 @@ def test_a_current_that_comes_late_into_the_log_is_named_and_moved_to_its_time()
     assert not found.unexplained.detected
 
 
+@pytest.mark.slow
 def test_the_way_of_a_hand_with_a_magnet_is_no_name_beside_its_step():
     track = track_of(experiment("wam", seed=11, samples=4000))
     t = track.time_s - track.time_s[0]
@@ -287,6 +288,7 @@ def test_a_mount_that_was_aligned_under_its_load_is_no_crooked_gyro_as_well(alig
     assert not found.unexplained.detected
 
 
+@pytest.mark.slow
 def test_a_scale_that_creeps_is_no_compensation_on_board():
     """A compensation takes hard iron away: a part of it below a hundredth is another source."""
     track = track_of(experiment("wam", seed=12, samples=4000))
