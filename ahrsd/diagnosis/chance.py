@@ -55,6 +55,7 @@ from ahrsd.diagnosis.values import Noise, NullModel
 from ahrsd.samples import Array
 
 LOUD = "the gyro's noise is louder than the magnetometer's"
+NOT_DIAGNOSED = "a simulation of the model alone with this noise cannot be diagnosed"
 BENT = "the gyro's noise bends the calibration, which this motion hardly shows"
 
 
@@ -137,7 +138,9 @@ def beyond_chance(
         if not alone.differs:
             break
     if not alone.differs:
-        return _agreeing(first, problem, start, alone, _alike(why, found, told, alone))
+        return _agreeing(
+            first, problem, start, alone, _alike(why, found, told, alone), alone.undecided
+        )
     if told <= 0.0:
         return replace(found, posterior_predictive=alone.checks)
     shown = list[float]()
@@ -148,7 +151,8 @@ def beyond_chance(
     bound = limits.chance_times * max(limits.alone_nats, *shown)
     said = _words(why, found, told, shown, bound)
     if told <= bound:
-        return _agreeing(first, problem, start, alone, said)
+        untold = None if np.isfinite(bound) else NOT_DIAGNOSED
+        return _agreeing(first, problem, start, alone, said, untold)
     weak = [one.effect for one in found.findings if _fitted(one) and one.evidence_nats <= bound]
     said = f"{said}; chance may be: {', '.join(weak)}" if weak else said
     return replace(found, notes=(*found.notes, said))
@@ -275,14 +279,22 @@ def _words(why: str, found: Diagnosis, told: float, shown: Sequence[float], boun
         f"model alone with this noise ({seeds}) "
     )
     if not np.isfinite(largest):
-        return f"{seen}cannot be fitted, so that nothing can be told beside it"
+        return f"{seen}were asked, and the last cannot be diagnosed"
     return f"{seen}{shows} {by_chance}; only what is worth more than {bound:.0f} nats is told"
 
 
 def _agreeing(
-    answered: Answered, problem: Problem, start: NullFit, alone: Alone, said: str
+    answered: Answered,
+    problem: Problem,
+    start: NullFit,
+    alone: Alone,
+    said: str,
+    undecided: str | None,
 ) -> Diagnosis:
-    """The answer of the calibration alone, with what was counted in the readings."""
+    """The answer of the calibration alone, with what was counted in the readings.
+
+    said: for the notes;  undecided: why not even that can be told, None where it can
+    """
     found = answered.found
     counted = tuple(one for one in found.findings if not _fitted(one))
     fitted = {one.term for one in found.findings if _fitted(one)}
@@ -298,7 +310,7 @@ def _agreeing(
         findings=counted,
         unexplained=Unexplained(False),
         posterior_predictive=alone.checks or checks(start, start, ()),
-        undecided=None if counted else alone.undecided,
+        undecided=None if counted else undecided,
         notes=(*found.notes, said, *more),
         model=model,
         noise=forward.noise_of(model),

@@ -43,7 +43,7 @@ class Limits:
                     were told to differ from themselves
     chance_bent:    the same where the gyro's noise moves the calibration by so many deviations to
                     which it is known.  Simulations that hardly tilt have .6 to .9, those that do
-                    .2 at most, 33 real recordings .02 (and one that never moves 13)
+                    .2 at most, real recordings next to nothing but one that never moves
     chance_fits:    simulations to which the calibration alone is fitted, for the bands in which the
                     recording's own fit has to be where nothing is told
     chance_copies, chance_times: how many of these are diagnosed, and how many times the largest

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.chance import bent, copy_of, loudness, motion_of
+from ahrsd.diagnosis.chance import (
+    Answered,
+    bent,
+    beyond_chance,
+    copy_of,
+    loudness,
+    motion_of,
+)
+from ahrsd.diagnosis.diagnosis import Diagnosis, Unexplained, Where
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.forward import noise_of
@@ -16,7 +24,7 @@ from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.problem import problem_of
 from ahrsd.diagnosis.spoken import lines, verdict
-from ahrsd.diagnosis.track import Spec
+from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.simulation import Experiment
 
 STEP_GAUSS = np.array([1.6e-3, -1.2e-3, 0.0])
@@ -80,6 +88,29 @@ def test_where_no_simulation_can_be_fitted_neither_yes_nor_no_is_said(monkeypatc
     )
     assert "would have shown" not in "\n".join(lines(found))
     assert found.to_json()["undecided"].startswith("of 16 simulations")
+
+
+def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> None:
+    """How much of such chance makes is then not known either."""
+    track = track_of(_made(1e-4, 5e-2))
+    since = (np.arange(len(track)) >= 1500)[:, None]
+    track = replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS)
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    start = fit_null(problem.track, problem.spec, cold)
+    where = Where(((60.0, 120.0),), ("x", "y"), "sensor")
+    left = Unexplained(True, where, evidence_nats=2000.0)
+    told = Diagnosis("step.csv", None, True, 1e-9, (), left, {})
+
+    def ask(asked: Track) -> Answered:
+        if asked is not track:
+            raise np.linalg.LinAlgError("Eigenvalues did not converge")
+        return Answered(told, problem, start)
+
+    found = beyond_chance(track, ask)
+    assert not found.unexplained.detected
+    assert verdict(found) == (
+        "nothing can be told: a simulation of the model alone with this noise cannot be diagnosed"
+    )
 
 
 def test_where_the_gyro_is_the_quieter_sensor_nothing_is_simulated() -> None:
