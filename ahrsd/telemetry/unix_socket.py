@@ -323,6 +323,8 @@ class DaemonConnection:
         return self
 
     def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(OSError):  # the daemon may be gone already
+            self._socket.shutdown(socket.SHUT_RDWR)  # whoever waits in `watch` is woken
         self._socket.close()
 
     def ask(self, what: str) -> dict[str, Any]:

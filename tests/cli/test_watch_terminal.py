@@ -41,8 +41,9 @@ def terminal(tmp_path):
         text, end_s = "", time.monotonic() + PATIENCE_S
         while not re.search(pattern, text):
             assert time.monotonic() < end_s, f"{pattern!r} was not drawn: {text[-3000:]}"
-            status["at_s"] += 1.0
-            server.status(status)
+            for _ in range(20):  # faster than a terminal draws
+                status["at_s"] += 1.0
+                server.status(status)
             if select.select([ours], [], [], 0.2)[0]:
                 text += os.read(ours, 1 << 16).decode(errors="replace")
         return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
@@ -67,5 +68,18 @@ def test_it_fits_scrolls_and_ends_by_a_key(terminal):
     drawn(r"lines 2-24 of \d+")
     press(b"\x1b[6~")
     assert "stream: " in drawn(r"-(\d+) of \1:")
+    press(b"q")
+    assert process.wait(PATIENCE_S) == 0
+
+
+def test_keys_count_one_by_one_however_they_come_and_while_records_pour(terminal):
+    drawn, press, process = terminal
+    drawn("arrows scroll, q ends")
+    press(b"\x1b[B\x1b[B\x1b[Aj")  # a key held down: several in one piece
+    drawn(r"lines 3-25 of \d+")
+    press(b"\x1b")
+    drawn(r"lines 3-25 of \d+")
+    press(b"[A")  # a slow line: one key in two pieces
+    drawn(r"lines 2-24 of \d+")
     press(b"q")
     assert process.wait(PATIENCE_S) == 0

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import queue
+import re
 import select
 import signal
 import sys
@@ -16,7 +18,7 @@ import threading
 import tty
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import click
 from rich.console import Console, Group, RenderableType
@@ -42,6 +44,8 @@ _NAMES = {
     "\x1b[6~": "page down",
     "\x1b[H": "home",
 }
+_KEY = re.compile(r"\x1b\[[0-9;]*[A-Za-z~]|.", re.DOTALL)
+_BEGUN = re.compile(r"\x1b(\[[0-9;]*)?\Z")
 _PIECE = 16
 _LOOK_S = 0.2
 
@@ -69,14 +73,17 @@ def keys(pressed: Callable[[str], None]) -> Iterator[None]:
 
 
 def _read(terminal: int, pressed: Callable[[str], None], ended: threading.Event) -> None:
+    begun = ""  # of a key whose end has not come yet
     while not ended.is_set():
         if not select.select([terminal], [], [], _LOOK_S)[0]:
             continue
         text = os.read(terminal, _PIECE).decode(errors="replace")
         if not text:
             return
-        for key in [_NAMES[text]] if text in _NAMES else text:
-            pressed(key)
+        text = begun + text
+        begun = match[0] if (match := _BEGUN.search(text)) else ""
+        for key in _KEY.findall(text.removesuffix(begun)):
+            pressed(_NAMES.get(key, key))
 
 
 # -- The screen ------------------------------------------------------------------------------------
@@ -189,6 +196,7 @@ class Scroll:
 
 
 _EVENTS = 6  # lines of what happened
+T = TypeVar("T")
 
 
 @click.command()
@@ -234,34 +242,60 @@ def _show(records: Iterator[Mapping[str, Any]], pasted: Callable[[str], str]) ->
 def _live(
     console: Console, records: Iterator[Mapping[str, Any]], pasted: Callable[[str], str]
 ) -> None:
-    """Draw until the daemon or the person ends it."""
+    """Draw until the daemon or the person ends it.
+
+    Records and keys come through one queue, in their order. What has come since the last picture is
+    taken at once and drawn once: a terminal that is slower than the daemon lags by no key.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever started it may ignore it
     happened, pace, scroll = deque[str](maxlen=_EVENTS), Pace(), Scroll()
     status: Mapping[str, Any] | None = None
-    lock = threading.Lock()
-    with Live(console=console, refresh_per_second=4, screen=True) as live:
-
-        def draw() -> None:
+    come: queue.SimpleQueue[str | Mapping[str, Any] | _End] = queue.SimpleQueue()
+    threading.Thread(target=_hand_on, args=(records, come.put), daemon=True).start()
+    with Live(console=console, refresh_per_second=4, screen=True) as live, keys(come.put):
+        while True:
+            for one in _all_of(come):
+                if isinstance(one, _End):
+                    if one.why is not None:
+                        raise one.why
+                    return
+                if isinstance(one, str):
+                    scroll.key(one)
+                elif one.get("record") == "status":
+                    status = one
+                    pace.take(status)
+                elif happening := event_line(one):
+                    happened.append(happening)
+            if scroll.ended:
+                return
             if status is not None:
                 whole = screen(status, happened, pace, pasted)
                 live.update(scroll.seen(console, whole, console.height))
 
-        def pressed(key: str) -> None:
-            with lock:
-                scroll.key(key)
-                draw()
-            if scroll.ended:  # like Ctrl-C, also while no record comes
-                signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
-        with keys(pressed):
-            for record in records:
-                with lock:
-                    if record.get("record") == "status":
-                        status = record
-                        pace.take(status)
-                    elif happening := event_line(record):
-                        happened.append(happening)
-                    draw()
+class _End(NamedTuple):
+    """No more records; why, where that was no end that was asked for."""
+
+    why: Exception | None
+
+
+def _hand_on(
+    records: Iterator[Mapping[str, Any]], put: Callable[[Mapping[str, Any] | _End], None]
+) -> None:
+    try:
+        for record in records:
+            put(record)
+    except Exception as error:  # noqa: BLE001 - raised again where it is drawn
+        put(_End(error))
+    else:
+        put(_End(None))
+
+
+def _all_of(come: queue.SimpleQueue[T]) -> Iterator[T]:
+    """Wait for one, then all that is there already."""
+    yield come.get()
+    for _ in range(come.qsize()):
+        yield come.get()
 
 
 def event_line(record: Mapping[str, Any]) -> str:
