@@ -69,8 +69,16 @@ class Started:
 
     def facts(self):
         """Facts of the capture with the device's time."""
-        found = [fact for _, fact in CaptureReader(self.capture).facts("event")]
-        return [fact for fact in found if "at_s" in fact]
+        return [fact for _, fact in self._events() if "at_s" in fact]
+
+    def _events(self):
+        return CaptureReader(self.capture).facts("event")
+
+    def read_s(self):
+        """Of the device's time at most, from the port's opening to the verdict by the host's."""
+        events = [*self._events()]
+        qualified = next(ns for ns, fact in events if fact.get("state") == "QUALIFIED")
+        return SPEED * 1e-9 * (qualified - events[0][0])
 
     def qualified_s(self):
         return next(f["at_s"] for f in self.facts() if f.get("state") == "QUALIFIED")
@@ -96,10 +104,9 @@ def test_a_kill_does_not_lose_the_drive(tmp_path):
             warm.kill()
     assert "no warm start: there is no earlier capture" in cold.said
     assert f"from {cold.capture.name}" in warm.said
-    needed_s = warm.qualified_s() - warm.warm_s()
-    # the samples that were the first to count had waited for the device's answer
-    assert needed_s + 5.0 * SPEED + 1.0 >= CONFIRM_S
-    assert needed_s < 0.8 * cold.qualified_s()
+    # a verdict is stamped by its samples, which on a busy machine are older than those that agreed
+    assert warm.read_s() >= CONFIRM_S
+    assert warm.qualified_s() - warm.warm_s() < 0.8 * cold.qualified_s()
     done = replay(warm.capture, warm.config)  # the samples are inputs: nothing else is needed
     assert done.core.warm.text.endswith("this run agrees")
     states = [entry["state"] for entry in done.core.decisions.entries if "reason" in entry]
