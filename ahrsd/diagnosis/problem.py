@@ -31,11 +31,12 @@ MEAN_RATES = (
 class Problem:
     """What is asked: the track, what is known of the sensor, the library, the thresholds.
 
-    recorded: the track as it was recorded;  thin, cold: what made the working `track` from it
+    recorded: the track as it was recorded;  thin, cold: what made the working `track` from it, a
+              cold start or a better calibration
     lag_s:    lag of the magnetometer that is already taken out of the track
     instants: the gyro's values are rates at instants: half of a step of that lag is theirs
-    riding:   (recorded rows, 3) gauss of named terms that ride with the sensor, without that lag;
-              None for none
+    riding:   (recorded rows, 3) gauss that ride with the sensor beyond the hard iron, as far as is
+              known, without that lag: they are averaged and not turned; None for none
     averaged: readings of the magnetometer in a working row that has any: less than `thin` where it
               is read more seldom than the gyro
     notes:    what a person should know of how the rates were read
@@ -79,6 +80,19 @@ class Problem:
         """The same, what rides with the sensor beyond the model's hard iron told of."""
         cold = replace(self.cold, hard_iron_gauss=model.hard_iron_gauss, soft_iron=model.soft_iron)
         return replace(self, riding=riding, cold=cold).lagging(self.lag_s)
+
+    def averaged_beside(self, riding: Array, model: NullModel, lag_s: float) -> Problem:
+        """The same with another lag, averaged by a better calibration.
+
+        riding: (working rows, 3) gauss that ride with the sensor beyond the model's hard iron
+        """
+        if self.thin == 1:
+            return self if lag_s == self.lag_s else self.lagging(lag_s)
+        at_s, time_s = self.track.time_s, self.recorded.time_s
+        drawn = np.column_stack([np.interp(time_s, at_s, column) for column in riding.T])
+        if of_magnetometer(self.recorded, lag_s):
+            drawn = earlier(self.recorded, drawn, -lag_s)
+        return replace(self, riding=drawn, cold=model).lagging(lag_s)
 
 
 def problem_of(

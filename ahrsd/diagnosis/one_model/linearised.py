@@ -346,7 +346,8 @@ def moved(
 ) -> Point:
     """The point at a model's likeliest coefficients, in the noise of the point before.
 
-    A delay is taken out of the track exactly, all else out of the readings.  Gains that followed
+    A delay is taken out of the track exactly, all else out of the readings, and these are averaged
+    to the working rate by what is known there.  Gains that followed
     would whiten what is not yet taken out by another filter: no linear model tells that.
     share: of the way there;  delayed: whether the delay moves too
     """
@@ -365,9 +366,11 @@ def moved(
     out = {key: value for key, value in values.items() if key not in point.exact}
     known = {key: made.seen[key].component for key in out}
     mag, gyro = added(len(made.context.track), known, out)
+    riding = {key: value for key, value in out.items() if known[key].frame == "sensor"}
     lag_s = sum(float(values[key][0]) for key in point.exact if key in values)
-    if lag_s != problem.lag_s:
-        problem = problem.lagging(lag_s)
+    problem = problem.averaged_beside(
+        added(len(made.context.track), known, riding)[0], model, lag_s
+    )
     filtered = run_filter(problem.track, model, mag, gyro, held=point.filtered)
     named = {key: value for key, value in out.items() if known[key].effect is not None}
     _, misread = added(len(made.context.track), known, named)

@@ -31,7 +31,6 @@ from ahrsd.diagnosis.one_model.linearised import (
 )
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, Space, searched
 from ahrsd.diagnosis.problem import Problem, model_at_rate
-from ahrsd.diagnosis.thin import thinned
 from ahrsd.samples import Array
 
 #: how often rows are weighed anew beside what was found
@@ -168,5 +167,4 @@ def _without(fast: Problem, slow: Problem, made: Linearised, best: Hypothesis) -
     known = {key: made.seen[key].component for key in values}
     mag, _ = added(len(fast.track), known, values)
     recorded = replace(slow.recorded, mag_b_gauss=slow.recorded.mag_b_gauss - mag)
-    track = thinned(recorded, slow.thin, slow.cold)
-    return replace(slow, recorded=recorded, track=track, lag_s=0.0, instants=False)
+    return replace(slow, recorded=recorded, instants=False).lagging(0.0)

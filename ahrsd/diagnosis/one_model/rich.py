@@ -14,9 +14,11 @@ from functools import partial
 
 import numpy as np
 
+from ahrsd.diagnosis.delay import of_magnetometer, usual_step
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.innovation import Filtered
 from ahrsd.diagnosis.locate import FRAMES
+from ahrsd.diagnosis.logger_noise import cleaned
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import (
@@ -43,6 +45,7 @@ from ahrsd.diagnosis.one_model.linearised import (
 )
 from ahrsd.diagnosis.one_model.remainder import ordinary_remainder
 from ahrsd.diagnosis.problem import Problem
+from ahrsd.diagnosis.shown import shown
 
 #: linearisations in one noise, noises, and nats that a further one must gain
 ROUNDS, NOISES, SETTLED = 6, 3, 5.0
@@ -127,45 +130,79 @@ def richest(problem: Problem, filtered: Filtered, library: Mapping[str, Effect])
     First the delay and the logged causes alone, beside noise of any spectrum: a delay of a tenth of
     a second, or a motor's current, bend everything else that is fitted beside them.
     """
+    problem = _without_logger_noise(problem, filtered, library)
     small = _settled(_likeliest_delay(problem, filtered, library), library, (), whole=False)
+    for lag_s in _delays_of_instants(small.base.made.point.problem):
+        early = _delayed(replace(problem, instants=True), filtered, library, lag_s)
+        early = _settled(early, library, (), whole=False)
+        small = early if early.nats > small.nats + priors.ODDS_REAL else small
     return settled(small.base.made.point, library, ())
+
+
+def _delays_of_instants(problem: Problem) -> tuple[float, ...]:
+    """Delays that a gyro may have whose values are rates at instants: it is early by half a step.
+
+    That half alone, and where there is more, all of it, which is the magnetometer's as well.
+    """
+    step_s = usual_step(problem.recorded.dt_s)
+    if problem.lag_s <= 0.0 or step_s is None:
+        return ()
+    more = of_magnetometer(problem.recorded, problem.lag_s)
+    return (step_s / 2, problem.lag_s) if more else (step_s / 2,)
+
+
+def _without_logger_noise(
+    problem: Problem, filtered: Filtered, library: Mapping[str, Effect]
+) -> Problem:
+    """The problem with columns without their loggers' noise, each where that is likelier.
+
+    Noise in a cause is told too small; what averages it, as a delay does, is likelier for that; and
+    itself is left as a source that nobody knows.
+    """
+    best: Judged | None = None
+    for name in sorted(problem.recorded.covariates):
+        clean = cleaned(problem.recorded, (name,))
+        if clean is None:
+            continue
+        if best is None:
+            best = _delayed(problem, filtered, library, 0.0)
+        said = f"column {shown(name)} has noise of its own: what follows it is judged without it"
+        quiet = replace(problem, recorded=clean, notes=(*problem.notes, said))
+        quiet = quiet.lagging(problem.lag_s)
+        found = _delayed(quiet, filtered, library, 0.0)
+        if found.nats > best.nats + priors.ODDS_REAL:
+            problem, best = quiet, found
+    return problem
+
+
+def _delayed(
+    problem: Problem, filtered: Filtered, library: Mapping[str, Effect], lag_s: float
+) -> Judged:
+    """The small model at a delay."""
+    start = first_point(problem.lagging(lag_s), filtered, (LAG,))
+    values = {} if lag_s == 0.0 else {LAG: np.array([lag_s])}
+    return judged(replace(start, values=values), library, (), whole=False)
 
 
 def _likeliest_delay(problem: Problem, filtered: Filtered, library: Mapping[str, Effect]) -> Judged:
     """The small model at the likeliest of some delays, sought up and down from none.
 
     Beside a calibration that a long delay has bent, what is linear in it may point the other way.
-    A gyro's values are means of the rate, or where that is likelier rates at instants.  A library
-    without a late magnetometer has no delay.
+    A library without a late magnetometer has no delay.
     """
     if plain_delay(library, 1.0) is None:
         return judged(first_point(problem, filtered, ()), library, (), whole=False)
-
-    def at(lag_s: float, *, instants: bool) -> Judged:
-        if lag_s == 0.0 and not instants:
-            return judged(first_point(problem, filtered, (LAG,)), library, (), whole=False)
-        lagging = replace(problem, instants=instants).lagging(lag_s)
-        start = first_point(lagging, filtered, (LAG,))
-        start = replace(start, values={LAG: np.array([lag_s])})
-        return judged(start, library, (), whole=False)
-
-    def climbed(best: Judged, *, instants: bool) -> Judged:
-        for way in (priors.ORDINARY_LAG_S, -priors.ORDINARY_LAG_S):
-            while True:
-                found = at(best.base.made.point.problem.lag_s + way, instants=instants)
-                if found.nats < best.nats + priors.ODDS_REAL:  # between samples is smoother
-                    break
-                if _points_back(found):
-                    break
-                best = found
-        return best
-
-    means = climbed(at(0.0, instants=False), instants=False)
-    lag_s = means.base.made.point.problem.lag_s
-    if lag_s <= 0.0 or problem.thin > 1:  # such a gyro is early; and what was averaged is a mean
-        return means
-    instants = climbed(at(lag_s, instants=True), instants=True)
-    return instants if instants.nats > means.nats + priors.ODDS_REAL else means
+    best = _delayed(problem, filtered, library, 0.0)
+    for way in (priors.ORDINARY_LAG_S, -priors.ORDINARY_LAG_S):
+        while True:
+            lag_s = best.base.made.point.problem.lag_s + way
+            found = _delayed(problem, filtered, library, lag_s)
+            if found.nats < best.nats + priors.ODDS_REAL:  # between samples is smoother
+                break
+            if _points_back(found):
+                break
+            best = found
+    return best
 
 
 def _points_back(here: Judged) -> bool:
