@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 from patience import PATIENCE_S
 
+from ahrsd.errors import EXIT_BUSY
 from ahrsd.telemetry.unix_socket import SocketServer
 
 STATUS = Path(__file__).parents[1] / "page" / "gathering.json"
@@ -48,6 +49,7 @@ def terminal(tmp_path):
                 text += os.read(ours, 1 << 16).decode(errors="replace")
         return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
 
+    drawn.server = server
     yield drawn, lambda keys: os.write(ours, keys), process
     process.kill()
     process.wait()
@@ -83,3 +85,10 @@ def test_keys_count_one_by_one_however_they_come_and_while_records_pour(terminal
     drawn(r"lines 2-24 of \d+")
     press(b"q")
     assert process.wait(PATIENCE_S) == 0
+
+
+def test_where_the_daemon_ends_it_says_so_and_ends_too(terminal):
+    drawn, _, process = terminal
+    drawn("arrows scroll, q ends")
+    drawn.server.close()
+    assert process.wait(PATIENCE_S) == EXIT_BUSY

@@ -29,6 +29,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ahrsd.cli.running.daemon import DaemonPlace, place_options
+from ahrsd.errors import DeviceError
 from ahrsd.gates import guards_a_write
 from ahrsd.printable import counted, line
 from ahrsd.telemetry.driving import LEVEL, TILTED, Pace, about, drive_next, shown_of
@@ -285,7 +286,7 @@ def _hand_on(
     try:
         for record in records:
             put(record)
-    except Exception as error:  # noqa: BLE001 - raised again where it is drawn
+    except (DeviceError, ValueError) as error:  # raised again where it is drawn
         put(_End(error))
     else:
         put(_End(None))
