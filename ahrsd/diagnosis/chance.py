@@ -154,7 +154,7 @@ def beyond_chance(
         untold = None if np.isfinite(bound) else NOT_DIAGNOSED
         return _agreeing(first, problem, start, alone, said, untold)
     weak = [one.effect for one in found.findings if _fitted(one) and one.evidence_nats <= bound]
-    said = f"{said}; chance may be: {', '.join(weak)}" if weak else said
+    said = f"{said}, so that this is doubted: {', '.join(weak)}" if weak else said
     return replace(found, notes=(*found.notes, said))
 
 
@@ -280,7 +280,8 @@ def _words(why: str, found: Diagnosis, told: float, shown: Sequence[float], boun
     )
     if not np.isfinite(largest):
         return f"{seen}were asked, and the last cannot be diagnosed"
-    return f"{seen}{shows} {by_chance}; only what is worth more than {bound:.0f} nats is told"
+    untold = ", and nothing is told" if told <= bound else ""
+    return f"{seen}{shows} {by_chance}; up to {bound:.0f} nats may be chance{untold}"
 
 
 def _agreeing(

@@ -113,6 +113,28 @@ def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> 
     )
 
 
+@pytest.mark.parametrize(("nats", "is_told"), [(30.0, False), (2000.0, True)])
+def test_what_simulations_show_is_said_beside_what_is_told(nats: float, is_told: bool) -> None:
+    """Four times what they show may be chance."""
+    track = track_of(_made(1e-4, 5e-2))
+    since = (np.arange(len(track)) >= 1500)[:, None]
+    track = replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS)
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    start = fit_null(problem.track, problem.spec, cold)
+    where = Where(((60.0, 120.0),), ("x", "y"), "sensor")
+
+    def ask(asked: Track) -> Answered:
+        left = Unexplained(True, where, evidence_nats=nats if asked is track else 12.0)
+        told = Diagnosis("step.csv", None, True, 1e-9, (), left, {})
+        return Answered(told, problem, start)
+
+    found = beyond_chance(track, ask)
+    assert found.unexplained.detected == is_told
+    (note,) = found.notes[:1]
+    beside = "" if is_told else ", and nothing is told"
+    assert note.endswith(f" up to 12 nats of such; up to 48 nats may be chance{beside}")
+
+
 def test_where_the_gyro_is_the_quieter_sensor_nothing_is_simulated() -> None:
     track = track_of(_made(1e-3, 5e-3))
     since = (np.arange(len(track)) >= 1500)[:, None]
