@@ -56,9 +56,11 @@ def _slow(left: Array, count: int) -> Array:
 def as_loud_along(left: Array, field_b: Array, count: int) -> Array:
     """A residual (N, 3) with as much power along the field as on each axis across, of its cosines.
 
-    field_b: (N, 3);  count: of the cosines
+    field_b: (N, 3), none where it is not known;  count: of the cosines
     """
-    unit = field_b / np.linalg.norm(field_b, axis=1, keepdims=True)
+    size = np.linalg.norm(field_b, axis=1, keepdims=True)
+    known = (size > 0.0) & np.isfinite(size)
+    unit = np.where(known, field_b, 0.0) / np.where(known, size, 1.0)
     along = np.sum(left * unit, axis=1, keepdims=True) * unit
     own, across = (float(np.sum(_slow(one, count) ** 2)) for one in (along, left - along))
     return np.asarray(left - along + along * np.sqrt(across / 2.0 / max(own, 1e-300)))

@@ -59,3 +59,13 @@ def test_iron_on_a_joint_that_nobody_logged_is_unknown_on_the_sensor():
     assert left.where.frame == "sensor"
     assert abs(np.array(left.where.direction) @ axis) > 0.95
     assert left.evidence_nats > 30.0
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_field_that_is_not_known_takes_nothing_from_a_residual():
+    left = np.random.default_rng(7).normal(size=(400, 3))
+    field_b = np.tile([0.2, 0.0, 0.4], (400, 1))
+    field_b[5], field_b[6] = 0.0, np.inf
+    even = as_loud_along(left, field_b, 50)
+    np.testing.assert_allclose(even[5:7], left[5:7])
+    assert not np.allclose(even[7], left[7])
