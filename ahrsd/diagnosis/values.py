@@ -136,3 +136,10 @@ class Term:
     value: Array
     deviation: Array
     setting: dict[str, Any] = field(default_factory=dict)
+
+
+def directions(vectors: Array) -> Array:
+    """(N, 3) unit vectors; none, zeros, where a vector is zero or not finite."""
+    size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    known = (size > 0.0) & np.isfinite(size)
+    return np.asarray(np.where(known, vectors, 0.0) / np.where(known, size, 1.0))

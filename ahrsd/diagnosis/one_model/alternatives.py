@@ -17,7 +17,7 @@ from ahrsd.diagnosis.by_heading import heading_columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Law, Sized
 from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw, course
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.values import Columns, Context, directions
 from ahrsd.estimator.locked import harmonics, on_each_axis
 from ahrsd.samples import Array
 
@@ -76,7 +76,7 @@ def varying(known: Component, added: Array, context: Context) -> list[Component]
     order = np.arange(1, _WAVES + 1)
     phase = np.pi * (time_s - time_s[0]) / (time_s[-1] - time_s[0])
     in_time = CourseLaw(order.astype(float), 1.0, most=priors.VARIES_MOST)
-    unit = context.field_b / np.linalg.norm(context.field_b, axis=1, keepdims=True)
+    unit = directions(context.field_b)
     degree_1_and_2 = np.column_stack([np.sqrt(3.0) * unit, harmonics(context.field_b)[:, :5]])
     low, high = (np.array([np.log(one)]) for one in (priors.COURSE_SIZES[0], priors.VARIES_MOST))
     in_attitude = Sized(np.ones(degree_1_and_2.shape[1]), low, high)

@@ -20,7 +20,7 @@ from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.values import Columns, Context, directions
 from ahrsd.samples import Array
 
 #: frames in which it is asked
@@ -58,9 +58,7 @@ def as_loud_along(left: Array, field_b: Array, count: int) -> Array:
 
     field_b: (N, 3), none where it is not known;  count: of the cosines
     """
-    size = np.linalg.norm(field_b, axis=1, keepdims=True)
-    known = (size > 0.0) & np.isfinite(size)
-    unit = np.where(known, field_b, 0.0) / np.where(known, size, 1.0)
+    unit = directions(field_b)
     along = np.sum(left * unit, axis=1, keepdims=True) * unit
     own, across = (float(np.sum(_slow(one, count) ** 2)) for one in (along, left - along))
     return np.asarray(left - along + along * np.sqrt(across / 2.0 / max(own, 1e-300)))
