@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -39,6 +40,22 @@ def _made(sigma_mag: float, sigma_gyro: float, scenario: str = "wam", seed: int 
         sigma_mag=sigma_mag,
         sigma_gyro=sigma_gyro,
     )
+
+
+def _stepped() -> tuple[Track, Callable[[float], Answered]]:
+    """A track with a step, and an answer that tells something unknown in it of so many nats."""
+    track = track_of(_made(1e-4, 5e-2))
+    since = (np.arange(len(track)) >= 1500)[:, None]
+    track = replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS)
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    start = fit_null(problem.track, problem.spec, cold)
+    where = Where(((60.0, 120.0),), ("x", "y"), "sensor")
+
+    def answered(nats: float) -> Answered:
+        left = Unexplained(True, where, evidence_nats=nats)
+        return Answered(Diagnosis("step.csv", None, True, 1e-9, (), left, {}), problem, start)
+
+    return track, answered
 
 
 def test_a_step_far_beyond_what_simulations_show_is_told() -> None:
@@ -92,19 +109,12 @@ def test_where_no_simulation_can_be_fitted_neither_yes_nor_no_is_said(monkeypatc
 
 def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> None:
     """How much of such chance makes is then not known either."""
-    track = track_of(_made(1e-4, 5e-2))
-    since = (np.arange(len(track)) >= 1500)[:, None]
-    track = replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS)
-    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
-    start = fit_null(problem.track, problem.spec, cold)
-    where = Where(((60.0, 120.0),), ("x", "y"), "sensor")
-    left = Unexplained(True, where, evidence_nats=2000.0)
-    told = Diagnosis("step.csv", None, True, 1e-9, (), left, {})
+    track, answered = _stepped()
 
     def ask(asked: Track) -> Answered:
         if asked is not track:
             raise np.linalg.LinAlgError("Eigenvalues did not converge")
-        return Answered(told, problem, start)
+        return answered(2000.0)
 
     found = beyond_chance(track, ask)
     assert not found.unexplained.detected
@@ -116,19 +126,8 @@ def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> 
 @pytest.mark.parametrize(("nats", "is_told"), [(30.0, False), (2000.0, True)])
 def test_what_simulations_show_is_said_beside_what_is_told(nats: float, is_told: bool) -> None:
     """Four times what they show may be chance."""
-    track = track_of(_made(1e-4, 5e-2))
-    since = (np.arange(len(track)) >= 1500)[:, None]
-    track = replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS)
-    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
-    start = fit_null(problem.track, problem.spec, cold)
-    where = Where(((60.0, 120.0),), ("x", "y"), "sensor")
-
-    def ask(asked: Track) -> Answered:
-        left = Unexplained(True, where, evidence_nats=nats if asked is track else 12.0)
-        told = Diagnosis("step.csv", None, True, 1e-9, (), left, {})
-        return Answered(told, problem, start)
-
-    found = beyond_chance(track, ask)
+    track, answered = _stepped()
+    found = beyond_chance(track, lambda asked: answered(nats if asked is track else 12.0))
     assert found.unexplained.detected == is_told
     (note,) = found.notes[:1]
     beside = "" if is_told else ", and nothing is told"

@@ -275,7 +275,7 @@ def _live(
 
 
 class _End(NamedTuple):
-    """No more records; why, where that was no end that was asked for."""
+    """No more records come; why: an error that is told to the person, None where there is none."""
 
     why: Exception | None
 
@@ -283,13 +283,15 @@ class _End(NamedTuple):
 def _hand_on(
     records: Iterator[Mapping[str, Any]], put: Callable[[Mapping[str, Any] | _End], None]
 ) -> None:
+    """Put all records, and an end behind them however they end: whoever waits is not left so."""
+    why: Exception | None = None
     try:
         for record in records:
             put(record)
     except (DeviceError, ValueError) as error:  # raised again where it is drawn
-        put(_End(error))
-    else:
-        put(_End(None))
+        why = error
+    finally:
+        put(_End(why))
 
 
 def _all_of(come: queue.SimpleQueue[T]) -> Iterator[T]:
