@@ -217,17 +217,21 @@ def form_of(known: Component, context: Context, library: Mapping[str, Effect]) -
     if effect is None or len(in_time(context, effect, known.setting)) == 1:
         return None
     late_s, step_s = float(known.setting.get("late_s", 0.0)), LATE_STEP_S / 2
-    before, behind = (
+    around = [
         effect.columns(context, {**known.setting, "late_s": late_s + way * step_s})
-        for way in (-1, 1)
-    )
-    columns = Columns(_change(before.mag, behind.mag), _change(before.gyro, behind.gyro))
-    blurred = Sized(law.scale * (priors.LOGGED_BLUR_S / LATE_STEP_S), law.low, law.high)
-    return Component(f"form of {known.key}", known.frame, columns, blurred)
+        for way in (-1, 0, 1)
+    ]
+    columns = Columns(_changes([one.mag for one in around]), _changes([one.gyro for one in around]))
+    scale = np.concatenate([law.scale, law.scale]) * (priors.LOGGED_BLUR_S / LATE_STEP_S)
+    return Component(f"form of {known.key}", known.frame, columns, Sized(scale, law.low, law.high))
 
 
-def _change(before: Array | None, behind: Array | None) -> Array | None:
-    return None if before is None or behind is None else behind - before
+def _changes(around: list[Array | None]) -> Array | None:
+    """(N, 3, 2 p) first and second difference of columns before, at and behind a time."""
+    before, at, behind = around
+    if before is None or at is None or behind is None:
+        return None
+    return np.concatenate([behind - before, behind - 2.0 * at + before], axis=2)
 
 
 def _way_of(known: Component, law: Sized, context: Context, frame: Frame) -> Component:

@@ -128,6 +128,11 @@ class Linearised:
             twin = self.seen[first[id(one.columns)].key]
             self.seen[one.key] = replace(twin, component=one)
 
+    def copied(self) -> Linearised:
+        """The same, to which components can be added that end with it."""
+        seen, rows, blocks = dict(self.seen), list(self.batches), dict(self.blocks)
+        return replace(self, seen=seen, batches=rows, blocks=blocks)
+
     def rows(self, key: str) -> Array:
         """(3 M, q) of a component, by frequency, lowest first."""
         one = self.seen[key]

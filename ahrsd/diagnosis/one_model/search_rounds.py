@@ -43,6 +43,7 @@ def answered(found: rich.Judged, library: Mapping[str, Effect]) -> Searched:
         real = all_sets.is_real(answer.best.names)
         spans = moved_in(all_sets, answer.best)
         point = unread(all_sets.made.point, spans) if spans else all_sets.made.point
+        del all_sets, space  # what was asked at the point before is as much again
         found = rich.settled(point, library, named)
         all_sets, space, best = best_at(found, library, named, real)
         answer = decision.decided(all_sets, space, best, library)

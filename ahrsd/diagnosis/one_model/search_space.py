@@ -41,8 +41,9 @@ def best_at(
     rich: Judged, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
 ) -> tuple[Hypotheses, Space, Hypothesis]:
     """The likeliest set at a richest model, searched from what is known and from nothing."""
-    base, made = rich.base, rich.base.made
+    base = rich.base
     all_sets, space = space_at(rich, library, named)
+    made = all_sets.made
     real = frozenset(base.remainder)
     known = all_sets.without(frozenset(one.key for one in named), LAG)
     lag = frozenset([LAG]) & made.seen.keys()
@@ -76,7 +77,7 @@ def space_at(
 ) -> tuple[Hypotheses, Space]:
     """The sets at a richest model, none judged yet, and what they may be made of."""
     base = rich.base
-    made, context = base.made, base.made.context
+    made, context = base.made.copied(), base.made.context
     found = library_components(context, library)
     whole: list[Component] = []
     if LAG in made.seen:
