@@ -10,10 +10,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.diagnosis import Check, Diagnosis, Heldout, Unexplained, Where, Whiteness
-from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.answer.diagnosis import (
+    Check,
+    Diagnosis,
+    Heldout,
+    Unexplained,
+    Where,
+    Whiteness,
+)
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.unknown import borne_out
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.unknown import borne_out
 from ahrsd.simulation import Experiment
 from ahrsd.simulation.scenarios import columns
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from tracks import experiment, recorded, track_of
 
-from ahrsd.diagnosis.along_field import MOSTLY_SLOW, framed, in_a_field, slowness
-from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.regression import Base, base
+from ahrsd.diagnosis.rules.along_field import MOSTLY_SLOW, framed, in_a_field, slowness
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.regression import Base, base
+from ahrsd.diagnosis.rules.unknown import Remainder, remainder
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.unknown import Remainder, remainder
 
 
 def basis_of(track: Track) -> Base:

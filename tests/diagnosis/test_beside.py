@@ -11,18 +11,18 @@ from mismatch_trials import Trial, made
 from tracks import experiment, track_of
 
 from ahrsd import so3
-from ahrsd.diagnosis import beside, sought, unknown
-from ahrsd.diagnosis.beside import _judged, named_beside, sayable
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.exam import pruned
+from ahrsd.diagnosis.innovation_filter.score import total_score
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Candidate
-from ahrsd.diagnosis.score import total_score
-from ahrsd.diagnosis.search import State, added, formed_basis_of, survey
-from ahrsd.diagnosis.spectrum import spectrum_of
+from ahrsd.diagnosis.rules import beside, sought, unknown
+from ahrsd.diagnosis.rules.beside import _judged, named_beside, sayable
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.exam import pruned
+from ahrsd.diagnosis.rules.regression import Candidate
+from ahrsd.diagnosis.rules.search import State, added, formed_basis_of, survey
+from ahrsd.diagnosis.rules.spectrum import spectrum_of
 from ahrsd.diagnosis.track import Spec, Track
 
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.base import BOUND_DEVIATIONS
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.exam import examined
+from ahrsd.diagnosis.innovation_filter.score import total_score
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.name import Judged, believable
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Candidate
-from ahrsd.diagnosis.score import total_score
-from ahrsd.diagnosis.search import State, added, survey
+from ahrsd.diagnosis.rules.exam import examined
+from ahrsd.diagnosis.rules.name import Judged, believable
+from ahrsd.diagnosis.rules.regression import Candidate
+from ahrsd.diagnosis.rules.search import State, added, survey
 from ahrsd.diagnosis.track import Spec, Track
 
 NAME = "mag_cross_axis"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.bursts import closest, loud_rows
-from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.rules.bursts import closest, loud_rows
+from ahrsd.diagnosis.rules.engine import diagnose
 from ahrsd.diagnosis.track import Track
 
 

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis import refined
-from ahrsd.diagnosis.by_heading import HARMONICS, heading_columns, heading_nats
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.search import State, formed_basis_of
+from ahrsd.diagnosis.rules import refined
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.refined import heading_nats
+from ahrsd.diagnosis.rules.search import State, formed_basis_of
 from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.diagnosis.where_and_when.by_heading import HARMONICS, heading_columns
 from ahrsd.simulation import simulate
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.chance import (
+from ahrsd.diagnosis.answer.chance import (
     Answered,
     bent,
     beyond_chance,
@@ -17,14 +17,14 @@ from ahrsd.diagnosis.chance import (
     loudness,
     motion_of,
 )
-from ahrsd.diagnosis.diagnosis import Diagnosis, Unexplained, Where
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Unexplained, Where
+from ahrsd.diagnosis.answer.spoken import lines, verdict
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.forward import noise_of
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.spoken import lines, verdict
+from ahrsd.diagnosis.repaired_model.forward import noise_of
+from ahrsd.diagnosis.rules.engine import diagnose
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.simulation import Experiment
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.diagnosis.choices import choices
 from ahrsd.diagnosis.effects.series import play
-from ahrsd.diagnosis.evidence import log_bayes
-from ahrsd.diagnosis.score import total_score
+from ahrsd.diagnosis.innovation_filter.evidence import log_bayes
+from ahrsd.diagnosis.innovation_filter.score import total_score
+from ahrsd.diagnosis.rules.choices import choices
 
 
 def settings(rng, width, count=40):

@@ -11,9 +11,14 @@ from scipy.spatial.transform import Rotation
 from tracks import experiment, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.context import bandwidth_hz, build_context, rate_by_others, smoothed_rate
-from ahrsd.diagnosis.descent import NullFit
-from ahrsd.diagnosis.innovation import run_filter
+from ahrsd.diagnosis.calibration_fit.descent import NullFit
+from ahrsd.diagnosis.innovation_filter.context import (
+    bandwidth_hz,
+    build_context,
+    rate_by_others,
+    smoothed_rate,
+)
+from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Context
 from ahrsd.samples import Array

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.coloured import coloured
-from ahrsd.diagnosis.context import Given, build_context
-from ahrsd.diagnosis.course_gram import course_gram
-from ahrsd.diagnosis.directions import weighed
-from ahrsd.diagnosis.gram import Gram
-from ahrsd.diagnosis.innovation import bearings, run_filter
-from ahrsd.diagnosis.locate import FRAMES, Frame, frame_columns, group_name, segments_between
-from ahrsd.diagnosis.regression import Base, base, based, group_gram
+from ahrsd.diagnosis.innovation_filter.context import Given, build_context
+from ahrsd.diagnosis.innovation_filter.gram import Gram
+from ahrsd.diagnosis.innovation_filter.innovation import bearings, run_filter
+from ahrsd.diagnosis.rules.coloured import coloured
+from ahrsd.diagnosis.rules.course_gram import course_gram
+from ahrsd.diagnosis.rules.directions import weighed
+from ahrsd.diagnosis.rules.locate import group_name
+from ahrsd.diagnosis.rules.regression import Base, base, based, group_gram
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Columns
+from ahrsd.diagnosis.where_and_when.locate import FRAMES, Frame, frame_columns, segments_between
 
 
 def basis_with_a_gap() -> Base:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.forward import simulated
-from ahrsd.diagnosis.injection import readings_of
+from ahrsd.diagnosis.calibration_fit.thin import thinned
 from ahrsd.diagnosis.one_model import diagnose as one_model
-from ahrsd.diagnosis.thin import thinned
+from ahrsd.diagnosis.repaired_model.forward import simulated
+from ahrsd.diagnosis.repaired_model.injection import readings_of
+from ahrsd.diagnosis.rules.engine import diagnose
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Noise, Term
 from ahrsd.samples import Array

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.cut_out import FEWEST, brief, without
-from ahrsd.diagnosis.delay import delayed_gyro
+from ahrsd.diagnosis.calibration_fit.delay import delayed_gyro
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Candidate
-from ahrsd.diagnosis.search import State, fitted_term
+from ahrsd.diagnosis.rules.cut_out import FEWEST, brief, without
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.regression import Candidate
+from ahrsd.diagnosis.rules.search import State, fitted_term
 from ahrsd.diagnosis.track import Spec, Track
 
 MAGNET = np.array([0.07, -0.1, 0.5])

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from tracks import experiment, recorded, track_of
 
-from ahrsd.diagnosis.dead import dead, dead_axes, possible, stuck_axes, stuck_gyro
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.facts import matters
-from ahrsd.diagnosis.hygiene import hygiene, put_right
+from ahrsd.diagnosis.data_quality.dead import dead, dead_axes, possible, stuck_axes, stuck_gyro
+from ahrsd.diagnosis.data_quality.facts import matters
+from ahrsd.diagnosis.data_quality.hygiene import hygiene, put_right
+from ahrsd.diagnosis.rules.engine import diagnose
 from ahrsd.diagnosis.track import Track
 
 

@@ -9,8 +9,13 @@ import pytest
 from effect_motion import moving
 
 from ahrsd import so3
-from ahrsd.diagnosis.delay import delayed_gyro, of_magnetometer, usual_step, without_lag
-from ahrsd.diagnosis.delays import beyond_the_lag
+from ahrsd.diagnosis.calibration_fit.delay import (
+    beyond_the_lag,
+    delayed_gyro,
+    of_magnetometer,
+    usual_step,
+    without_lag,
+)
 from ahrsd.diagnosis.track import Track
 
 

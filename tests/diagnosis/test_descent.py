@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis import descent
+from ahrsd.diagnosis.calibration_fit import descent
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.search import State, added, refitted, survey
-from ahrsd.diagnosis.selection import likelihood
+from ahrsd.diagnosis.rules.search import State, added, refitted, survey
+from ahrsd.diagnosis.rules.selection import likelihood
 from ahrsd.diagnosis.track import Spec
 
 TRUE, NEARLY = "gyro_nonorthogonality", "flexible_mount"

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.discrepancy import beyond, discrepancy, places
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.regression import base
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.rules.discrepancy import beyond, discrepancy, places
+from ahrsd.diagnosis.rules.regression import base
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Columns
 

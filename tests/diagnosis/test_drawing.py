@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.rules.engine import diagnose
 
 
 def answer(*effects, seed=3):

@@ -9,7 +9,7 @@ import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.rules.engine import diagnose
 
 
 def test_a_warm_up_that_nobody_logged_is_one_drift() -> None:

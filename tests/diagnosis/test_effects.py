@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ahrsd import so3
-from ahrsd.diagnosis import roles
+from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.forward import contribution
+from ahrsd.diagnosis.repaired_model.forward import contribution
 from ahrsd.diagnosis.values import Term
 
 CONTRACT = Path(__file__).parents[2] / ".." / "shared" / "reference" / "contract.md"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from ahrsd.diagnosis.effects.effects_text import page
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.effects_text import page
 
 PROJECT = Path(__file__).parents[2]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ahrsd import so3
-from ahrsd.diagnosis.injection import PIECE_S, EmulatedEffects
+from ahrsd.diagnosis.repaired_model.injection import PIECE_S, EmulatedEffects
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.emulator.scenarios import Setup, build

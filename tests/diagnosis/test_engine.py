@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.rules.engine import diagnose
 
 SAMPLES, RATE_HZ = 8_000, 25.0
 

@@ -9,27 +9,27 @@ import pytest
 from mismatch_trials import Trial, made
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis import foretold, unknown
-from ahrsd.diagnosis.descent import FittedTerm
+from ahrsd.diagnosis.calibration_fit.descent import FittedTerm
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.foretold import (
+from ahrsd.diagnosis.limits import LIMITS
+from ahrsd.diagnosis.rules import foretold, unknown
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.foretold import (
     FORETOLD,
     in_time_alone,
     part_of,
     share_foretold,
     without_unforetold,
 )
-from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.name import Judged
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.often import changes
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Candidate
-from ahrsd.diagnosis.search import State, Survey, formed_basis_of, without_term
-from ahrsd.diagnosis.settings import evidence_of
+from ahrsd.diagnosis.rules.name import Judged
+from ahrsd.diagnosis.rules.often import changes
+from ahrsd.diagnosis.rules.regression import Candidate
+from ahrsd.diagnosis.rules.search import State, Survey, formed_basis_of, without_term
+from ahrsd.diagnosis.rules.settings import evidence_of
+from ahrsd.diagnosis.rules.validate import Gain
 from ahrsd.diagnosis.track import Spec
-from ahrsd.diagnosis.validate import Gain
 
 SAMPLES = 5000
 SETTING = {"covariate": "motor_current_a", "reference": 0.0}

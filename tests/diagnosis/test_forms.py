@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.rules.engine import diagnose
 
 
 @pytest.mark.slow

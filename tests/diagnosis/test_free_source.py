@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis import free_source
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.free_source import free_nats, without_names_of_a_source
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.refined import WHITE
-from ahrsd.diagnosis.rivals import MORE_NATS
+from ahrsd.diagnosis.rules import free_source
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.free_source import free_nats, without_names_of_a_source
+from ahrsd.diagnosis.rules.refined import WHITE
+from ahrsd.diagnosis.rules.rivals import MORE_NATS
 from ahrsd.diagnosis.track import Track
 
 SETTINGS = {"switched_device": {"covariate": "lamp_on"}, "hard_iron_step": {"onset_s": 9.0}}

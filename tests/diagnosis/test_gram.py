@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.gram import block_edges, gram, solve
+from ahrsd.diagnosis.innovation_filter.gram import solve
+from ahrsd.diagnosis.rules.gram import block_edges, gram
 
 
 def made(seed: int = 0, count: int = 400):

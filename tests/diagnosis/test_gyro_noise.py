@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.diagnosis import Unexplained, Where
-from ahrsd.diagnosis.gyro_noise import loud_gyro
+from ahrsd.diagnosis.answer.diagnosis import Unexplained, Where
+from ahrsd.diagnosis.rules.gyro_noise import loud_gyro
 from ahrsd.diagnosis.track import Track
 
 BURST_S = (100.0, 118.0)

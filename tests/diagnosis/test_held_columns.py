@@ -7,8 +7,8 @@ import pytest
 from mismatch_trials import Trial, made
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.held_columns import drawn_between, held_columns
-from ahrsd.diagnosis.logged import diagnose_logged
+from ahrsd.diagnosis.columns.held_columns import drawn_between, held_columns
+from ahrsd.diagnosis.rules.logged import diagnose_logged
 
 RATE_HZ = 25.0
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis import findings
-from ahrsd.diagnosis.descent import FittedTerm
+from ahrsd.diagnosis.calibration_fit.descent import FittedTerm
+from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.heldout import _alone, gain_of
-from ahrsd.diagnosis.innovation import run_filter
-from ahrsd.diagnosis.null import fit_null
+from ahrsd.diagnosis.innovation_filter.innovation import run_filter
+from ahrsd.diagnosis.rules import findings
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.heldout import _alone, gain_of
 
 SAMPLES = 5000
 

@@ -8,7 +8,7 @@ import numpy as np
 from mismatch_trials import Trial, made
 from scipy.signal import lfilter
 
-from ahrsd.diagnosis.narrow_band import loudest_band
+from ahrsd.diagnosis.where_and_when.narrow_band import loudest_band
 
 
 def turning(time_s: np.ndarray, rate_hz: float, spread_hz: float) -> np.ndarray:

@@ -10,16 +10,16 @@ from mismatch_trials import Trial, made
 from tracks import experiment, recorded, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.clipping import clipping, quantisation, step_of
-from ahrsd.diagnosis.coarse import noise_of
-from ahrsd.diagnosis.diagnosis import Where
-from ahrsd.diagnosis.facts import Fact, around, lost_at, matters, spans_of
-from ahrsd.diagnosis.frames import ranked, windows
-from ahrsd.diagnosis.hygiene import as_recorded, hygiene, put_right, would_have_shown
-from ahrsd.diagnosis.innovation import run_filter
-from ahrsd.diagnosis.missing import missing_turns, whole_nats
-from ahrsd.diagnosis.repeats import _turned
-from ahrsd.diagnosis.stamps import regular
+from ahrsd.diagnosis.answer.diagnosis import Where
+from ahrsd.diagnosis.calibration_fit.coarse import noise_of
+from ahrsd.diagnosis.data_quality.clipping import clipping, quantisation, step_of
+from ahrsd.diagnosis.data_quality.facts import Fact, around, lost_at, matters, spans_of
+from ahrsd.diagnosis.data_quality.frames import ranked, windows
+from ahrsd.diagnosis.data_quality.hygiene import as_recorded, hygiene, put_right, would_have_shown
+from ahrsd.diagnosis.data_quality.missing import missing_turns, whole_nats
+from ahrsd.diagnosis.data_quality.repeats import _turned
+from ahrsd.diagnosis.data_quality.stamps import regular
+from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis import imitators
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.findings import of_both
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.search import State, refitted, shaped_again, survey
+from ahrsd.diagnosis.rules import imitators
+from ahrsd.diagnosis.rules.findings import of_both
+from ahrsd.diagnosis.rules.search import State, refitted, shaped_again, survey
 from ahrsd.diagnosis.track import Spec
 
 

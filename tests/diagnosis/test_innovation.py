@@ -10,10 +10,10 @@ from scipy import stats
 from tracks import experiment, moved_model, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.blocks import NARROW, layout_of
-from ahrsd.diagnosis.by_heading import heading_nats
-from ahrsd.diagnosis.innovation import (
-    TRACELESS,
+from ahrsd.diagnosis.calibration_fit.problem import Problem
+from ahrsd.diagnosis.calibration_fit.thin import thinned, working_factor
+from ahrsd.diagnosis.innovation_filter.blocks import NARROW, layout_of
+from ahrsd.diagnosis.innovation_filter.innovation import (
     Filtered,
     bearings,
     nuisance_columns,
@@ -22,13 +22,12 @@ from ahrsd.diagnosis.innovation import (
     sensitivities,
 )
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import at_model
-from ahrsd.diagnosis.one_course import smooth_nats
-from ahrsd.diagnosis.problem import Problem
-from ahrsd.diagnosis.search import State, formed_basis_of
-from ahrsd.diagnosis.thin import thinned, working_factor
+from ahrsd.diagnosis.rules.one_course import smooth_nats
+from ahrsd.diagnosis.rules.refined import heading_nats
+from ahrsd.diagnosis.rules.search import State, at_model, formed_basis_of
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.diagnosis.values import Columns, NullModel
+from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
 

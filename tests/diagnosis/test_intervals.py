@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.diagnosis.intervals import change_points, departures, explained, levels, reaching, spans
-from ahrsd.diagnosis.locate import segments
+from ahrsd.diagnosis.rules.intervals import change_points, explained, levels
+from ahrsd.diagnosis.where_and_when.intervals import departures, reaching, spans
+from ahrsd.diagnosis.where_and_when.locate import segments
 
 
 def course_with(levels_at, noise=0.3, seed=0):

@@ -9,13 +9,13 @@ import pytest
 from tracks import experiment, track_of
 
 from ahrsd import so3
-from ahrsd.diagnosis.delay import delayed_gyro
+from ahrsd.diagnosis.calibration_fit.delay import delayed_gyro
+from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.findings import refined
-from ahrsd.diagnosis.itself import ITSELF, USUAL, beside_itself, gyro_matrix
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.regression import Base, base
-from ahrsd.diagnosis.spectrum import against, spectrum_of
+from ahrsd.diagnosis.rules.findings import refined
+from ahrsd.diagnosis.rules.itself import ITSELF, USUAL, beside_itself, gyro_matrix
+from ahrsd.diagnosis.rules.regression import Base, base
+from ahrsd.diagnosis.rules.spectrum import against, spectrum_of
 from ahrsd.diagnosis.track import Track
 
 LAG_S = 2e-3

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of
 
+from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.late import in_time
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.regression import base
-from ahrsd.diagnosis.settings import best_settings
+from ahrsd.diagnosis.rules.late import in_time
+from ahrsd.diagnosis.rules.regression import base
+from ahrsd.diagnosis.rules.settings import best_settings
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.2])

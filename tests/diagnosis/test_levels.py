@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ahrsd.diagnosis import levels, unknown
-from ahrsd.diagnosis.levels import without_levels
+from ahrsd.diagnosis.rules import levels, unknown
+from ahrsd.diagnosis.rules.levels import without_levels
 
 ALONG = np.array([-2.6, 1.6, 1.2])
 

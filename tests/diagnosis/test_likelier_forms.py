@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis import likelier_forms, unknown
-from ahrsd.diagnosis.beside import material
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.likelier_forms import without_likelier_forms
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Candidate
-from ahrsd.diagnosis.search import State, Survey, formed_basis_of, refitted, survey
+from ahrsd.diagnosis.rules import likelier_forms, unknown
+from ahrsd.diagnosis.rules.beside import material
+from ahrsd.diagnosis.rules.likelier_forms import without_likelier_forms
+from ahrsd.diagnosis.rules.regression import Candidate
+from ahrsd.diagnosis.rules.search import State, Survey, formed_basis_of, refitted, survey
 from ahrsd.diagnosis.track import Spec, Track
 
 TEMPERATURE = "mag_bias_temperature"

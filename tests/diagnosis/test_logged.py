@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis import roles
+from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 

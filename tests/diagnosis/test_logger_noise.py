@@ -9,8 +9,8 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.logged import diagnose_logged
-from ahrsd.diagnosis.logger_noise import cleaned, logged, without_noise
+from ahrsd.diagnosis.columns.logger_noise import cleaned, logged, without_noise
+from ahrsd.diagnosis.rules.logged import diagnose_logged
 
 ROWS = 12_000
 FIELD_PER_M_S = np.array([9e-3, -6e-3, 4e-3])

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.diagnosis import Where
-from ahrsd.diagnosis.facts import Fact
+from ahrsd.diagnosis.answer.diagnosis import Where
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.data_quality.facts import Fact
+from ahrsd.diagnosis.data_quality.missing import price
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.lost import _as_seen, believed, beyond_lost, price
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.search import State
+from ahrsd.diagnosis.rules.lost import _as_seen, believed, beyond_lost
+from ahrsd.diagnosis.rules.search import State
 from ahrsd.diagnosis.track import Spec
 
 LOST = Fact("dropped_samples", "", Where((), (), "link"), 0.98, turned=np.ones(3))

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis import loudness, unknown
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.loudness import even, in_even_noise
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Base
-from ahrsd.diagnosis.search import State, formed_basis_of
-from ahrsd.diagnosis.spells import with_spells
+from ahrsd.diagnosis.rules import loudness, unknown
+from ahrsd.diagnosis.rules.loudness import even, in_even_noise
+from ahrsd.diagnosis.rules.regression import Base
+from ahrsd.diagnosis.rules.search import State, formed_basis_of
+from ahrsd.diagnosis.rules.spells import with_spells
 from ahrsd.diagnosis.track import Spec
 from ahrsd.samples import Array
 

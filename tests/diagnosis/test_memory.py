@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
+from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.effects import series
-from ahrsd.diagnosis.forward import contribution
-from ahrsd.diagnosis.null import fit_null
+from ahrsd.diagnosis.repaired_model.forward import contribution
 from ahrsd.diagnosis.values import Term
 
 

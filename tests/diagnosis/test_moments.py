@@ -7,16 +7,16 @@ from dataclasses import replace
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis import search
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.moments import as_found, at_one_moment
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Base, Candidate
-from ahrsd.diagnosis.search import State, formed_basis_of, refitted, survey
-from ahrsd.diagnosis.settings import evidence_of
-from ahrsd.diagnosis.swapping import swapped
+from ahrsd.diagnosis.rules import search
+from ahrsd.diagnosis.rules.moments import as_found, at_one_moment
+from ahrsd.diagnosis.rules.regression import Base, Candidate
+from ahrsd.diagnosis.rules.search import State, formed_basis_of, refitted, survey
+from ahrsd.diagnosis.rules.settings import evidence_of
+from ahrsd.diagnosis.rules.swapping import swapped
 from ahrsd.diagnosis.track import Spec
 
 NAMES = ("hard_iron_step", "soft_iron_step", "geomagnetic_drift")

@@ -9,8 +9,15 @@ import pytest
 from scipy.signal import lfilter
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.innovation import Filtered, run_filter
-from ahrsd.diagnosis.noise import Colour, before, colour_of, level_facts, levels, tails_of
+from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
+from ahrsd.diagnosis.innovation_filter.noise import (
+    Colour,
+    before,
+    colour_of,
+    level_facts,
+    levels,
+    tails_of,
+)
 from ahrsd.samples import Array
 
 

@@ -10,14 +10,14 @@ from scipy import stats
 from tracks import experiment, recorded, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.coarse import noise_of, thinned
-from ahrsd.diagnosis.descent import FittedTerm, NullFit
+from ahrsd.diagnosis.calibration_fit.coarse import noise_of, thinned
+from ahrsd.diagnosis.calibration_fit.descent import FittedTerm, NullFit
+from ahrsd.diagnosis.calibration_fit.noise_fit import WALK_CAP_RAD_S_SQRT_S
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.prior import rate_at_rest
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.noise_fit import WALK_CAP_RAD_S_SQRT_S
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.prior import rate_at_rest
-from ahrsd.diagnosis.problem import problem_of
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.diagnosis.values import Columns, Context, NullModel
 from ahrsd.samples import Array

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ahrsd.diagnosis.effects.dipole import unit_fields
-from ahrsd.diagnosis.objects import closest_object
+from ahrsd.diagnosis.rules.objects import closest_object
 from ahrsd.samples import Array
 
 #: m and degrees

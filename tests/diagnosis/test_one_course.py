@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis import one_course
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.one_course import as_smooth, price, smooth_nats
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Candidate
-from ahrsd.diagnosis.search import State, formed_basis_of
+from ahrsd.diagnosis.rules import one_course
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.one_course import as_smooth, price, smooth_nats
+from ahrsd.diagnosis.rules.regression import Candidate
+from ahrsd.diagnosis.rules.search import State, formed_basis_of
 from ahrsd.diagnosis.track import Spec
 from ahrsd.simulation import simulate
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.diagnosis.one_source import NATS, course_root, directed, half_sphere
+from ahrsd.diagnosis.rules.one_source import NATS, course_root, directed, half_sphere
 
 COUNT, UNIT = 80, 1e-3
 

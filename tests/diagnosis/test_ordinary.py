@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from ahrsd.diagnosis.diagnosis import Diagnosis, Finding, Unexplained, Where
-from ahrsd.diagnosis.ordinary import (
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding, Unexplained, Where
+from ahrsd.diagnosis.answer.ordinary_text import in_one_sentence, ordinary_left, size_lines
+from ahrsd.diagnosis.answer.spoken import lines, verdict
+from ahrsd.diagnosis.rules.ordinary import (
     COMPONENTS,
     FREEDOM,
     Row,
@@ -20,9 +22,7 @@ from ahrsd.diagnosis.ordinary import (
     spread_of,
     table_of,
 )
-from ahrsd.diagnosis.ordinary_text import in_one_sentence, ordinary_left, size_lines
-from ahrsd.diagnosis.remainder_sizes import Left, Size
-from ahrsd.diagnosis.spoken import lines, verdict
+from ahrsd.diagnosis.rules.remainder_sizes import Left, Size
 from ahrsd.report.diagnosis_page import write_diagnosis_report
 
 #: of twenty recordings, none of which has a course on the sensor

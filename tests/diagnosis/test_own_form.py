@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from ahrsd.diagnosis import own_form
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
+from ahrsd.diagnosis.rules import own_form
 
 
 def named(name: str, evidence: float, **setting: object) -> SimpleNamespace:

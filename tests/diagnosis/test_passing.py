@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from ahrsd.diagnosis import passing
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.name import LONELY_BLOCKS
-from ahrsd.diagnosis.passing import LIKELIER, without_passing
+from ahrsd.diagnosis.rules import passing
+from ahrsd.diagnosis.rules.name import LONELY_BLOCKS
+from ahrsd.diagnosis.rules.passing import LIKELIER, without_passing
 
 
 def remainder(frame: str, nats: float) -> SimpleNamespace:

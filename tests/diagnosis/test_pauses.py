@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.gram import block_edges
-from ahrsd.diagnosis.pauses import LEFT_S, without_jumps
-from ahrsd.diagnosis.predictive import segments_of
+from ahrsd.diagnosis.answer.predictive import segments_of
+from ahrsd.diagnosis.data_quality.pauses import LEFT_S, without_jumps
+from ahrsd.diagnosis.rules.gram import block_edges
 from ahrsd.diagnosis.track import Track
 
 

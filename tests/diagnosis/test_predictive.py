@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from effect_motion import moving
 
-from ahrsd.diagnosis import forward, predictive
-from ahrsd.diagnosis.descent import FittedTerm
+from ahrsd.diagnosis.answer import predictive
+from ahrsd.diagnosis.calibration_fit.descent import FittedTerm
+from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.null import fit_null
+from ahrsd.diagnosis.repaired_model import forward
 from ahrsd.diagnosis.values import Term
 
 

@@ -9,13 +9,13 @@ import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd import so3
+from ahrsd.diagnosis.calibration_fit.null import cold_start, fit_null
+from ahrsd.diagnosis.calibration_fit.resting import at_rest
+from ahrsd.diagnosis.calibration_fit.thin import working_factor
 from ahrsd.diagnosis.effects.base import readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.effects.pulses import train, trains
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.null import cold_start, fit_null
-from ahrsd.diagnosis.resting import at_rest
-from ahrsd.diagnosis.thin import working_factor
+from ahrsd.diagnosis.rules.engine import diagnose
 from ahrsd.diagnosis.track import Spec, Track
 
 RATE_HZ = 40.0

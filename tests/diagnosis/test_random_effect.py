@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ahrsd.diagnosis import random_effect
-from ahrsd.diagnosis.random_effect import effect_nats
+from ahrsd.diagnosis.rules import random_effect
+from ahrsd.diagnosis.rules.random_effect import effect_nats
 
 
 @pytest.mark.parametrize("colour", [0.8, 1.0, 4.0])

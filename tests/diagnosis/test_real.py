@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ahrsd.diagnosis.diagnosis import Diagnosis, Finding
-from ahrsd.diagnosis.engine import diagnose
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding
+from ahrsd.diagnosis.rules.engine import diagnose
 from ahrsd.diagnosis.track import Track
 from ahrsd.recording.table import read_table
 

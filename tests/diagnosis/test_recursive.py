@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import ndimage, signal, stats
 
-from ahrsd.diagnosis import probabilities, recursive
+from ahrsd.diagnosis.innovation_filter import probabilities, recursive
 
 VALUES = np.random.default_rng(0).standard_normal((500, 3))
 

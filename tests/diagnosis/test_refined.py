@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis import refined as refined_module
-from ahrsd.diagnosis import unknown
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.explained import explained
 from ahrsd.diagnosis.limits import LIMITS, Limits
-from ahrsd.diagnosis.name import ROBUST
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.one_source import ANY_NATS, with_any_course, with_one_source
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.refined import _of_any_course, left_alone, refined
-from ahrsd.diagnosis.search import State, formed_basis_of, survey
+from ahrsd.diagnosis.rules import refined as refined_module
+from ahrsd.diagnosis.rules import unknown
+from ahrsd.diagnosis.rules.explained import explained
+from ahrsd.diagnosis.rules.name import ROBUST
+from ahrsd.diagnosis.rules.one_source import ANY_NATS, with_any_course, with_one_source
+from ahrsd.diagnosis.rules.refined import _of_any_course, left_alone, refined
+from ahrsd.diagnosis.rules.search import State, formed_basis_of, survey
+from ahrsd.diagnosis.rules.unknown import Remainder
 from ahrsd.diagnosis.track import Spec, Track
-from ahrsd.diagnosis.unknown import Remainder
 
 BEGIN_S, END_S = 120.0, 160.0
 

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from tracks import experiment, recorded, track_of
 
-from ahrsd.diagnosis.added_field import (
+from ahrsd.diagnosis.answer.added_field import (
     calibration_of,
     deviation,
     heading_off_deg,
     less_calibration,
 )
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.ordinary import beyond_ordinary, held_against
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.remainder_sizes import Left, Size, sizes_left
-from ahrsd.diagnosis.search import State
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.ordinary import beyond_ordinary, held_against
+from ahrsd.diagnosis.rules.remainder_sizes import Left, Size, sizes_left
+from ahrsd.diagnosis.rules.search import State
 from ahrsd.diagnosis.track import Spec, Track
 
 SAMPLES = 3000  # two minutes

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.resting import resting
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.resting import resting
 from ahrsd.diagnosis.track import Track
 
 COUNT, RATE_HZ = 6000, 10.0

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.facts import spans_of
-from ahrsd.diagnosis.ringing import ringing_rows
+from ahrsd.diagnosis.data_quality.facts import spans_of
+from ahrsd.diagnosis.rules.ringing import ringing_rows
 
 TIMES_S = np.array([21.0, 62.0, 85.5, 120.0, 171.0, 203.0])
 

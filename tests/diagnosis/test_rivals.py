@@ -11,16 +11,16 @@ from mismatch_trials import Trial, made
 from scipy.spatial.transform import Rotation
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis import rivals
-from ahrsd.diagnosis.diagnosis import Diagnosis
-from ahrsd.diagnosis.discrepancy import UNIT_GAUSS
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import base, columns_of
-from ahrsd.diagnosis.rivals import (
+from ahrsd.diagnosis.rules import rivals
+from ahrsd.diagnosis.rules.discrepancy import UNIT_GAUSS
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.regression import base, columns_of
+from ahrsd.diagnosis.rules.rivals import (
     _shape,
     by_matrix,
     by_memory,
@@ -29,8 +29,8 @@ from ahrsd.diagnosis.rivals import (
     more,
     of_another_form,
 )
-from ahrsd.diagnosis.search import State, formed_basis_of, refitted, survey
-from ahrsd.diagnosis.together import projected
+from ahrsd.diagnosis.rules.search import State, formed_basis_of, refitted, survey
+from ahrsd.diagnosis.rules.together import projected
 from ahrsd.diagnosis.track import Spec, Track
 
 Ask = Callable[[Track], Diagnosis]

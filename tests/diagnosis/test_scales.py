@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.diagnosis import Diagnosis
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis
+from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.effects.base import Readings, Setting, readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.null import fit_null
+from ahrsd.diagnosis.rules.engine import diagnose
 from ahrsd.diagnosis.track import Track
 
 Ask = Callable[[Track], Diagnosis]

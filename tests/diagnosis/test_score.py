@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
-from ahrsd.diagnosis.evidence import colour, log_bayes, log_bayes_walk, posterior
-from ahrsd.diagnosis.gram import block_edges, gram
-from ahrsd.diagnosis.score import chi2_p, robust_p, score, shift_statistics
+from ahrsd.diagnosis.innovation_filter.evidence import colour, log_bayes, posterior
+from ahrsd.diagnosis.innovation_filter.score import score
+from ahrsd.diagnosis.rules.gram import block_edges, gram
+from ahrsd.diagnosis.rules.locate import log_bayes_walk
+from ahrsd.diagnosis.rules.score import chi2_p, robust_p, shift_statistics
 
 COUNT, RATE_HZ = 1600, 10.0
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis import selection
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.calibration_fit.resting import ORDINARY_WALK_RAD_S_SQRT_S
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.name import ROBUST
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.resting import ORDINARY_WALK_RAD_S_SQRT_S
-from ahrsd.diagnosis.search import State, added, refitted, survey
-from ahrsd.diagnosis.selection import (
+from ahrsd.diagnosis.rules import selection
+from ahrsd.diagnosis.rules.name import ROBUST
+from ahrsd.diagnosis.rules.search import State, added, refitted, survey
+from ahrsd.diagnosis.rules.selection import (
     _cause,
     _cause_after_all,
     _may_wander,

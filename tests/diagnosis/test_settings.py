@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Base, Candidate
-from ahrsd.diagnosis.search import State, formed_basis_of
-from ahrsd.diagnosis.settings import _averaged, best_settings, evidence_of
+from ahrsd.diagnosis.rules.regression import Base, Candidate
+from ahrsd.diagnosis.rules.search import State, formed_basis_of
+from ahrsd.diagnosis.rules.settings import _averaged, best_settings, evidence_of
 from ahrsd.diagnosis.track import Spec
 
 DRIFT = EFFECTS["hard_iron_drift"]

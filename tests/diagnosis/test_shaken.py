@@ -9,11 +9,11 @@ import pytest
 from tracks import experiment, recorded, track_of
 
 from ahrsd import so3
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.calibration_fit.shaken import shaken
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.shaken import shaken
+from ahrsd.diagnosis.rules.engine import diagnose
 from ahrsd.diagnosis.track import Spec, Track
 
 SIGMA_MAG, SIGMA_GYRO = 6e-4, 1e-3

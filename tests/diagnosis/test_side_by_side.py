@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.gains import inverse
-from ahrsd.diagnosis.side_by_side import batches, joined, pieces
+from ahrsd.diagnosis.innovation_filter.gains import inverse
+from ahrsd.diagnosis.innovation_filter.side_by_side import batches, joined
+from ahrsd.diagnosis.rules.together import pieces
 from ahrsd.diagnosis.values import Columns
 
 

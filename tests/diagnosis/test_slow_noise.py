@@ -10,10 +10,10 @@ import pytest
 from mismatch_trials import Trial, made
 from scipy.signal import lfilter
 
-from ahrsd.diagnosis import exam
-from ahrsd.diagnosis.coloured import Coloured, Law, coloured
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
+from ahrsd.diagnosis.rules import exam
+from ahrsd.diagnosis.rules.coloured import Coloured, Law, coloured
+from ahrsd.diagnosis.rules.engine import diagnose
 from ahrsd.diagnosis.track import Track
 
 RATE_HZ, COUNT = 10.0, 4000

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.name import _of_own_noise
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Candidate
-from ahrsd.diagnosis.search import State, formed_basis_of
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.name import _of_own_noise
+from ahrsd.diagnosis.rules.regression import Candidate
+from ahrsd.diagnosis.rules.search import State, formed_basis_of
 from ahrsd.diagnosis.track import Spec
 
 

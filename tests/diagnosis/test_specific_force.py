@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.specific_force import without_noise
+from ahrsd.diagnosis.innovation_filter.specific_force import without_noise
+from ahrsd.diagnosis.rules.engine import diagnose
 
 RATE_HZ = 50.0
 

@@ -8,14 +8,15 @@ import numpy as np
 from scipy import fft
 from tracks import experiment, track_of
 
+from ahrsd.diagnosis.calibration_fit.descent import moved
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import at_model, fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Base, base, without_known
-from ahrsd.diagnosis.reweighted import moved, reweighted
-from ahrsd.diagnosis.search import State, formed_basis_of
-from ahrsd.diagnosis.spectrum import against, in_world, smooth_power, spectrum_of, transformed
+from ahrsd.diagnosis.rules.regression import Base, base, without_known
+from ahrsd.diagnosis.rules.reweighted import reweighted
+from ahrsd.diagnosis.rules.search import State, at_model, formed_basis_of
+from ahrsd.diagnosis.rules.spectrum import against, in_world, smooth_power, spectrum_of, transformed
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.diagnosis.values import Columns
 

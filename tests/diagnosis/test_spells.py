@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.spells import away_from_usual, best_box, best_wave, turned_over
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.spells import away_from_usual, best_box, best_wave, turned_over
 from ahrsd.diagnosis.track import Track
 
 COUNT = 60

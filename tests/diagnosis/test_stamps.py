@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ahrsd import so3
-from ahrsd.diagnosis.facts import matters
-from ahrsd.diagnosis.hygiene import put_right
-from ahrsd.diagnosis.stamps import stamps
+from ahrsd.diagnosis.data_quality.facts import matters
+from ahrsd.diagnosis.data_quality.hygiene import put_right
+from ahrsd.diagnosis.data_quality.stamps import stamps
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 

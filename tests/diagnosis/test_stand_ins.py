@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ahrsd.diagnosis.stand_ins import end_where_they_began
+from ahrsd.diagnosis.rules.stand_ins import end_where_they_began
 
 
 @pytest.mark.parametrize(

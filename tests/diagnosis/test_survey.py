@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 from mismatch_trials import Trial, made
 
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Candidate, base
-from ahrsd.diagnosis.search import State, formed_basis_of, survey
-from ahrsd.diagnosis.settings import closest_onset, evidence_of
+from ahrsd.diagnosis.rules.regression import Candidate, base
+from ahrsd.diagnosis.rules.search import State, formed_basis_of, survey
+from ahrsd.diagnosis.rules.settings import closest_onset, evidence_of
+from ahrsd.diagnosis.rules.unknown import beside_names, detected, remainder
 from ahrsd.diagnosis.track import Spec
-from ahrsd.diagnosis.unknown import beside_names, detected, remainder
 
 
 def surveyed(**trial):

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 from mismatch_trials import Trial, made
 
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.name import Judged
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.search import State, Survey, added, survey
-from ahrsd.diagnosis.swapping import _replaced, _without, swapped
+from ahrsd.diagnosis.rules.name import Judged
+from ahrsd.diagnosis.rules.search import State, Survey, added, survey
+from ahrsd.diagnosis.rules.swapping import _replaced, _without, swapped
 from ahrsd.diagnosis.track import Spec
 
 DRIFT, OUTSIDE = "hard_iron_drift", "geomagnetic_drift"

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.innovation import run_filter
-from ahrsd.diagnosis.missing import UNSEEN, missing_turns
-from ahrsd.diagnosis.turns import Means, _Jumps, _put_right, recovered, some_lost, surplus
+from ahrsd.diagnosis.data_quality.missing import UNSEEN, missing_turns
+from ahrsd.diagnosis.data_quality.turns import (
+    Means,
+    _Jumps,
+    _put_right,
+    recovered,
+    some_lost,
+    surplus,
+)
+from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 
 GYRO_RAD_S = 2e-4  # of a filter that believes its gyro: what is lost stays with it for long
 

@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 from mismatch_trials import Trial, made
 
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.search import State, Survey, added, refitted, survey
-from ahrsd.diagnosis.stand_ins import shares_of
-from ahrsd.diagnosis.swapping import swapped
+from ahrsd.diagnosis.rules.findings import shares_of
+from ahrsd.diagnosis.rules.search import State, Survey, added, refitted, survey
+from ahrsd.diagnosis.rules.swapping import swapped
+from ahrsd.diagnosis.rules.twins import told_apart
 from ahrsd.diagnosis.track import Spec
-from ahrsd.diagnosis.twins import told_apart
 
 DRIFT, ON_BOARD = "hard_iron_drift", "onboard_calibration_active"
 

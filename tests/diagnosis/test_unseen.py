@@ -7,15 +7,15 @@ import pytest
 from mismatch_trials import Trial, made
 from scipy.spatial.transform import Rotation
 
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.base import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.effects.shapes import GRAVITY_M_S2
-from ahrsd.diagnosis.findings import with_unseen
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
-from ahrsd.diagnosis.problem import problem_of
-from ahrsd.diagnosis.regression import Candidate
-from ahrsd.diagnosis.search import State, added, survey
+from ahrsd.diagnosis.rules.findings import with_unseen
+from ahrsd.diagnosis.rules.regression import Candidate
+from ahrsd.diagnosis.rules.search import State, added, survey
 from ahrsd.diagnosis.track import Spec
 
 MOUNT = EFFECTS["flexible_mount"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from ahrsd.diagnosis import variances
+from ahrsd.diagnosis.rules import variances
 
 LOW, HIGH = -6.0, 8.0
 GROUPS = np.repeat([0, 1, 2], [12, 20, 5]).astype(np.intp)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis import wandering as walks
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.search import State
-from ahrsd.diagnosis.wandering import went_and_came
+from ahrsd.diagnosis.rules import wandering as walks
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.search import State
+from ahrsd.diagnosis.rules.wandering import went_and_came
 
 
 @pytest.fixture(scope="module")
