@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mismatch_trials import Trial, made
-from test_resting import standing, warming
+from odd_tracks import standing, warming
 from tracks import experiment, track_of
 
 from ahrsd import so3
