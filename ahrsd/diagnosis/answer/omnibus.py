@@ -1,7 +1,7 @@
 """Is there anything at all?  Tests of the whitened innovations that need no idea of what.
 
 Each gives its statistic and its probability under the null (Gaussian, white, variance 1), which
-`tests/diagnosis/test_omnibus.py` checks to be uniform on simulated nulls.
+`tests/diagnosis/answer/test_omnibus.py` checks to be uniform on simulated nulls.
 """
 
 from __future__ import annotations

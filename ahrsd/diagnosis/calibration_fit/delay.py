@@ -15,6 +15,8 @@ of a lag of some milliseconds); only the gyro's small noise is mixed.
 Where the gyro's values are rates at instants (`instants`) the rate is straight from value to value,
 and half of a step of the lag is theirs.  Drawn through means it would be off by as much
 as the rate changes within a step, which at 10 Hz on a flight is far more than its noise.
+
+A low-pass is such a delay and, in quick turns, more (`beyond_the_lag`).
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@
 A Python loop over N samples is slow, numpy over N / n blocks is not: each block of n ~ sqrt(N)
 consecutive samples starts from zero, all blocks take their j-th step together, and since the
 recursion is linear the states at the block boundaries are chained afterwards and their effect is
-added with the product of the S before each sample.  `tests/diagnosis/test_innovation.py` compares
-with the plain loop.
+added with the product of the S before each sample.
+`tests/diagnosis/innovation_filter/test_innovation.py` compares with the plain loop.
 """
 
 from __future__ import annotations

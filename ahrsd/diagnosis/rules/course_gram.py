@@ -7,7 +7,7 @@ carries all that is left of them.  With x the state, the whitened rows of a piec
 
 and W with the states carried from piece to piece gives every product of the columns: the same
 numbers as columns (N, 3, 3 J) through the filter, without any of them.
-`tests/diagnosis/test_course_gram.py` holds both against each other.
+`tests/diagnosis/rules/test_course_gram.py` holds both against each other.
 """
 
 from __future__ import annotations

@@ -8,9 +8,10 @@ that without effects, and its slope in the t_k, are
     L   = 1/2 m^T D s - 1/2 log |A|
     dL  = a_k - g_k,   a_k = sum of m_j^2,   g_k = sum of 1 - (A^-1)_jj   over j in group k
 
-by differentiating L (held against differences in `tests/diagnosis/test_variances.py`), so that
-a_k = g_k at the maximum.  Where the data decide, a_k / g_k goes with e^(-2 t_k): g_k log(a_k / g_k)
-is nearly linear in t, and its slope is nearly what dL's would be if a_k were g_k,
+by differentiating L (held against differences in `tests/diagnosis/rules/test_variances.py`), so
+that a_k = g_k at the maximum.  Where the data decide, a_k / g_k goes with e^(-2 t_k):
+g_k log(a_k / g_k) is nearly linear in t, and its slope is nearly what dL's would be if a_k were
+g_k,
 
     2 m_k^T (I - A^-1)_kl m_l,   with m_k scaled by the root of g_k / a_k.
 

@@ -1,4 +1,4 @@
-"""What untouched real recordings leave: the table of `ahrsd/diagnosis/ordinary.py`.
+"""What untouched real recordings leave: the table of `ahrsd/diagnosis/rules/ordinary.py`.
 
     python tests/benchmarks/diagnosis/bench_ordinary.py --measured SIZES.json [--only WORD ...]
     python tests/benchmarks/diagnosis/bench_ordinary.py

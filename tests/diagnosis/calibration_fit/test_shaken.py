@@ -9,12 +9,11 @@ import pytest
 from odd_tracks import shaking
 from tracks import experiment, recorded, track_of
 
-from ahrsd import so3
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.calibration_fit.shaken import shaken
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.diagnosis.track import Spec
 
 
 @pytest.mark.parametrize("scenario", ["wam", "mam", "lam"])

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from odd_tracks import SIGMA_GYRO, SIGMA_MAG, shaking
 
-from ahrsd import so3
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.calibration_fit.shaken import shaken
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.rules.engine import diagnose
-from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.diagnosis.track import Spec
 
 
 @pytest.mark.parametrize("seed", [1, 2])
