@@ -10,7 +10,7 @@ from ahrsd.diagnosis.innovation_filter.evidence import colour, log_bayes
 from ahrsd.diagnosis.innovation_filter.score import score
 from ahrsd.diagnosis.rules.gram import block_edges, gram
 from ahrsd.diagnosis.rules.locate import log_bayes_walk
-from ahrsd.diagnosis.rules.score import chi2_p, robust_p, shift_statistics
+from ahrsd.diagnosis.rules.score import chi2_p, f_above, robust_p, shift_statistics
 
 COUNT, RATE_HZ = 1600, 10.0
 
@@ -130,3 +130,7 @@ def test_a_wandering_course_is_likelier_as_a_walk_than_as_independent_segments()
     walked = log_bayes_walk(G, s, 3, sizes)
     shuffled = s.reshape(30, 3)[rng.permutation(30)].ravel()
     assert walked > log_bayes_walk(G, shuffled, 3, sizes) + 10
+
+
+def test_f_s_tail_is_that_of_the_distribution():
+    assert f_above(3.1, 3, 36.5) == pytest.approx(stats.f.sf(3.1, 3, 36.5), rel=1e-12)
