@@ -1,8 +1,8 @@
 """How large something is that is added to the readings: in gauss, and in degrees of heading.
 
 What another calibration would take of it is no part of it: on a car that hardly tilts nearly all of
-a field by attitude is such.  Here, too: by how much one calibration in
-place of another turns a heading.
+a field by attitude is such.  Here, too: by how much one calibration in place of another
+turns a heading.
 """
 
 from __future__ import annotations
