@@ -306,7 +306,9 @@ def terms_text(config: Config) -> str:
     path = config.terms.model
     if path is None:
         return ""
-    from ahrsd.diagnosis.model_file import from_text  # takes 50 MB: only where there is a model
+    from ahrsd.diagnosis.repaired_model.model_file import (
+        from_text,  # takes 50 MB: only where there is a model
+    )
 
     try:
         text = text_within(path, _LARGEST_MODEL_BYTES)

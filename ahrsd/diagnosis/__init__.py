@@ -1,7 +1,9 @@
 """Where a recording and its simulation differ, and which physics was left out.
 
-`track` and `values` hold what travels; `hygiene` looks at the recording itself; `innovation`
-filters it (`blocks`, `gains`), `null` fits the calibration (`prior`, `noise_fit`, `coarse`),
-`noise` and `omnibus` judge what is left; `effects/` is the library, one table row per effect;
-`gram` keeps a recording's statistics; `locate`, `name`, `engine` answer from them.
+`track` and `values` hold what travels, `limits` the thresholds of verdicts.  `data_quality` looks
+at the recording itself and `columns` at what was logged beside it; `innovation_filter` filters it,
+`calibration_fit` fits the calibration; `effects` is the library, one table row per effect;
+`where_and_when` says what is left, where; `answer` is the contract's form and its words, and
+`repaired_model` what a model is worth as a file and forward.  Two engines answer from them,
+`rules` and `one_model`; `engines` chooses.
 """

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from functools import partial
 
-from ahrsd.diagnosis.diagnosis import Diagnosis
-from ahrsd.diagnosis.logged import diagnose_logged, with_columns_as_logged
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis
+from ahrsd.diagnosis.columns.logged import with_columns_as_logged
+from ahrsd.diagnosis.rules.logged import diagnose_logged
 from ahrsd.diagnosis.track import Spec, Track
 
 #: by rules; by one generative model, experimental (docs/design/engine.md)

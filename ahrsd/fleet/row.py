@@ -19,7 +19,7 @@ from ahrsd.events import Event, SamplesSeen
 from ahrsd.printable import LINE, printable
 
 if TYPE_CHECKING:
-    from ahrsd.diagnosis.diagnosis import Diagnosis
+    from ahrsd.diagnosis.answer.diagnosis import Diagnosis
 
 Row = dict[str, Any]
 

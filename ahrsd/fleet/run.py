@@ -34,7 +34,7 @@ from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 
 if TYPE_CHECKING:
-    from ahrsd.diagnosis.diagnosis import Diagnosis
+    from ahrsd.diagnosis.answer.diagnosis import Diagnosis
 
 # -- One recording, one row ------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from ahrsd.config.config import Config
 from ahrsd.core.estimation import Calibrator
-from ahrsd.diagnosis.model_file import RepairedModel
+from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
 from ahrsd.events import Estimated, Event, SamplesSeen
 from ahrsd.offline.replay import Replayed, replay
 from ahrsd.offline.track import faults, without_terms

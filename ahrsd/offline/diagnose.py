@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ahrsd.diagnosis.aligned import align, differing
-from ahrsd.diagnosis.diagnosis import Diagnosis
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis
+from ahrsd.diagnosis.data_quality.aligned import align, differing
 from ahrsd.diagnosis.engines import RULES, diagnosed
-from ahrsd.diagnosis.model_file import RepairedModel, from_text
+from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, from_text
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen

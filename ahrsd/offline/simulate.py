@@ -7,10 +7,11 @@ import gzip
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ahrsd.diagnosis import forward, roles
+from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.effects import profiles, request
-from ahrsd.diagnosis.injection import injected, readings_of, terms_json
-from ahrsd.diagnosis.model_file import RepairedModel
+from ahrsd.diagnosis.repaired_model import forward
+from ahrsd.diagnosis.repaired_model.injection import injected, readings_of, terms_json
+from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
 from ahrsd.diagnosis.track import Track
 from ahrsd.errors import AhrsdError
 from ahrsd.recording.table import TABLE_SUFFIXES, is_table, write_table

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ahrsd.diagnosis.correction import without
-from ahrsd.diagnosis.dead import dead_axes, possible
+from ahrsd.diagnosis.columns.roles import prepared
+from ahrsd.diagnosis.data_quality.dead import dead_axes, possible
+from ahrsd.diagnosis.data_quality.facts import matters
+from ahrsd.diagnosis.data_quality.frames import windows
+from ahrsd.diagnosis.data_quality.hygiene import as_recorded, hygiene
+from ahrsd.diagnosis.data_quality.pauses import without_jumps
 from ahrsd.diagnosis.effects.shapes import GRAVITY_M_S2
-from ahrsd.diagnosis.facts import matters
-from ahrsd.diagnosis.frames import windows
-from ahrsd.diagnosis.hygiene import as_recorded, hygiene
-from ahrsd.diagnosis.model_file import RepairedModel
-from ahrsd.diagnosis.pauses import without_jumps
-from ahrsd.diagnosis.roles import prepared
+from ahrsd.diagnosis.repaired_model.correction import without
+from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
 from ahrsd.diagnosis.track import Track
 from ahrsd.errors import AhrsdError
 from ahrsd.events import Event, SamplesSeen

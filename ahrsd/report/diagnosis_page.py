@@ -13,10 +13,17 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from ahrsd.diagnosis.diagnosis import Contribution, Diagnosis, Drawn, Finding, RegimeMap, Validation
-from ahrsd.diagnosis.ordinary_text import in_one_sentence, ordinary_left, size_lines
-from ahrsd.diagnosis.shown import shown
-from ahrsd.diagnosis.spoken import assumed, headline, place, sensitivity, value_text, verdict
+from ahrsd.diagnosis.answer.diagnosis import (
+    Contribution,
+    Diagnosis,
+    Drawn,
+    Finding,
+    RegimeMap,
+    Validation,
+)
+from ahrsd.diagnosis.answer.ordinary_text import in_one_sentence, ordinary_left, size_lines
+from ahrsd.diagnosis.answer.spoken import assumed, headline, place, sensitivity, value_text, verdict
+from ahrsd.diagnosis.columns.shown import shown
 from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN, legend_above
 from ahrsd.report.template import Picture, number, picture, render
 from ahrsd.samples import Array

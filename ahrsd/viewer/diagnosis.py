@@ -8,9 +8,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from ahrsd.diagnosis.diagnosis import Contribution, Diagnosis, Drawn
-from ahrsd.diagnosis.ordinary_text import ordinary_left
-from ahrsd.diagnosis.spoken import headline, lines, place
+from ahrsd.diagnosis.answer.diagnosis import Contribution, Diagnosis, Drawn
+from ahrsd.diagnosis.answer.ordinary_text import ordinary_left
+from ahrsd.diagnosis.answer.spoken import headline, lines, place
 from ahrsd.samples import Array
 from ahrsd.viewer.blueprint import X, Y, Z
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from ahrsd.diagnosis import engine
-from ahrsd.diagnosis.diagnosis import Diagnosis
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis
 from ahrsd.diagnosis.engines import ENGINES, ONE_MODEL, diagnosed
 from ahrsd.diagnosis.one_model import diagnose as one_model
+from ahrsd.diagnosis.rules import engine
 from ahrsd.diagnosis.track import Spec, Track
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -12,8 +12,8 @@ import pytest
 from browser import BROWSER, look_at
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ahrsd.diagnosis import predictive
-from ahrsd.diagnosis.diagnosis import (
+from ahrsd.diagnosis.answer import predictive
+from ahrsd.diagnosis.answer.diagnosis import (
     Baseline,
     Check,
     Contribution,
@@ -31,8 +31,8 @@ from ahrsd.diagnosis.diagnosis import (
     Value,
     Where,
 )
-from ahrsd.diagnosis.shown import MOST, shown
-from ahrsd.diagnosis.spoken import lines
+from ahrsd.diagnosis.answer.spoken import lines
+from ahrsd.diagnosis.columns.shown import MOST, shown
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.report import diagnosis_page
 from ahrsd.report.diagnosis_page import _STATISTICS, write_diagnosis_report

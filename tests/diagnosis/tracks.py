@@ -53,7 +53,7 @@ def true_model(made: Experiment) -> NullModel:
 
 def moved_model(model: NullModel, direction: np.ndarray) -> NullModel:
     """The model with its 11 parameters moved, in the order of `nuisance_columns`."""
-    from ahrsd.diagnosis.innovation import TRACELESS
+    from ahrsd.estimator.locked import TRACELESS
 
     return replace(
         model,

@@ -14,7 +14,7 @@ import pytest
 from scipy.signal import lfilter
 
 from ahrsd import so3
-from ahrsd.diagnosis.ordinary import TABLE
+from ahrsd.diagnosis.rules.ordinary import TABLE
 from ahrsd.estimator.epoch import with_drift
 from ahrsd.estimator.online import (
     WHOLE,

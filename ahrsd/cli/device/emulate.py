@@ -39,7 +39,7 @@ def _device(setup: Setup, effects: Sequence[str]) -> Emulator:
     try:
         if not effects:
             return build(setup)
-        from ahrsd.diagnosis.injection import EmulatedEffects
+        from ahrsd.diagnosis.repaired_model.injection import EmulatedEffects
 
         return build(setup, EmulatedEffects(setup, effects))
     except ValueError as error:

@@ -13,7 +13,7 @@ from ahrsd.daemon.heap import keep_heap
 from ahrsd.errors import AhrsdError
 
 if TYPE_CHECKING:
-    from ahrsd.diagnosis.diagnosis import Diagnosis
+    from ahrsd.diagnosis.answer.diagnosis import Diagnosis
     from ahrsd.recording.column_names import ColumnMap
 
 _PATH = click.Path(path_type=Path)
@@ -55,7 +55,7 @@ def command(
                          diagnosis.json the answer
                          model.json     the repaired model: ahrsd simulate --model
     """
-    from ahrsd.diagnosis.spoken import lines
+    from ahrsd.diagnosis.answer.spoken import lines
     from ahrsd.offline.diagnose import diagnose_recording
 
     refuse_unwritable(json_path)
@@ -83,7 +83,7 @@ def command(
 
 
 def _write_report(folder: Path, found: Diagnosis) -> None:
-    from ahrsd.diagnosis.model_file import of_diagnosis, to_text
+    from ahrsd.diagnosis.repaired_model.model_file import of_diagnosis, to_text
     from ahrsd.report.diagnosis_page import write_diagnosis_report
     from ahrsd.viewer.diagnosis import write_rrd
 

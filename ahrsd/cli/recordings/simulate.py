@@ -167,7 +167,7 @@ def _recorded(path: Path, wanted: _Options, disturbances: Disturbances) -> Exper
 
 def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None:
     """Write a table of what a repaired model reads along a recording, and its truth beside it."""
-    from ahrsd.diagnosis.injection import terms_json
+    from ahrsd.diagnosis.repaired_model.injection import terms_json
     from ahrsd.offline.diagnose import load_model, load_track
     from ahrsd.offline.simulate import along, write_columns
     from ahrsd.recording.table import TABLE_SUFFIXES, is_table

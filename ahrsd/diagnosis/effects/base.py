@@ -18,6 +18,9 @@ Kind = Literal["mean", "variance", "discrete"]
 #: what a non-linear choice of an effect is made of: onset, time constant, covariate's name ...
 Setting = dict[str, Any]
 
+#: settings that are a size or an angle, sought between the values of their grid
+SCALES = ("time_constant_s", "radius_gauss", "length_s", "length_m")
+ANGLES = ("turn_deg",)
 #: deviations that a coefficient at its physical bound must be for a direction to be observable
 BOUND_DEVIATIONS = 3.0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis import roles
+from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.effects import series, shapes
 from ahrsd.diagnosis.effects.base import Linear, Parameter, Readings, Setting
 from ahrsd.diagnosis.values import Columns

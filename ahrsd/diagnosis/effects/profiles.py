@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
-from ahrsd.diagnosis import roles
+from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.samples import Array
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ahrsd import so3
 from ahrsd.diagnosis.effects.base import Readings
-from ahrsd.diagnosis.recursive import first_order
+from ahrsd.diagnosis.innovation_filter.recursive import first_order
 from ahrsd.samples import Array
 
 

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ahrsd.diagnosis import roles
+from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.effects.base import Parameter, Readings, Setting
 from ahrsd.samples import Array
 

@@ -10,7 +10,7 @@ from itertools import product
 
 import numpy as np
 
-from ahrsd.diagnosis import roles
+from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.effects import series, shapes
 from ahrsd.diagnosis.effects.base import Linear, Parameter, Readings, Setting, readings_of
 from ahrsd.diagnosis.effects.dipole import found_place, unit_fields
@@ -26,7 +26,7 @@ _BUMP_LENGTHS_S = (4.0, 12.0, 36.0)
 _BUMPS = 2
 _DISTANCES_M = (1.0, 3.0)
 _SIDES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
-_NEAREST_M = 0.2
+NEAREST_M = 0.2
 _WAY = 5  # places along the way around which it is sought, too
 _CLEAR = 4.0  # usual departures of the size from which an object is sought
 #: half waves of a slow pulsation, in lengths of the recording, and their phases, coarsely
@@ -136,7 +136,7 @@ class FieldAnomaly(Linear):
         place = position_m(readings)
         if place is None:
             return ({"onset_s": shapes.middle_s(readings), "length_s": 12.0},)
-        return (_object(place[len(place) // 2] + [0.0, 0.0, 2.0], 2.0),)
+        return (object_setting(place[len(place) // 2] + [0.0, 0.0, 2.0], 2.0),)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """Its field for unit sources along the world's axes."""
@@ -348,24 +348,13 @@ def _dipoles(
             best = found_place(size, place, field_n, row)
             if best is not None:
                 nearest = float(np.linalg.norm(place - best[0], axis=1).min())
-                found.append(_object(best[0], max(nearest, _NEAREST_M), np.degrees(best[1])))
+                found.append(object_setting(best[0], max(nearest, NEAREST_M), np.degrees(best[1])))
         around = product(_DISTANCES_M, _SIDES)
-        found += [_object(place[row] + far * np.array(side), far) for far, side in around]
+        found += [object_setting(place[row] + far * np.array(side), far) for far, side in around]
     far = _DISTANCES_M[-1]
     along = place[:: max(len(place) // _WAY, 1)]
-    found += [_object(at + far * np.array(side), far) for at, side in product(along, _SIDES)]
+    found += [object_setting(at + far * np.array(side), far) for at, side in product(along, _SIDES)]
     return tuple(found)
-
-
-def moved_object(context: Context, setting: Setting, place_and_turn: Array) -> Setting:
-    """The setting of an object (3 m, 1 deg) elsewhere, its distance that to the nearest place."""
-    way = position_m(readings_of(context))
-    if way is None:
-        return setting
-    away = way - place_and_turn[:3]
-    nearest = float(np.sqrt(np.einsum("ni,ni->n", away, away).min()))
-    at = _object(place_and_turn[:3], max(nearest, _NEAREST_M), float(place_and_turn[3]))
-    return {**setting, **at}
 
 
 def _seen(readings: Readings, field_n: Array) -> Array:
@@ -373,7 +362,8 @@ def _seen(readings: Readings, field_n: Array) -> Array:
     return np.asarray(shapes.world_axes(readings) @ field_n)
 
 
-def _object(place: Array, distance: float, turn_deg: float = 0.0) -> Setting:
+def object_setting(place: Array, distance: float, turn_deg: float = 0.0) -> Setting:
+    """The setting of an object at a place, so far from the nearest of the way."""
     return {
         "place_m": [round(float(x), 4) for x in place],
         "distance_m": round(distance, 3),

@@ -13,13 +13,12 @@ from typing import cast
 
 import numpy as np
 
-from ahrsd.diagnosis.address import AXES, where_of
-from ahrsd.diagnosis.confound import separating_manoeuvre
-from ahrsd.diagnosis.delay import usual_step
-from ahrsd.diagnosis.diagnosis import Cost, Finding, Share, Unexplained, Value, Where
+from ahrsd.diagnosis.answer.added_field import heading_error_deg
+from ahrsd.diagnosis.answer.confound import separating_manoeuvre
+from ahrsd.diagnosis.answer.diagnosis import Cost, Finding, Share, Unexplained, Value, Where
+from ahrsd.diagnosis.calibration_fit.delay import usual_step
+from ahrsd.diagnosis.calibration_fit.prior import prior_of
 from ahrsd.diagnosis.effects.base import Effect, Setting
-from ahrsd.diagnosis.intervals import departures
-from ahrsd.diagnosis.locate import Frame, single_source, unit_columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.alternatives import (
     by_heading,
@@ -40,9 +39,10 @@ from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
 from ahrsd.diagnosis.one_model.near_settings import changed, opened
 from ahrsd.diagnosis.one_model.remainder import still_spells
-from ahrsd.diagnosis.prior import prior_of
-from ahrsd.diagnosis.validate import heading_error_deg
 from ahrsd.diagnosis.values import Term
+from ahrsd.diagnosis.where_and_when.address import AXES, where_of
+from ahrsd.diagnosis.where_and_when.intervals import departures
+from ahrsd.diagnosis.where_and_when.locate import Frame, single_source, unit_columns
 from ahrsd.samples import Array
 
 #: odds are told no surer than this

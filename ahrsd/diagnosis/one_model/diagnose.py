@@ -12,14 +12,17 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
-from ahrsd.diagnosis.chance import Answered, beyond_chance
-from ahrsd.diagnosis.descent import NullFit
-from ahrsd.diagnosis.diagnosis import Diagnosis
+from ahrsd.diagnosis.answer.chance import Answered, beyond_chance
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis
+from ahrsd.diagnosis.calibration_fit.descent import NullFit
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import Problem, problem_of
+from ahrsd.diagnosis.calibration_fit.resting import at_rest, resting, told_at_rest
+from ahrsd.diagnosis.data_quality.missing import differ, lost_turns
+from ahrsd.diagnosis.data_quality.prepared import prepared
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.missing import differ, lost_turns
-from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.one_model import rich
 from ahrsd.diagnosis.one_model.answer.whole_answer import whole_answer
 from ahrsd.diagnosis.one_model.column_clocks import wrong_clock
@@ -27,9 +30,6 @@ from ahrsd.diagnosis.one_model.lost_beside import lost_beside, nats
 from ahrsd.diagnosis.one_model.recorded_rate import Quick, quick
 from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
 from ahrsd.diagnosis.one_model.search_rounds import Searched, answered
-from ahrsd.diagnosis.prepared import prepared
-from ahrsd.diagnosis.problem import Problem, problem_of
-from ahrsd.diagnosis.resting import at_rest, resting, told_at_rest
 from ahrsd.diagnosis.track import Spec, Track
 
 

@@ -9,13 +9,12 @@ from typing import cast
 
 import numpy as np
 
-from ahrsd.diagnosis.delays import beyond_the_lag
-from ahrsd.diagnosis.effects.base import Effect, Setting
-from ahrsd.diagnosis.locate import Frame, unit_columns
+from ahrsd.diagnosis.calibration_fit.delay import beyond_the_lag
+from ahrsd.diagnosis.effects.base import ANGLES, SCALES, Effect, Setting
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
-from ahrsd.diagnosis.settings import ANGLES, SCALES
 from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.where_and_when.locate import Frame, unit_columns
 from ahrsd.samples import Array
 
 #: the delay that stands for all delays: which of them it is, is asked at the end

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis.locate import Frame, unit_columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, log_density, stiff
 from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.where_and_when.locate import Frame, unit_columns
 from ahrsd.samples import Array
 
 #: half waves of a course: one in so many seconds, and from few to many

@@ -14,9 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.effects.base import Setting
+from ahrsd.diagnosis.effects.base import ANGLES, SCALES, Setting
 from ahrsd.diagnosis.one_model.component import Component, Fixed
-from ahrsd.diagnosis.settings import ANGLES, SCALES
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ahrsd.diagnosis.delay import without_lag
-from ahrsd.diagnosis.diagnosis import Unexplained
+from ahrsd.diagnosis.answer.diagnosis import Unexplained
+from ahrsd.diagnosis.calibration_fit.delay import without_lag
+from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate
 from ahrsd.diagnosis.effects.base import Effect
-from ahrsd.diagnosis.innovation import run_filter
-from ahrsd.diagnosis.narrow_band import loudest_band, of_band
+from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 from ahrsd.diagnosis.one_model import decision, noise_model, priors, rich
 from ahrsd.diagnosis.one_model.effect_components import component
 from ahrsd.diagnosis.one_model.linearised import (
@@ -30,7 +30,7 @@ from ahrsd.diagnosis.one_model.linearised import (
     relevelled,
 )
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, Space, searched
-from ahrsd.diagnosis.problem import Problem, model_at_rate
+from ahrsd.diagnosis.where_and_when.narrow_band import loudest_band, of_band
 from ahrsd.samples import Array
 
 #: how often rows are weighed anew beside what was found

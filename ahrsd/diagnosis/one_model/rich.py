@@ -14,11 +14,12 @@ from functools import partial
 
 import numpy as np
 
-from ahrsd.diagnosis.delay import of_magnetometer, usual_step
+from ahrsd.diagnosis.calibration_fit.delay import of_magnetometer, usual_step
+from ahrsd.diagnosis.calibration_fit.problem import Problem
+from ahrsd.diagnosis.columns.logger_noise import cleaned
+from ahrsd.diagnosis.columns.shown import shown
 from ahrsd.diagnosis.effects.base import Effect
-from ahrsd.diagnosis.innovation import Filtered
-from ahrsd.diagnosis.locate import FRAMES
-from ahrsd.diagnosis.logger_noise import cleaned
+from ahrsd.diagnosis.innovation_filter.innovation import Filtered
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import (
@@ -44,8 +45,7 @@ from ahrsd.diagnosis.one_model.linearised import (
     step_of,
 )
 from ahrsd.diagnosis.one_model.remainder import ordinary_remainder
-from ahrsd.diagnosis.problem import Problem
-from ahrsd.diagnosis.shown import shown
+from ahrsd.diagnosis.where_and_when.locate import FRAMES
 
 #: linearisations in one noise, noises, and nats that a further one must gain
 ROUNDS, NOISES, SETTLED = 6, 3, 5.0

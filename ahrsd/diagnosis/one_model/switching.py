@@ -23,12 +23,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis.locate import Frame, frame_columns, segments_between, unit_columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Sized, log_density
 from ahrsd.diagnosis.one_model.evidence import At
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, beside
 from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.where_and_when.locate import (
+    Frame,
+    frame_columns,
+    segments_between,
+    unit_columns,
+)
 from ahrsd.samples import Array
 
 #: frames in which such a source is asked

@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ahrsd.diagnosis.diagnosis import Diagnosis, Finding
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.locate import Located
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding
+from ahrsd.diagnosis.rules.engine import diagnose
 from ahrsd.diagnosis.track import Track
+from ahrsd.diagnosis.where_and_when.locate import Located
 from ahrsd.offline.diagnose import load_track
 
 RECORDINGS = Path(__file__).parents[3] / ".." / "shared" / "recordings"

@@ -21,7 +21,7 @@ from collections import Counter
 from pathlib import Path
 
 from ahrsd.cli.recordings import simulate
-from ahrsd.diagnosis.diagnosis import Diagnosis
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis
 from ahrsd.offline.diagnose import diagnose_recording
 
 SCENARIOS, MOTIONS = ("wam", "mam", "lam"), ("slow", "rov")

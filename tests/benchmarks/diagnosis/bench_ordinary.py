@@ -1,4 +1,4 @@
-"""What untouched real recordings leave: the table of `ahrsd/diagnosis/ordinary.py`.
+"""What untouched real recordings leave: the table of `ahrsd/diagnosis/rules/ordinary.py`.
 
     python tests/benchmarks/diagnosis/bench_ordinary.py --measured SIZES.json [--only WORD ...]
     python tests/benchmarks/diagnosis/bench_ordinary.py
@@ -21,11 +21,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ahrsd.diagnosis.diagnosis import Diagnosis
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
-from ahrsd.diagnosis.ordinary import Row, Table, held_against, is_course_on_sensor, table_of
-from ahrsd.diagnosis.remainder_sizes import Left, Size
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.ordinary import Row, Table, held_against, is_course_on_sensor, table_of
+from ahrsd.diagnosis.rules.remainder_sizes import Left, Size
 from ahrsd.errors import RecordingError
 from ahrsd.offline.diagnose import load_track
 

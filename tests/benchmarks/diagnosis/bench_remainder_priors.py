@@ -27,6 +27,7 @@ import numpy as np
 from bench_ordinary import AT_REST, DISTURBED, DOUBTFUL, FOLDERS, RECORDINGS
 from scipy.optimize import minimize
 
+from ahrsd.diagnosis.data_quality.prepared import prepared
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.one_model import priors, rich
@@ -36,7 +37,6 @@ from ahrsd.diagnosis.one_model.effect_components import LAG
 from ahrsd.diagnosis.one_model.evidence import evaluated
 from ahrsd.diagnosis.one_model.model_search import beside
 from ahrsd.diagnosis.one_model.search_space import space_at
-from ahrsd.diagnosis.prepared import prepared
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import RecordingError
 from ahrsd.offline.diagnose import load_track

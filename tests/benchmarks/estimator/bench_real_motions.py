@@ -22,13 +22,13 @@ sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 
 from mismatch_trials import covariates
 
-from ahrsd.diagnosis.coarse import noise_of
-from ahrsd.diagnosis.diagnosis import Diagnosis
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis
+from ahrsd.diagnosis.calibration_fit.coarse import noise_of
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.base import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.engine import diagnose
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.problem import problem_of
+from ahrsd.diagnosis.rules.engine import diagnose
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.offline.diagnose import load_track
 from ahrsd.samples import Array

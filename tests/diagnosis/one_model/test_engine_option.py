@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tracks import experiment
 
-from ahrsd.diagnosis.model_file import from_text
+from ahrsd.diagnosis.repaired_model.model_file import from_text
 from ahrsd.recording.table import write_table
 
 

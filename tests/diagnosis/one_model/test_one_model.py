@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mismatch_trials import Trial, made
-from test_resting import standing, warming
+from odd_tracks import standing, warming
 from tracks import experiment, track_of
 
 from ahrsd import so3
-from ahrsd.diagnosis.forward import context_along, contribution
-from ahrsd.diagnosis.model_file import from_text, of_diagnosis, to_text
 from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.repaired_model.forward import context_along, contribution
+from ahrsd.diagnosis.repaired_model.model_file import from_text, of_diagnosis, to_text
 from ahrsd.diagnosis.track import NothingToFit
 from ahrsd.simulation import ScenarioSettings, simulate
 

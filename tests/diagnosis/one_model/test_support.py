@@ -9,11 +9,12 @@ import pytest
 from scipy.special import chdtri
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.added_field import calibration_of, deviation, less_calibration
-from ahrsd.diagnosis.diagnosis import Assumed, Finding, Heldout, OnPriors, Where
+from ahrsd.diagnosis.answer.added_field import calibration_of, deviation, less_calibration
+from ahrsd.diagnosis.answer.diagnosis import Assumed, Finding, Heldout, OnPriors, Where
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.null import fit_null
 from ahrsd.diagnosis.one_model import priors, rich
 from ahrsd.diagnosis.one_model.answer.held_out import HeldOut, dealt
 from ahrsd.diagnosis.one_model.answer.left_sizes import left_sizes
@@ -34,7 +35,6 @@ from ahrsd.diagnosis.one_model.answer.support import doubts
 from ahrsd.diagnosis.one_model.answer.visibility import limits, seen_alone
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Space
 from ahrsd.diagnosis.one_model.search_space import space_at
-from ahrsd.diagnosis.problem import problem_of
 from ahrsd.diagnosis.track import Spec, Track
 
 CURRENT = np.array([5e-4, -7e-4, 3e-4])

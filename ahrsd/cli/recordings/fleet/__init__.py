@@ -18,7 +18,7 @@ from ahrsd.fleet.run import ROLES, Examiner, Orders, summary
 from ahrsd.printable import counted
 
 if TYPE_CHECKING:
-    from ahrsd.diagnosis.diagnosis import Diagnosis
+    from ahrsd.diagnosis.answer.diagnosis import Diagnosis
     from ahrsd.fleet.run import Progress
     from ahrsd.recording.column_names import ColumnMap
 

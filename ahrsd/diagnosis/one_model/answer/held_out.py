@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ahrsd.diagnosis.diagnosis import Heldout
+from ahrsd.diagnosis.answer.diagnosis import Heldout
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.answer.white_rows import WhiteRows, root_of, white_rows
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, averaged

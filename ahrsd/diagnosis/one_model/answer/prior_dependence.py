@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.diagnosis import Assumed, OnPriors
+from ahrsd.diagnosis.answer.diagnosis import Assumed, OnPriors
 from ahrsd.diagnosis.one_model import noise_model, priors
 from ahrsd.diagnosis.one_model.component import Fixed, Law, Sized
 from ahrsd.diagnosis.one_model.effect_components import LAG, LAG_FORM

@@ -17,15 +17,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special
 
-from ahrsd.diagnosis.descent import NullFit
-from ahrsd.diagnosis.diagnosis import Check, RegimeMap, Whiteness
-from ahrsd.diagnosis.noise import tails_of
-from ahrsd.diagnosis.omnibus import omnibus
+from ahrsd.diagnosis.answer.diagnosis import Check, RegimeMap, Whiteness
+from ahrsd.diagnosis.answer.omnibus import omnibus
+from ahrsd.diagnosis.answer.predictive import COPIES, bands, scene_of, statistics
+from ahrsd.diagnosis.calibration_fit.descent import NullFit
+from ahrsd.diagnosis.innovation_filter.noise import tails_of
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.answer.white_rows import Fit, WhiteRows
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION
-from ahrsd.diagnosis.predictive import COPIES, bands, scene_of, statistics
-from ahrsd.diagnosis.regime import regime_columns, regimes
+from ahrsd.diagnosis.where_and_when.regime import regime_columns, regimes
 from ahrsd.samples import Array
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from ahrsd.diagnosis.diagnosis import Finding, Unexplained, Validation
+from ahrsd.diagnosis.answer.diagnosis import Finding, Unexplained, Validation
 from ahrsd.diagnosis.one_model.answer.held_out import HeldOut
 from ahrsd.diagnosis.one_model.answer.prior_dependence import on_priors
 from ahrsd.diagnosis.one_model.decision import Answer, asked_odds

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis.diagnosis import Limit
+from ahrsd.diagnosis.answer.diagnosis import Limit
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Names, Space, beside

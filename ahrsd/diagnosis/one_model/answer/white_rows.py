@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.fft import idct
 
-from ahrsd.diagnosis.innovation import sensitivities
+from ahrsd.diagnosis.innovation_filter.innovation import sensitivities
+from ahrsd.diagnosis.innovation_filter.side_by_side import batches, joined
 from ahrsd.diagnosis.one_model.linearised import Linearised, by_frequency
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis
-from ahrsd.diagnosis.side_by_side import batches, joined
 from ahrsd.diagnosis.values import Columns
 from ahrsd.samples import Array
 

@@ -11,14 +11,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis import locate
-from ahrsd.diagnosis.descent import NullFit
-from ahrsd.diagnosis.diagnosis import Check, Diagnosis, Finding, RegimeMap, Suspect, Unexplained
+from ahrsd.diagnosis.answer.diagnosis import (
+    Check,
+    Diagnosis,
+    Finding,
+    RegimeMap,
+    Suspect,
+    Unexplained,
+)
+from ahrsd.diagnosis.calibration_fit.descent import NullFit
+from ahrsd.diagnosis.calibration_fit.null import baseline
+from ahrsd.diagnosis.calibration_fit.resting import HARDLY_TURNED, at_rest
+from ahrsd.diagnosis.data_quality.facts import Fact, around, lost_at, of_fact, rounding
+from ahrsd.diagnosis.data_quality.hygiene import would_have_shown
+from ahrsd.diagnosis.data_quality.prepared import Prepared
 from ahrsd.diagnosis.effects.base import Effect
-from ahrsd.diagnosis.facts import Fact, around, lost_at, of_fact, rounding
-from ahrsd.diagnosis.hygiene import would_have_shown
-from ahrsd.diagnosis.noise import level_facts
-from ahrsd.diagnosis.null import baseline
+from ahrsd.diagnosis.innovation_filter.noise import level_facts
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.answer import pictures, residual_checks, support, visibility
 from ahrsd.diagnosis.one_model.answer.held_out import HeldOut
@@ -27,8 +35,7 @@ from ahrsd.diagnosis.one_model.answer.repaired_noise import repaired_noise
 from ahrsd.diagnosis.one_model.decision import Answer
 from ahrsd.diagnosis.one_model.recorded_rate import Quick
 from ahrsd.diagnosis.one_model.search_rounds import Searched
-from ahrsd.diagnosis.prepared import Prepared
-from ahrsd.diagnosis.resting import HARDLY_TURNED, at_rest
+from ahrsd.diagnosis.where_and_when import locate
 
 NOTE = "by the engine one-model, which is experimental"
 

@@ -1,0 +1,1 @@
+"""The answer in the contract's form, what it is held against, and its words."""

@@ -1,0 +1,79 @@
+"""How large something is that is added to the readings: in gauss, and in degrees of heading.
+
+What another calibration would take of it is no part of it: on a car that hardly tilts nearly all of
+a field by attitude is such.  Here, too: by how much one calibration in place of another
+turns a heading.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd.diagnosis.values import Context, NullModel
+from ahrsd.samples import Array
+
+#: where no accelerometer says what is level: the horizontal part of the field at 60 degrees of dip
+LEVEL_SHARE = 0.5
+#: smallest horizontal part of the field in which a heading is told
+LEAST_SHARE = 0.1
+
+
+def calibration_of(context: Context) -> Array:
+    """(3 N, 9) orthonormal: how readings move with soft and hard iron."""
+    x, y, z = context.field_b.T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    soft = [
+        (x, zero, zero), (zero, y, zero), (zero, zero, z), (y, x, zero), (z, zero, x), (zero, z, y)
+    ]  # fmt: skip
+    hard = [(one, zero, zero), (zero, one, zero), (zero, zero, one)]
+    columns = np.stack([np.column_stack(part).ravel() for part in (*soft, *hard)], axis=1)
+    return np.asarray(np.linalg.svd(columns, full_matrices=False)[0])
+
+
+def less_calibration(added: Array, take: Array) -> Array:
+    """(N, 3) what no soft and hard iron would take over; take: `calibration_of`."""
+    flat = added.ravel()
+    return np.asarray((flat - take @ (take.T @ flat)).reshape(added.shape))
+
+
+def deviation(added: Array) -> float:
+    """Root mean square length of (N, 3) about its mean."""
+    return float(np.sqrt(np.sum(np.var(added, axis=0))))
+
+
+def heading_off_deg(added: Array, context: Context) -> float:
+    """Deviation of a level vehicle's heading by a field (N, 3) that is added to the readings.
+
+    Across the horizontal field; where nothing says what is level, of any direction in a field of
+    usual dip.
+    """
+    read = context.field_b @ context.model.soft_iron.T
+    if not context.world_levelled:
+        size = float(np.median(np.linalg.norm(read, axis=1)))
+        return float(np.degrees(deviation(added) / np.sqrt(3.0) / (LEVEL_SHARE * size)))
+    outside, in_world = (_turned(context.R_nb, vectors) for vectors in (read, added))
+    north, east, _ = mean = outside.mean(axis=0)
+    level = float(np.hypot(north, east))
+    least = max(level, LEAST_SHARE * float(np.linalg.norm(mean)))
+    across = in_world[:, :2] @ np.array([-east, north]) / max(level, 1e-300)
+    return float(np.degrees(np.std(across) / least))
+
+
+def _turned(rotations: Array, vectors: Array) -> Array:
+    return np.asarray(np.einsum("nij,nj->ni", rotations, vectors))
+
+
+def heading_error_deg(before: NullModel, after: NullModel, field_b: Array) -> float:
+    """Largest heading error that a level vehicle sees from the one calibration in place of another.
+
+    Both correct the readings of the repaired sensor; field_b (N, 3) gives the field's size, and the
+    inclination is taken as 60 degrees.
+    """
+    size = float(np.median(np.linalg.norm(field_b, axis=1)))
+    heading = np.radians(np.arange(0.0, 360.0, 5.0))
+    level = np.column_stack([0.5 * np.cos(heading), -0.5 * np.sin(heading), np.full(72, 0.866)])
+    reading = size * level @ after.soft_iron.T + after.hard_iron_gauss
+    seen = (reading - before.hard_iron_gauss) @ np.linalg.inv(before.soft_iron).T
+    error = np.arctan2(-seen[:, 1], seen[:, 0]) - heading
+    wrapped = (error + np.pi) % (2 * np.pi) - np.pi
+    return float(np.degrees(np.max(np.abs(wrapped))))

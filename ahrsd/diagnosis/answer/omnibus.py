@@ -1,0 +1,134 @@
+"""Is there anything at all?  Tests of the whitened innovations that need no idea of what.
+
+Each gives its statistic and its probability under the null (Gaussian, white, variance 1), which
+`tests/diagnosis/answer/test_omnibus.py` checks to be uniform on simulated nulls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ahrsd.diagnosis.calibration_fit.noise_fit import FLOOR_MAG_GAUSS
+from ahrsd.diagnosis.innovation_filter.innovation import Filtered
+from ahrsd.diagnosis.innovation_filter.probabilities import chi2_above, chi2_below, kolmogorov_above
+from ahrsd.diagnosis.values import Context
+from ahrsd.samples import Array
+
+#: mean square of the innovations below which an assumed noise is not there; two of the three axes
+#: have the gyro's: 2 / 3 where the magnetometer has none
+_QUIETER = 0.8
+LAGS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Test:
+    """One test.  expected: the statistic's mean under the null."""
+
+    __test__ = False  # not one of pytest's
+
+    name: str
+    value: float
+    expected: float
+    p_value: float
+    words: str
+
+
+def omnibus(done: Filtered, context: Context | None = None) -> tuple[Test, ...]:
+    """All tests; those of the variance only with a context.
+
+    Empty below 100 innovations, where an axis does not vary at all, and where the magnetometer has
+    less noise than is assumed at least: then what is assumed along the field is not there, and the
+    tests would say only that.
+    """
+    rows = done.whitened[done.used]
+    if len(rows) < 100 or np.any(np.std(rows, axis=0) < 1e-9):
+        return ()
+    assumed = done.model.sigma_mag_gauss <= FLOOR_MAG_GAUSS
+    if assumed and np.mean(rows**2) < _QUIETER:
+        return ()
+    out = [_level(rows), _ljung_box(done), _periodogram(done), _normal(rows)]
+    if context is not None:
+        out.append(variance_test(done, drivers(context)))
+    return tuple(out)
+
+
+def _level(rows: Array) -> Test:
+    """Normalised innovation squared; 1 by construction where the noise was estimated."""
+    total, freedom = float(np.sum(rows**2)), rows.size
+    tail = min(chi2_above(total, freedom), chi2_below(total, freedom))
+    return Test("normalised_innovation", total / freedom, 1.0, float(min(1.0, 2 * tail)), "level")
+
+
+def _ljung_box(done: Filtered) -> Test:
+    """Autocorrelation to lag 20 of the three axes together; rows without a reading count as 0."""
+    rows = np.where(done.used[:, None], done.whitened, 0.0)
+    count = int(np.count_nonzero(done.used))
+    power = np.sum(rows**2, axis=0)
+    q = 0.0
+    for lag in range(1, LAGS + 1):
+        rho = np.sum(rows[lag:] * rows[:-lag], axis=0) / power
+        q += float(np.sum(rho**2)) * count * (count + 2) / (count - lag)
+    freedom = 3 * LAGS
+    return Test("ljung_box", q, freedom, chi2_above(q, freedom), "whiteness over time")
+
+
+def _periodogram(done: Filtered) -> Test:
+    """Bartlett's test: largest distance of the cumulative periodogram from the diagonal."""
+    rows = np.where(done.used[:, None], done.whitened, 0.0)
+    power = np.abs(np.fft.rfft(rows - rows.mean(axis=0), axis=0))[1:-1] ** 2
+    share = np.cumsum(power, axis=0) / np.sum(power, axis=0)
+    count = len(share)
+    straight = np.arange(1, count + 1)[:, None] / count
+    distance = float(np.max(np.abs(share - straight))) * np.sqrt(count)
+    p_value = min(1.0, 3 * kolmogorov_above(distance))
+    return Test("cumulative_periodogram", distance, 0.87, p_value, "whiteness over frequency")
+
+
+def _normal(rows: Array) -> Test:
+    """Jarque-Bera of the three axes together, each by its own mean and deviation."""
+    z = (rows - rows.mean(axis=0)) / rows.std(axis=0)
+    skewness = np.mean(z**3, axis=0)
+    kurtosis = np.mean(z**4, axis=0) - 3
+    value = float(len(rows) * np.sum(skewness**2 / 6 + kurtosis**2 / 24))
+    return Test("normality", value, 6.0, chi2_above(value, 6), "tails and skewness")
+
+
+def drivers(context: Context) -> dict[str, Array]:
+    """What the variance may follow: turn, change of the field, time, and the covariates."""
+    out = {
+        "rate": np.linalg.norm(context.rate_b_rad_s, axis=1),
+        "field_change": np.sum(context.field_dot_b**2, axis=1),
+        "time": context.track.time_s,
+    }
+    if context.track.accel_b_m_s2 is not None:
+        out["acceleration"] = np.linalg.norm(context.track.accel_b_m_s2, axis=1)
+    out.update(context.track.covariates)
+    return out
+
+
+def variance_test(done: Filtered, columns: Mapping[str, Array]) -> Test:
+    """Do the squares of the innovations follow any column?  Koenker's n R^2, any tails.
+
+    words: which column most.
+    """
+    square = np.sum(done.whitened[done.used] ** 2, axis=1)
+    names, kept = [], []
+    for name, values in columns.items():
+        mine = values[done.used]
+        if np.isfinite(mine).all() and np.std(mine) > 1e-9 * (np.abs(mine).max() + 1e-300):
+            names.append(name)
+            kept.append((mine - mine.mean()) / mine.std())
+    if not kept:
+        return Test("variance", 0.0, 0.0, 1.0, "no column to follow")
+    X = np.column_stack(kept)
+    y = square - square.mean()
+    solution, _, rank, _ = np.linalg.lstsq(X, y, rcond=1e-8)
+    left = y - X @ solution
+    value = float(len(y) * (1.0 - (left @ left) / (y @ y)))
+    alone = np.abs(X.T @ y)
+    p_value = chi2_above(value, int(rank))
+    most = names[int(np.argmax(alone))]
+    return Test("variance", value, float(rank), p_value, f"scatter, most with {most}")

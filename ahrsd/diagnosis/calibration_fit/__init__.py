@@ -1,0 +1,1 @@
+"""The calibration and the noise that explain a recording best, whatever the effects."""

@@ -1,0 +1,150 @@
+"""What a search works on: the recording averaged to a working rate, and what is known of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ahrsd.diagnosis.calibration_fit.coning import with_delta_angles
+from ahrsd.diagnosis.calibration_fit.delay import earlier, of_magnetometer, without_lag
+from ahrsd.diagnosis.calibration_fit.null import cold_start
+from ahrsd.diagnosis.calibration_fit.shaken import carrying, quieter
+from ahrsd.diagnosis.calibration_fit.thin import thinned, working_factor
+from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.limits import Limits
+from ahrsd.diagnosis.track import NothingToFit, Spec, Track
+from ahrsd.diagnosis.values import NullModel
+from ahrsd.samples import Array
+
+BLOCKS = 80
+BLOCK_S = (2.0, 10.0)
+#: samples per working row from which the gyro's noise is taken from the recorded rate
+OVERSAMPLED = 5
+MEAN_RATES = (
+    "the gyro's values are means of the rate: how its axis turned within a step (coning) is put in"
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """What is asked: the track, what is known of the sensor, the library, the thresholds.
+
+    recorded: the track as it was recorded;  thin, cold: what made the working `track` from it, a
+              cold start or a better calibration
+    lag_s:    lag of the magnetometer that is already taken out of the track
+    instants: the gyro's values are rates at instants: half of a step of that lag is theirs
+    riding:   (recorded rows, 3) gauss that ride with the sensor beyond the hard iron, as far as is
+              known, without that lag: they are averaged and not turned; None for none
+    averaged: readings of the magnetometer in a working row that has any: less than `thin` where it
+              is read more seldom than the gyro
+    notes:    what a person should know of how the rates were read
+    unread_s: spans, from and to, whose readings are left out: something was moved there
+    """
+
+    track: Track
+    spec: Spec
+    library: Mapping[str, Effect]
+    limits: Limits
+    recorded: Track
+    thin: int
+    cold: NullModel
+    lag_s: float = 0.0
+    averaged: float = 1.0
+    notes: tuple[str, ...] = ()
+    riding: Array | None = None
+    instants: bool = False
+    unread_s: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def rate_hz(self) -> float:
+        """Rows per second."""
+        return 1.0 / float(np.nanmedian(self.track.dt_s))
+
+    @property
+    def block_s(self) -> float:
+        """Length of the Gram's blocks: about 80, longer than correlated noise where possible."""
+        return float(np.clip(self.track.duration_s / BLOCKS, *BLOCK_S))
+
+    def lagging(self, lag_s: float) -> Problem:
+        """The same with a lag of the magnetometer taken out."""
+        riding = self.riding
+        if riding is not None and of_magnetometer(self.recorded, lag_s):
+            riding = earlier(self.recorded, riding, lag_s)
+        moved = without_lag(self.recorded, lag_s, instants=self.instants)
+        track = thinned(moved, self.thin, self.cold, riding)
+        return replace(self, track=track, lag_s=lag_s)
+
+    def beside(self, riding: Array, model: NullModel) -> Problem:
+        """The same, what rides with the sensor beyond the model's hard iron told of."""
+        cold = replace(self.cold, hard_iron_gauss=model.hard_iron_gauss, soft_iron=model.soft_iron)
+        return replace(self, riding=riding, cold=cold).lagging(self.lag_s)
+
+    def averaged_beside(self, riding: Array, model: NullModel, lag_s: float) -> Problem:
+        """The same with another lag, averaged by a better calibration.
+
+        riding: (working rows, 3) gauss that ride with the sensor beyond the model's hard iron
+        """
+        if self.thin == 1:
+            return self if lag_s == self.lag_s else self.lagging(lag_s)
+        at_s, time_s = self.track.time_s, self.recorded.time_s
+        drawn = np.column_stack([np.interp(time_s, at_s, column) for column in riding.T])
+        if of_magnetometer(self.recorded, lag_s):
+            drawn = earlier(self.recorded, drawn, -lag_s)
+        return replace(self, riding=drawn, cold=model).lagging(lag_s)
+
+
+def problem_of(
+    track: Track, spec: Spec, library: Mapping[str, Effect], limits: Limits
+) -> tuple[Problem, NullModel]:
+    """The recording at working rate, and a calibration to start from."""
+    cold = cold_start(track, spec)
+    told = with_delta_angles(track, cold)
+    notes = () if told is track else (MEAN_RATES,)
+    track = told
+    m = working_factor(track, carrying(track, cold))
+    work = thinned(track, m, cold)
+    if not _readings(work):
+        raise NothingToFit("no whole reading of the magnetometer is left: all are stuck or missing")
+    averaged = _readings(track) / _readings(work)
+    start = replace(
+        cold,
+        sigma_mag_gauss=cold.sigma_mag_gauss / float(np.sqrt(averaged)),
+        sigma_gyro_rad_s=cold.sigma_gyro_rad_s / float(np.sqrt(m)),
+    )
+    known = noise_of_thinned(spec, averaged, m)
+    if (found := quieter(track, work, known, start)) is not None:
+        known, start = found
+    elif m >= OVERSAMPLED and spec.sigma_gyro_rad_s is None:
+        # the gyro's differences at the working rate would be its motion
+        known = replace(known, sigma_gyro_rad_s=start.sigma_gyro_rad_s)
+    made = Problem(work, known, library, limits, track, m, cold, averaged=averaged, notes=notes)
+    return made, start
+
+
+def noise_of_thinned(spec: Spec, mag: float, gyro: float) -> Spec:
+    """What is known of the noise, for averages of so many samples."""
+
+    def of_mean(sigma: float | None, count: float) -> float | None:
+        return None if sigma is None else sigma / float(np.sqrt(count))
+
+    return replace(
+        spec,
+        sigma_mag_gauss=of_mean(spec.sigma_mag_gauss, mag),
+        sigma_gyro_rad_s=of_mean(spec.sigma_gyro_rad_s, gyro),
+        shaken_gyro_rad_s=of_mean(spec.shaken_gyro_rad_s, gyro),
+    )
+
+
+def model_at_rate(model: NullModel, problem: Problem) -> NullModel:
+    """A model of the working rows as one of single samples."""
+    return replace(
+        model,
+        sigma_mag_gauss=model.sigma_mag_gauss * float(np.sqrt(problem.averaged)),
+        sigma_gyro_rad_s=model.sigma_gyro_rad_s * float(np.sqrt(problem.thin)),
+    )
+
+
+def _readings(track: Track) -> int:
+    return int(np.count_nonzero(np.isfinite(track.mag_b_gauss).all(axis=1)))

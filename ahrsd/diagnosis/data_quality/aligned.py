@@ -1,0 +1,164 @@
+"""A recording beside a simulation that somebody brought: the common time, and what only one has.
+
+The two are the same motion if their rates agree, so the rates align them: the shift at which the
+two gyros correlate most, or where their axes differ the magnitudes.  A simulation contains what its
+author put in; an effect that both have to the same size is no difference, one that only the
+recording has was left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding
+from ahrsd.diagnosis.track import Track
+from ahrsd.samples import Array
+
+LONGEST_SHIFT_S = 5.0
+LEAST_OVERLAP_S = 20.0
+LEAST_CORRELATION = 0.8  # of the two gyros' magnitudes; another motion is far below
+SAME_SIGMAS = 4.0  # parameters that differ by less are the same effect
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Overlap:
+    """Both over their common time, and sentences on how they were brought together."""
+
+    real: Track
+    simulated: Track
+    notes: tuple[str, ...]
+
+
+def align(real: Track, simulated: Track) -> Overlap:
+    """The common time of both.  ValueError where there is none, or where the motions differ."""
+    shift_s, correlation = _shift(real, simulated)
+    begin = max(real.time_s[0], simulated.time_s[0] - shift_s)
+    end = min(real.time_s[-1], simulated.time_s[-1] - shift_s)
+    if end - begin < LEAST_OVERLAP_S:
+        raise ValueError(
+            f"overlaps the recording by {max(end - begin, 0.0):.1f} s only: it covers "
+            f"{simulated.time_s[0]:.1f} to {simulated.time_s[-1]:.1f} s, the recording "
+            f"{real.time_s[0]:.1f} to {real.time_s[-1]:.1f} s"
+        )
+    if correlation < LEAST_CORRELATION:
+        raise ValueError(
+            f"is another motion: its rates correlate with the recording's by {correlation:.2f} "
+            f"at best, {LEAST_CORRELATION} is needed"
+        )
+    notes = [f"compared over {end - begin:.1f} s, from {begin:.1f} to {end:.1f} s"]
+    if abs(shift_s) > 0.5 * _step_s(real):
+        notes.append(f"the simulation was moved by {shift_s:+.3f} s to match the recording's rates")
+    moved = replace(simulated, time_s=simulated.time_s - shift_s)
+    return Overlap(cut(real, begin, end), cut(moved, begin, end), tuple(notes))
+
+
+def _step_s(track: Track) -> float:
+    return float(np.nanmedian(track.dt_s))
+
+
+def _shift(real: Track, simulated: Track) -> tuple[float, float]:
+    """Shift in s of the simulation's clock against the recording's, and the correlation there."""
+    step = max(_step_s(real), _step_s(simulated))
+    reach = round(LONGEST_SHIFT_S / step)
+    begin = max(real.time_s[0], simulated.time_s[0])
+    end = min(real.time_s[-1], simulated.time_s[-1])
+    if end - begin < LEAST_OVERLAP_S:
+        return 0.0, 1.0  # said by the caller
+    grid = np.arange(begin, end, step)
+    a, b = (_rates(track, grid) for track in (real, simulated))
+    reach = min(reach, len(grid) // 4)
+    found = _best(a, b, reach)
+    if found[1] < LEAST_CORRELATION:  # perhaps one has its axes swapped
+        found = max(found, _best(_size(a), _size(b), reach), key=lambda one: one[1])
+    return found[0] * step, found[1]
+
+
+def _best(a: Array, b: Array, reach: int) -> tuple[int, float]:
+    """Lag in rows of b (N, k) behind a, within reach, and the correlation of the two there."""
+    best = (0, -1.0)
+    for lag in range(-reach, reach + 1):
+        x = a[max(0, -lag) : len(a) - max(0, lag)]
+        y = b[max(0, lag) : len(b) - max(0, -lag)]
+        x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+        power = float(np.sum(x * x) * np.sum(y * y))
+        if power > 0.0:
+            best = max(best, (lag, float(np.sum(x * y)) / power**0.5), key=lambda one: one[1])
+    return best
+
+
+def _rates(track: Track, grid_s: Array) -> Array:
+    axes = [np.interp(grid_s, track.time_s, values) for values in track.gyro_b_rad_s.T]
+    return np.stack(axes, axis=1)
+
+
+def _size(rates: Array) -> Array:
+    """(N, 1) magnitudes, the bias taken off as the median."""
+    return np.asarray(np.linalg.norm(rates - np.median(rates, axis=0), axis=1))[:, None]
+
+
+def cut(track: Track, begin_s: float, end_s: float) -> Track:
+    """The rows between two times."""
+    rows = slice(
+        int(np.searchsorted(track.time_s, begin_s, "left")),
+        int(np.searchsorted(track.time_s, end_s, "right")),
+    )
+    dt_s = track.dt_s[rows].copy()
+    dt_s[:1] = np.nan
+    starts = [*np.flatnonzero(np.isnan(dt_s)).tolist(), len(dt_s)]
+    return Track(
+        track.time_s[rows],
+        dt_s,
+        track.mag_b_gauss[rows],
+        track.gyro_b_rad_s[rows],
+        None if track.accel_b_m_s2 is None else track.accel_b_m_s2[rows],
+        {name: values[rows] for name, values in track.covariates.items()},
+        tuple(slice(a, b) for a, b in pairwise(starts)),
+    )
+
+
+def differing(real: Diagnosis, simulated: Diagnosis) -> Diagnosis:
+    """The recording's diagnosis without what the simulation has as well, to the same size."""
+    kept: list[Finding] = []
+    notes: list[str] = []
+    has = {finding.effect: finding for finding in simulated.findings}
+    for finding in real.findings:
+        twin = has.get(finding.effect)
+        if twin is not None and _same(finding, twin):
+            notes.append(f"{finding.effect} is in the simulation already, to the same size")
+        else:
+            kept.append(finding)
+    only = [effect for effect in has if effect not in {one.effect for one in real.findings}]
+    notes += [f"the simulation has {effect}, the recording does not show it" for effect in only]
+    notes += _calibration_notes(real, simulated)
+    mismatch = bool(kept) or real.unexplained.detected or bool(only)
+    return replace(real, findings=tuple(kept), mismatch=mismatch, notes=(*real.notes, *notes))
+
+
+def _same(one: Finding, other: Finding) -> bool:
+    values = {value.name: value for value in other.parameters}
+    for value in one.parameters:
+        twin = values.get(value.name)
+        if twin is None:
+            return False
+        sigma = float(np.hypot(value.std, twin.std))
+        if not abs(value.value - twin.value) <= SAME_SIGMAS * max(sigma, 1e-12):
+            return False
+    return True
+
+
+def _calibration_notes(real: Diagnosis, simulated: Diagnosis) -> list[str]:
+    """Numbers of the calibration in which the two differ: no physics, but worth knowing."""
+    if real.model is None or simulated.model is None:
+        return []
+    hard = real.model.hard_iron_gauss - simulated.model.hard_iron_gauss
+    bias = real.model.gyro_bias_rad_s - simulated.model.gyro_bias_rad_s
+    return [
+        "calibration of the recording less that of the simulation: hard iron "
+        + ", ".join(f"{v * 1e3:+.2f}" for v in hard)
+        + " mG, gyro bias "
+        + ", ".join(f"{v * 1e3:+.3f}" for v in bias)
+        + " mrad/s"
+    ]

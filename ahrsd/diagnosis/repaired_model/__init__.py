@@ -1,0 +1,1 @@
+"""The repaired model: as a file, and forward, into and out of readings."""

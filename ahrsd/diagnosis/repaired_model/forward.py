@@ -1,0 +1,207 @@
+"""The forward model: what magnetometer and gyro would have read along a recording's own motion.
+
+    truth_along(context)      the motion, made consistent: a body that turns in a constant field
+    simulated(truth, ...)     readings of it: calibration, named terms, noise, gaps as recorded
+
+The motion is the context's attitude, turned by what brings its smoothed field (over DRIFT_S) to one
+direction of the world: headings are the recording's, each step turns the field exactly as the true
+rate says.  What the gyro's noise did to that attitude counts as motion: a body may shake.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd import so3
+from ahrsd.diagnosis.effects import series
+from ahrsd.diagnosis.effects.base import Effect, Readings, readings_of
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.innovation_filter.context import Given, build_context
+from ahrsd.diagnosis.innovation_filter.innovation import Filtered, bearings
+from ahrsd.diagnosis.innovation_filter.noise import colour_of
+from ahrsd.diagnosis.innovation_filter.recursive import autoregression, both_ways
+from ahrsd.diagnosis.track import Track
+from ahrsd.diagnosis.values import Context, Noise, NullModel, Term
+from ahrsd.samples import Array
+
+DRIFT_S = 3.0  # shorter follows the field, longer the gyro; a gyro sampled at 10 Hz needs 3 s
+_RESPONSE = 4000  # rows after which a colour has died away
+
+
+def noise_of(model: NullModel, filtered: Filtered | None = None) -> Noise:
+    """The model's noise; with a filter run, the colour that its innovations still have.
+
+    Where the filter remembers more than a sample or two its innovations are nearly the
+    magnetometer's noise, so their colour is given to that.
+    """
+    colour = () if filtered is None else tuple(colour_of(filtered).coefficients.tolist())
+    return Noise(
+        model.sigma_mag_gauss, model.sigma_gyro_rad_s, model.gyro_walk_rad_s_sqrt_s, colour
+    )
+
+
+def context_along(
+    track: Track,
+    model: NullModel,
+    terms: Sequence[Term] = (),
+    library: Mapping[str, Effect] = EFFECTS,
+) -> Context:
+    """The track as a model sees it that was fitted before, its terms taken out; nothing is fitted.
+
+    Twice: the terms' contributions need a context, which is better without the terms.
+    Raises ValueError where a term needs a covariate that the track has not.
+    """
+    for term in terms:
+        missing = term.setting.get("covariate")
+        if missing not in (None, "accel", *track.covariates):
+            raise ValueError(f"{term.identifier} needs the column {missing}")
+    context = build_context(track, Given(bearings(track, model)))
+    added = [term for term in terms if library[term.identifier].kind == "mean"]
+    if not added:
+        return context
+    mag, gyro = contribution(context, added, library)
+    return build_context(track, Given(bearings(track, model, mag, gyro), gyro))
+
+
+def contribution(
+    context: Context, terms: Sequence[Term], library: Mapping[str, Effect] = EFFECTS
+) -> tuple[Array, Array]:
+    """What terms of those values add to the magnetometer and the gyro, exactly: (N, 3) each.
+
+    For effects that keep the number of rows, that is all but dropped samples.
+    """
+    clean = readings_of(context)
+    made = simulated(clean, terms, library=library)
+    return made.mag_b_gauss - clean.mag_b_gauss, made.gyro_b_rad_s - clean.gyro_b_rad_s
+
+
+def truth_along(context: Context) -> Readings:
+    """Noise-free readings of the recording's motion, without any term.
+
+    field_b has a constant size, and h_k = Exp(-w_k dt_k) h_(k-1) holds exactly within runs.
+    """
+    start, model = readings_of(context), context.model
+    size = float(np.mean(np.linalg.norm(start.field_b, axis=1)))
+    seen = np.einsum("nij,nj->ni", start.R_nb, start.field_b)
+    direction = seen.mean(axis=0) / np.linalg.norm(seen.mean(axis=0))
+    R_nb, rate = start.R_nb.copy(), start.rate_b_rad_s.copy()
+    for run in series.runs(start.dt_s):
+        slow = _both_ways(seen[run], DRIFT_S, start.time_s[run])
+        R_nb[run] = _smallest_turn(slow, direction) @ start.R_nb[run]
+        rate[run] = _mean_rate(R_nb[run], start.time_s[run], rate[run])
+    field_b = size * np.einsum("nji,j->ni", R_nb, direction)
+    return replace(
+        start,
+        R_nb=R_nb,
+        rate_b_rad_s=rate,
+        field_b=field_b,
+        mag_b_gauss=field_b @ model.soft_iron.T + model.hard_iron_gauss,
+        gyro_b_rad_s=rate + model.gyro_bias_rad_s,
+    )
+
+
+def simulated(
+    truth: Readings,
+    terms: Sequence[Term] = (),
+    noise: Noise | None = None,
+    seed: int = 0,
+    library: Mapping[str, Effect] = EFFECTS,
+) -> Readings:
+    """Readings of a truth with terms and noise on them; the same seed gives the same readings.
+
+    Effects on the finished reading come behind the noise, those of all that a sensor measures
+    behind the others.  KeyError for an unknown effect.
+    """
+    named = [(library[term.identifier], term) for term in terms]
+    named.sort(key=lambda one: one[0].of_whole)
+    readings = truth
+    for effect, term in named:
+        if not effect.after_noise:
+            readings = effect.simulate(readings, term.value, term.setting)
+    if noise is not None:
+        readings = _noisy(readings, noise, seed)
+    for effect, term in named:
+        if effect.after_noise:
+            readings = effect.simulate(readings, term.value, term.setting)
+    return readings
+
+
+def track_of(readings: Readings, like: Track | None = None) -> Track:
+    """The readings as a track; covariates of `like` that no effect knows are kept."""
+    accel = readings.accel_b_m_s2 if np.isfinite(readings.accel_b_m_s2).all() else None
+    same = like is not None and len(like) == len(readings.time_s)
+    others = like.covariates if like is not None and same else {}
+    return Track(
+        time_s=readings.time_s,
+        dt_s=readings.dt_s,
+        mag_b_gauss=readings.mag_b_gauss,
+        gyro_b_rad_s=readings.gyro_b_rad_s,
+        accel_b_m_s2=accel,
+        covariates={**others, **readings.covariates},
+        runs=tuple(series.runs(readings.dt_s)),
+    )
+
+
+def _mean_rate(R_nb: Array, time_s: Array, otherwise: Array) -> Array:
+    """Mean rate (N, 3) over the steps of one run; its first row repeats the second."""
+    if len(R_nb) < 2:
+        return otherwise
+    turned = so3.log(np.swapaxes(R_nb[:-1], 1, 2) @ R_nb[1:])
+    rate = turned / np.diff(time_s)[:, None]
+    return np.vstack([rate[:1], rate])
+
+
+def _both_ways(values: Array, width_s: float, time_s: Array) -> Array:
+    """Smoothed (N, 3) by exp(-|t| / width), without the pull of the ends towards zero."""
+    if len(values) < 2:
+        return values
+    keep = np.exp(-float(np.median(np.diff(time_s))) / width_s)
+    stacked = np.column_stack([values, np.ones(len(values))])
+    total = both_ways(stacked, keep)
+    return np.asarray(total[:, :3] / total[:, 3:])
+
+
+def _smallest_turn(vectors: Array, onto: Array) -> Array:
+    """The smallest rotations (N, 3, 3) that turn each of the vectors (N, 3) onto one direction."""
+    size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit = np.where(size > 0.0, vectors / np.where(size > 0.0, size, 1.0), onto)
+    axis = np.cross(unit, onto)
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, unit @ onto)
+    scale = np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 1.0)
+    return so3.exp(axis * scale[:, None])
+
+
+def _noisy(readings: Readings, noise: Noise, seed: int) -> Readings:
+    """Noise of that colour on the magnetometer, white noise and a walking bias on the gyro."""
+    shape = readings.mag_b_gauss.shape
+    mag, gyro, walk = (
+        np.random.default_rng([seed, stream]).standard_normal(shape) for stream in range(3)
+    )
+    if np.isfinite(noise.freedom):
+        square = np.random.default_rng([seed, 3]).chisquare(noise.freedom, shape)
+        mag = mag * np.sqrt((noise.freedom - 2) / square)
+    mag = _coloured(mag, noise.colour)
+    if noise.level is not None:
+        mag = mag * noise.level[:, None]
+    passed = np.sqrt(np.concatenate([[0.0], np.diff(readings.time_s)]))[:, None]
+    bias = noise.gyro_walk_rad_s_sqrt_s * np.cumsum(passed * walk, axis=0)
+    return replace(
+        readings,
+        mag_b_gauss=readings.mag_b_gauss + noise.mag_gauss * mag,
+        gyro_b_rad_s=readings.gyro_b_rad_s + noise.gyro_rad_s * gyro + bias,
+    )
+
+
+def _coloured(white: Array, colour: tuple[float, ...]) -> Array:
+    """White noise (N, 3) of variance 1 with a colour, its variance 1 again."""
+    if not colour:
+        return white
+    taps = np.array(colour)[:, None]
+    response = autoregression(np.eye(_RESPONSE, 1), taps)
+    # a stretch before the first row, so that the noise is settled there
+    ahead = np.vstack([white[:_RESPONSE][::-1], white])
+    return autoregression(ahead, taps)[-len(white) :] / float(np.linalg.norm(response))

@@ -1,0 +1,1 @@
+"""Where, when and under which conditions readings and model differ."""

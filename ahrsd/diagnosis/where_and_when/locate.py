@@ -1,0 +1,179 @@
+"""Where readings and model differ, without a name for it: three frames, segment by segment.
+
+    sensor   a field that rides with the vehicle         D = e_i 1[segment]
+    world    a field that stays outside and turns with R D = A R_nb^T e_i 1[segment]
+    gyro     an error of the rate                        W = e_i 1[segment]
+
+A singular value decomposition of a frame's segments x axes says whether one source with one
+direction is enough, and gives that source's course in time, to be compared with what was logged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd.diagnosis.track import Track
+from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.samples import Array
+
+Frame = Literal["sensor", "world", "gyro"]
+FRAMES: tuple[Frame, ...] = ("sensor", "world", "gyro")
+
+SEGMENT_S = 20.0
+SEGMENTS = (6, 24)
+#: of a recording's stretches one in so many is its beginning
+FIRST_SHARE = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Segments:
+    """A recording cut in J stretches.  edges_s: (J + 1,);  index: (N,) the stretch of a sample."""
+
+    edges_s: Array
+    index: NDArray[np.intp]
+
+    def __len__(self) -> int:
+        return len(self.edges_s) - 1
+
+    @property
+    def length_s(self) -> float:
+        """Mean length of a stretch."""
+        return float(self.edges_s[-1] - self.edges_s[0]) / max(len(self), 1)
+
+    @property
+    def middle_s(self) -> Array:
+        """(J,) middle times."""
+        return np.asarray((self.edges_s[1:] + self.edges_s[:-1]) / 2)
+
+
+def segments(time_s: Array, count: int) -> Segments:
+    """`count` stretches of equal length."""
+    return segments_between(time_s, np.linspace(time_s[0], time_s[-1], count + 1))
+
+
+def coarse_cut(track: Track) -> Segments:
+    """Stretches of about 20 s, shorter and longer on short and long recordings."""
+    count = int(np.clip(round(track.duration_s / SEGMENT_S), *SEGMENTS))
+    return segments(track.time_s, count)
+
+
+def segments_between(time_s: Array, edges_s: Array) -> Segments:
+    """Stretches between the given edges; samples outside belong to none (index -1)."""
+    index = np.searchsorted(edges_s, time_s, side="right") - 1
+    index[time_s == edges_s[-1]] = len(edges_s) - 2
+    index[index >= len(edges_s) - 1] = -1
+    return Segments(np.asarray(edges_s, float), index)
+
+
+def frame_columns(context: Context, frame: Frame, cut: Segments) -> Columns:
+    """3 columns per segment, segment-major."""
+    basis = unit_columns(context, frame)
+    out = np.zeros((len(cut.index), 3, len(cut), 3))
+    inside = np.flatnonzero(cut.index >= 0)
+    out[inside, :, cut.index[inside], :] = basis[inside]
+    flat = out.reshape(len(cut.index), 3, -1)
+    return Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
+
+
+def unit_columns(context: Context, frame: Frame) -> Array:
+    """(N, 3, 3) what a source of one unit along each axis of the frame adds, gauss or rad/s."""
+    if frame == "world":
+        return np.asarray(context.model.soft_iron @ np.swapaxes(context.R_nb, 1, 2))
+    return np.broadcast_to(np.eye(3), (len(context.track), 3, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Located:
+    """What one frame's segments say.
+
+    evidence: log Bayes factor, nats;  statistic, rank, p_value: the score test
+    course:   (J, 3) posterior mean of the coefficients, gauss or rad/s, of zero weighted mean
+    deviation: (J,) of a coefficient
+    direction: (3,) unit vector of the strongest single source;  single_share: how much it covers
+    """
+
+    frame: Frame
+    evidence: float
+    statistic: float
+    rank: int
+    p_value: float
+    cut: Segments
+    course: Array
+    deviation: Array
+    direction: Array
+    single_share: float
+
+    @property
+    def source(self) -> Array:
+        """(J,) the single source's course in time."""
+        return np.asarray(self.course @ self.direction)
+
+
+def single_source(course: Array, deviation: Array) -> tuple[Array, float]:
+    """Unit vector (3,) along which a course (J, 3) moves most, and the share of what moves there.
+
+    It points to where the course goes from its beginning: what runs later is seldom on at first.
+    """
+    weight = 1.0 / np.maximum(deviation, 1e-12)
+    centred = (course - np.average(course, axis=0, weights=weight**2)) * weight[:, None]
+    _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
+    power = sizes**2
+    along = course @ axes[0]
+    first = max(1, len(along) // FIRST_SHARE)
+    later = np.average(along, weights=weight**2) - np.average(
+        along[:first], weights=weight[:first] ** 2
+    )
+    direction = axes[0] * np.copysign(1.0, later)
+    return np.asarray(direction), float(power[0] / max(power.sum(), 1e-300))
+
+
+def course_of(track: Track, covariate: Array, cut: Segments) -> Array:
+    """(J,) mean of a logged column over each segment; nan where it has no value."""
+    out = np.full(len(cut), np.nan)
+    for j in range(len(cut)):
+        values = covariate[cut.index == j]
+        if np.isfinite(values).any():
+            out[j] = float(np.nanmean(values))
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """A logged channel that moves with a recovered course: correlation and how rare that is."""
+
+    channel: str
+    correlation: float
+    p_value: float
+
+
+def matches(track: Track, located: Located) -> tuple[Match, ...]:
+    """Logged channels by how well they follow the recovered course, best first.
+
+    The p-value is the share of circular shifts of the channel that follow it at least as well.
+    """
+    found = []
+    for channel, values in track.covariates.items():
+        logged = course_of(track, values, located.cut)
+        known = np.isfinite(logged)
+        if known.sum() < 6 or np.ptp(logged[known]) == 0:
+            continue
+        weight = known / np.maximum(located.deviation, 1e-12) ** 2
+        filled = np.where(known, logged, 0.0)
+        size = [
+            abs(_correlation(np.roll(filled, k), located.source, weight))
+            for k in range(len(filled))
+        ]
+        p_value = float(np.mean(np.asarray(size) >= size[0]))
+        found.append(Match(channel, _correlation(filled, located.source, weight), p_value))
+    return tuple(sorted(found, key=lambda match: -abs(match.correlation)))
+
+
+def _correlation(a: Array, b: Array, weight: Array) -> float:
+    a = a - np.average(a, weights=weight)
+    b = b - np.average(b, weights=weight)
+    power = np.sum(weight * a * a) * np.sum(weight * b * b)
+    return float(np.sum(weight * a * b) / np.sqrt(power)) if power > 0 else 0.0

@@ -1,0 +1,82 @@
+"""Under which conditions: residual field by heading, tilt, rate and every logged column.
+
+Each quantity is cut into bins with equally many samples; a field in sensor axes per bin is one
+group of columns.  What follows the heading but not the time is a misfit of the calibration's form;
+what follows a logged column is a hint at that column.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd.diagnosis.columns.shown import shown
+from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.samples import Array
+
+BINS = {"heading_deg": 12}
+OTHER_BINS = 6
+#: log of the relevant quantity must move at least this much to be binned
+MINIMUM_RANGE = {"heading_deg": 60.0, "pitch_deg": 10.0, "roll_deg": 10.0, "rate_rad_s": 0.05}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regime:
+    """One binned quantity: its (bins + 1,) edges and the bin (N,) of every sample, -1 for none."""
+
+    quantity: str
+    edges: Array
+    index: NDArray[np.intp]
+
+    @property
+    def group(self) -> str:
+        """Its group in a Gram."""
+        return f"regime {self.quantity}"
+
+    def words(self, inside: NDArray[np.bool]) -> str:
+        """The bins that are inside, as text: `heading_deg 200 to 260`."""
+        padded = np.concatenate([[False], inside, [False]]).astype(int)
+        starts, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)
+        parts = [
+            f"{self.edges[a]:.3g} to {self.edges[b]:.3g}" for a, b in zip(starts, ends, strict=True)
+        ]
+        return f"{shown(self.quantity)} {', '.join(parts)}" if parts else ""
+
+
+def regimes(context: Context) -> tuple[Regime, ...]:
+    """Attitude (where the world is levelled), rate and logged columns that move."""
+    R = context.R_nb
+    quantities = {"rate_rad_s": np.linalg.norm(context.rate_b_rad_s, axis=1)}
+    quantities["heading_deg"] = np.degrees(context.heading_rad) % 360.0
+    if context.world_levelled:
+        quantities["pitch_deg"] = np.degrees(-np.arcsin(np.clip(R[:, 2, 0], -1.0, 1.0)))
+        quantities["roll_deg"] = np.degrees(np.arctan2(R[:, 2, 1], R[:, 2, 2]))
+    found = [_binned(name, values) for name, values in quantities.items()]
+    for name, values in context.track.covariates.items():
+        if np.isfinite(values).mean() > 0.5:
+            found.append(_binned(name, values))
+    return tuple(regime for regime in found if regime is not None)
+
+
+def regime_columns(regime: Regime) -> Columns:
+    """3 columns per bin, bin-major: a field in sensor axes."""
+    bins = len(regime.edges) - 1
+    out = np.zeros((len(regime.index), 3, bins, 3))
+    inside = np.flatnonzero(regime.index >= 0)
+    out[inside, :, regime.index[inside], :] = np.eye(3)
+    return Columns(mag=out.reshape(len(regime.index), 3, -1))
+
+
+def _binned(name: str, values: Array) -> Regime | None:
+    known = np.isfinite(values)
+    span = float(np.ptp(values[known])) if known.any() else 0.0
+    if span <= MINIMUM_RANGE.get(name, 0.0):
+        return None
+    count = BINS.get(name, OTHER_BINS)
+    edges = np.unique(np.quantile(values[known], np.linspace(0.0, 1.0, count + 1)))
+    if len(edges) < 3:
+        return None
+    index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+    return Regime(name, edges, np.where(known, index, -1))

@@ -1,0 +1,116 @@
+"""What is told beside a gyro that is louder than the magnetometer is beyond chance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracks import experiment, track_of, true_model
+
+from ahrsd.diagnosis.answer.chance import (
+    Answered,
+    bent,
+    beyond_chance,
+    copy_of,
+    loudness,
+    motion_of,
+)
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Unexplained, Where
+from ahrsd.diagnosis.answer.spoken import verdict
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.limits import LIMITS
+from ahrsd.diagnosis.repaired_model.forward import noise_of
+from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.simulation import Experiment
+
+STEP_GAUSS = np.array([1.6e-3, -1.2e-3, 0.0])
+
+
+def _made(sigma_mag: float, sigma_gyro: float, scenario: str = "wam", seed: int = 0) -> Experiment:
+    return experiment(
+        scenario,
+        motion="slow",
+        seed=seed,
+        samples=3000,
+        sigma_mag=sigma_mag,
+        sigma_gyro=sigma_gyro,
+    )
+
+
+def _stepped() -> tuple[Track, Callable[[float], Answered]]:
+    """A track with a step, and an answer that tells something unknown in it of so many nats."""
+    track = track_of(_made(1e-4, 5e-2))
+    since = (np.arange(len(track)) >= 1500)[:, None]
+    track = replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS)
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    start = fit_null(problem.track, problem.spec, cold)
+    where = Where(((60.0, 120.0),), ("x", "y"), "sensor")
+
+    def answered(nats: float) -> Answered:
+        left = Unexplained(True, where, evidence_nats=nats)
+        return Answered(Diagnosis("step.csv", None, True, 1e-9, (), left, {}), problem, start)
+
+    return track, answered
+
+
+def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> None:
+    """How much of such chance makes is then not known either."""
+    track, answered = _stepped()
+
+    def ask(asked: Track) -> Answered:
+        if asked is not track:
+            raise np.linalg.LinAlgError("Eigenvalues did not converge")
+        return answered(2000.0)
+
+    found = beyond_chance(track, ask)
+    assert not found.unexplained.detected
+    assert verdict(found) == (
+        "nothing can be told: a simulation of the model alone with this noise cannot be diagnosed"
+    )
+
+
+@pytest.mark.parametrize(("nats", "is_told"), [(30.0, False), (2000.0, True)])
+def test_what_simulations_show_is_said_beside_what_is_told(nats: float, is_told: bool) -> None:
+    """Four times what they show may be chance."""
+    track, answered = _stepped()
+    found = beyond_chance(track, lambda asked: answered(nats if asked is track else 12.0))
+    assert found.unexplained.detected == is_told
+    (note,) = found.notes[:1]
+    beside = "" if is_told else ", and nothing is told"
+    assert note.endswith(f" up to 12 nats of such; up to 48 nats may be chance{beside}")
+
+
+@pytest.mark.parametrize(
+    ("sigma_mag", "sigma_gyro", "ratio"), [(1e-3, 5e-3, 0.1), (1e-4, 5e-2, 10.0)]
+)
+def test_how_loud_a_gyro_is(sigma_mag: float, sigma_gyro: float, ratio: float) -> None:
+    """Of half a gauss, 25 times a second: 50 mrad/s turn it by 1 mG."""
+    made = _made(sigma_mag, sigma_gyro)
+    assert loudness(track_of(made), true_model(made)) == pytest.approx(ratio, rel=0.1)
+
+
+@pytest.mark.parametrize(("scenario", "is_bent"), [("lam", True), ("wam", False), ("mam", False)])
+def test_the_noise_bends_a_calibration_that_the_motion_hardly_shows(
+    scenario: str, is_bent: bool
+) -> None:
+    """Slow turns with a tilt of a few degrees; the same noise beside larger ones moves nothing."""
+    problem, cold = problem_of(track_of(_made(1e-3, 5e-3, scenario, 2)), Spec(), EFFECTS, LIMITS)
+    moved = bent(fit_null(problem.track, problem.spec, cold, walk=False))
+    assert moved == pytest.approx(0.62, abs=0.1) if is_bent else moved < 0.1
+
+
+def test_a_copy_has_the_motion_the_noise_and_the_stamps() -> None:
+    made = _made(1e-4, 5e-2)
+    track, model = track_of(made), true_model(made)
+    truth = motion_of(track, model)
+    clean = track_of(_made(0.0, 0.0)).gyro_b_rad_s
+    assert np.std(truth.gyro_b_rad_s - clean) < 0.1 * 5e-2
+    one = copy_of(track, truth, noise_of(model), seed=3)
+    assert np.array_equal(one.time_s, track.time_s)
+    assert np.std(one.gyro_b_rad_s - truth.gyro_b_rad_s) == pytest.approx(5e-2, rel=0.03)
+    assert np.std(one.mag_b_gauss - truth.mag_b_gauss) == pytest.approx(1e-4, rel=0.03)
+    assert np.array_equal(one.mag_b_gauss, copy_of(track, truth, noise_of(model), 3).mag_b_gauss)

@@ -1,0 +1,156 @@
+"""Roles of columns: by name and unit; what cannot be used is refused with a sentence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ahrsd.diagnosis.columns import roles
+from ahrsd.diagnosis.track import Track
+
+RAMP = np.linspace(1.0, 5.0, 200)
+BITS = (np.arange(200) % 40 < 20).astype(float)
+PULSES = (np.arange(200) % 40 < 1).astype(float)
+
+
+def track(rows=200, **columns):
+    time_s = np.arange(rows) / 10.0
+    dt_s = np.concatenate([[np.nan], np.diff(time_s)])
+    zero = np.zeros((rows, 3))
+    return Track(time_s, dt_s, zero, zero, None, columns, (slice(0, rows),))
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        ("motor_current_a", "current"),
+        ("thruster_2_a", "current"),
+        ("temperature_c", "temperature"),
+        ("imu_temp_c", "temperature"),
+        ("rudder_angle_rad", "angle"),
+        ("joint_3_rad", "angle"),
+        ("pan_deg", "angle"),
+        ("position_down_m", "position"),
+        ("speed_m_s", "speed"),
+        ("motor_1_rpm", "rpm"),
+        ("altitude_m", "altitude"),
+        ("depth_m", "altitude"),
+        ("pressure_kpa", "pressure"),
+        ("throttle", "throttle"),
+        ("battery_v", "voltage"),
+        ("latitude_deg", "latitude"),
+        ("vn_yaw_deg", None),
+        ("ref_qw", None),
+        ("movement", None),
+        ("hdop", None),
+    ],
+)
+def test_a_name_gives_the_role(name, role):
+    assert roles.role_of(name, RAMP) == role
+
+
+def test_two_valued_columns_are_switches_or_pulses():
+    assert roles.role_of("x1", BITS) == "switch"
+    assert roles.role_of("x1", PULSES) == "ping"
+    assert roles.role_of("x1", 0 * BITS) is None
+    assert roles.role_of("sonar_ping", BITS) == "ping"
+    assert roles.role_of("lamp", BITS) == "switch"
+
+
+def test_the_reference_is_zero_or_the_mean():
+    assert roles.reference("current", RAMP) == 0.0
+    assert roles.reference("temperature", RAMP) == pytest.approx(3.0)
+
+
+def test_usable_columns_are_named_in_order():
+    columns = {"b_a": RAMP, "a_a": RAMP, "temperature_c": 0 * RAMP, "x_a": RAMP * np.nan}
+    assert roles.named(columns, "current") == ("b_a", "a_a")
+    assert roles.named(columns, "temperature") == ()
+
+
+def test_short_holes_are_filled():
+    holed = RAMP.copy()
+    holed[50:65] = np.nan
+    found, notes = roles.prepared(track(motor_current_a=holed))
+    assert notes == ()
+    assert found.covariates["motor_current_a"] == pytest.approx(RAMP)
+
+
+def test_a_slow_logger_is_filled_and_a_switch_holds_its_value():
+    slow, bits = np.full(200, np.nan), np.full(200, np.nan)
+    slow[::10], bits[::10] = RAMP[::10], BITS[::10]
+    found, notes = roles.prepared(track(temperature_c=slow, lamp_on=bits))
+    assert notes == ()
+    assert found.covariates["temperature_c"][:191] == pytest.approx(RAMP[:191])
+    assert set(np.unique(found.covariates["lamp_on"])) == {0.0, 1.0}
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "said"),
+    [
+        ("motor_current_a", np.where(np.arange(200) < 80, RAMP, np.nan), "no values from 7.9 to"),
+        ("motor_current_a", np.full(200, np.nan), "100% of its values are missing"),
+        ("motor_current_a", RAMP * 0 + 3, "it is 3 throughout, so nothing follows it"),
+        ("motor_current_a", RAMP * 1000, "it looks like milliampere"),
+        ("temperature_c", RAMP + 295, "it looks like kelvin"),
+        ("rudder_angle_rad", RAMP * 40, "looks like degrees"),
+        ("lamp_on", RAMP, "it looks like no 0/1"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_a_sentence(name, values, said):
+    found, (note,) = roles.prepared(track(**{name: values, "depth_m": RAMP}))
+    assert said in note
+    assert note.startswith(f"column {name} was left out: ")
+    assert list(found.covariates) == ["depth_m"]
+
+
+def test_a_hole_of_the_samples_themselves_is_none_of_the_column():
+    base = track(motor_current_a=RAMP)
+    time_s = base.time_s + np.where(np.arange(200) >= 100, 30.0, 0.0)
+    values = RAMP.copy()
+    values[20] = np.nan
+    moved = Track(time_s, base.dt_s, base.mag_b_gauss, base.gyro_b_rad_s, None, {"x_a": values})
+    found, notes = roles.prepared(moved)
+    assert notes == ()
+    assert found.covariates["x_a"] == pytest.approx(RAMP)
+
+
+def test_columns_without_a_role_are_kept():
+    found, notes = roles.prepared(track(hdop=RAMP))
+    assert list(found.covariates) == ["hdop"]
+    assert notes == ()
+
+
+def test_a_reference_attitude_is_no_cause() -> None:
+    """What it adds to a recording must not change what is said of the sensor."""
+    found, notes = roles.prepared(track(ref_qw=RAMP, ref_qz=RAMP, hdop=RAMP))
+    assert list(found.covariates) == ["hdop"]
+    assert notes == ()
+
+
+def test_what_the_sensor_makes_of_its_own_readings_is_no_cause():
+    own = {"vn_yaw_deg": RAMP, "dcm_01": RAMP, "mag_n_d_gauss": RAMP, "pitch_rad": RAMP}
+    own |= {"yaw": RAMP, "roll_rate_rad_s": RAMP, "yaw_angle_deg": RAMP}
+    found, notes = roles.prepared(track(**own, linkage_m=RAMP))
+    assert list(found.covariates) == ["linkage_m"]
+    assert notes == ()
+
+
+@pytest.mark.parametrize("name", ["yaw_motor_current_a", "pitch_servo_a", "gyro_temperature_c"])
+def test_a_cause_may_be_named_after_what_it_turns_or_warms(name):
+    found, notes = roles.prepared(track(**{name: RAMP}))
+    assert list(found.covariates) == [name]
+    assert notes == ()
+
+
+@given(
+    st.text(max_size=12),
+    st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=5, max_size=5),
+)
+def test_no_column_is_kept_that_is_not_finite(name, values):
+    found, notes = roles.prepared(track(5, **{f"x{name}": np.array(values)}))
+    assert all(np.isfinite(column).all() for column in found.covariates.values())
+    if not np.isfinite(values).all() and np.isfinite(values).any():
+        assert len(found.covariates) + len(notes) == 1

@@ -1,0 +1,55 @@
+"""Tracks of a sensor that stands still, and of one that is turned and shaken by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd import so3
+from ahrsd.diagnosis.track import Track
+
+#: of what stands
+COUNT, RATE_HZ = 6000, 10.0
+#: of what is shaken
+SIGMA_MAG, SIGMA_GYRO = 6e-4, 1e-3
+
+
+def standing(bias: np.ndarray, warmth: np.ndarray | None = None, seed: int = 4) -> Track:
+    """Ten minutes at rest; bias (N, 3) rad/s."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(COUNT) / RATE_HZ
+    dt_s = np.full(COUNT, 1 / RATE_HZ)
+    dt_s[0] = np.nan
+    mag = np.array([0.2, 0.05, 0.4]) + rng.normal(0.0, 1e-3, (COUNT, 3))
+    gyro = bias + rng.normal(0.0, 1.5e-4, (COUNT, 3))
+    accel = np.array([0.0, 0.0, -9.81]) + rng.normal(0.0, 0.01, (COUNT, 3))
+    covariates = {} if warmth is None else {"temperature_c": warmth}
+    return Track(time_s, dt_s, mag, gyro, accel, covariates, (slice(0, COUNT),))
+
+
+def warming() -> np.ndarray:
+    passed = np.arange(COUNT) / RATE_HZ
+    return 8.0 + 7.0 * (1 - np.exp(-passed / 200.0)) + 1.5 * np.sin(passed / 60.0)
+
+
+def shaking(seed: int, *, jitter_rad_s: float = 0.05) -> Track:
+    """Five minutes of turning by hand, which trembles in three of four spells of six seconds."""
+    rng = np.random.default_rng(seed)
+    count, rate_hz = 12_000, 40.0
+    time_s = np.arange(count) / rate_hz
+    slow = np.cumsum(rng.normal(size=(count // 40 + 2, 3)), axis=0)
+    slow = 0.5 * (slow - slow.mean(axis=0)) / slow.std(axis=0)
+    knots = np.arange(len(slow)) * 40 / rate_hz
+    rate = np.column_stack([np.interp(time_s, knots, one) for one in slow.T])
+    on = np.repeat(rng.random(count // 240) < 0.75, 240)
+    rate += jitter_rad_s * on[:, None] * rng.normal(size=(count, 3))
+    turn = so3.exp(rate / rate_hz)
+    field_b = np.empty((count, 3))
+    R_nb = np.eye(3)
+    for k in range(count):
+        R_nb = R_nb @ turn[k]
+        field_b[k] = R_nb.T @ [0.2, 0.05, 0.45]
+    A = np.array([[1.03, 0.02, -0.01], [0.02, 0.96, 0.01], [-0.01, 0.01, 1.01]])
+    mag = field_b @ A + [0.05, -0.08, 0.03] + SIGMA_MAG * rng.normal(size=(count, 3))
+    gyro = rate + [2e-3, -1e-3, 1.5e-3] + SIGMA_GYRO * rng.normal(size=(count, 3))
+    dt_s = np.r_[np.nan, np.diff(time_s)]
+    return Track(time_s, dt_s, mag, gyro, None, {}, (slice(0, count),))

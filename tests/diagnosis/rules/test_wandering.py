@@ -1,0 +1,178 @@
+"""A gyro's bias that walks more than an ordinary one's has a name; a course that does not, none."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.diagnosis.limits import LIMITS
+from ahrsd.diagnosis.rules import wandering as walks
+from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.rules.search import State
+from ahrsd.diagnosis.rules.wandering import went_and_came
+
+
+@pytest.fixture(scope="module")
+def track():
+    return made(Trial(seed=11, samples=7500, rate_hz=25.0, scenario="wam", noise="white")).track
+
+
+def test_a_bias_that_walks_a_lot_is_named_and_leaves_nothing(track):
+    steps = np.random.default_rng(3).normal(size=(len(track), 3)) * np.sqrt(0.04)
+    walked = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + 4e-5 * np.cumsum(steps, axis=0))
+    found = diagnose(walked)
+    assert [one.effect for one in found.findings] == ["gyro_bias_drift"]
+    assert not found.unexplained.detected
+
+
+@pytest.mark.parametrize(
+    ("seed", "size"),
+    [
+        # the few modes of the name explain a tenth of what the filter gains by walking as much
+        (19, 1.2e-5),
+        # where the filter walks as an ordinary bias does, what is left of it looks like no walk
+        (21, 2.6e-5),
+    ],
+)
+def test_a_walk_that_the_names_few_modes_hardly_show_is_named_too(track, seed, size):
+    steps = np.random.default_rng(seed).normal(size=(len(track), 3)) * np.sqrt(0.04)
+    walked = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + size * np.cumsum(steps, axis=0))
+    found = diagnose(walked)
+    assert [one.effect for one in found.findings] == ["gyro_bias_drift"]
+    assert not found.unexplained.detected
+
+
+@pytest.mark.parametrize(("size", "asked"), [(2e-6, False), (2e-5, True), (1e-2, False)])
+def test_a_walk_is_asked_for_that_a_gyro_can_have(monkeypatch, size, asked):
+    """A room that a real recording cannot explain looks like a walk of ten mrad/s a root second."""
+    fitted_walks = []
+
+    def refit(state, named):
+        fitted_walks.append(state.walk)
+        raise LookupError
+
+    monkeypatch.setattr(walks, "_size", lambda *_: size)
+    monkeypatch.setattr(walks, "refitted", refit)
+    monkeypatch.setattr(walks.unknown, "detected", lambda *_: True)
+    located = {"gyro": SimpleNamespace(evidence=90.0), "sensor": SimpleNamespace(evidence=1.0)}
+    state = State(SimpleNamespace(limits=LIMITS), None)
+    found = SimpleNamespace(state=state, before=state, left=SimpleNamespace(located=located))
+    with pytest.raises(LookupError) if asked else nullcontext():
+        assert walks.wandering(found) is found
+    assert fitted_walks == ([size] if asked else [])
+
+
+@pytest.mark.slow
+def test_a_bias_that_swings_is_no_walk(track):
+    swing = 6e-4 * np.sin(2 * np.pi * track.time_s / 37.0)[:, None] * np.array([1.0, -0.5, 0.7])
+    found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + swing))
+    assert "gyro_bias_drift" not in [one.effect for one in found.findings]
+    assert found.unexplained.detected
+    assert found.unexplained.where.frame == "gyro"
+
+
+@pytest.mark.slow
+def test_a_step_and_a_start_up_are_no_walk(track):
+    """Both explain in three numbers what a walk needs all its freedom for."""
+    onset_s = 0.4 * (track.time_s[0] + track.time_s[-1])
+    jump = np.where(track.time_s > onset_s, 1.0, 0.0)[:, None] * np.array([4e-4, -3e-4, 2e-4])
+    found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + jump))
+    assert [one.effect for one in found.findings] == ["gyro_bias_step"]
+    assert found.findings[0].where.intervals_s[0][0] == pytest.approx(onset_s, abs=3.0)
+    warm = np.exp(-(track.time_s - track.time_s[0]) / 30.0)[:, None] * np.array([9e-4, 6e-4, -6e-4])
+    found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + warm))
+    assert [one.effect for one in found.findings] == ["gyro_startup"]
+
+
+def test_a_small_start_up_that_a_walk_follows_less_well_has_its_name(track):
+    """5.7 nats before the modes of a walk, 21 before the filter's own: less was noise once."""
+    warm = np.exp(-(track.time_s - track.time_s[0]) / 120.0)[:, None]
+    cold = 3e-4 * np.array([0.6, 0.5, -0.62])
+    found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + warm * cold))
+    assert [one.effect for one in found.findings] == ["gyro_startup"]
+    assert not found.unexplained.detected
+
+
+def test_an_ordinary_walk_has_no_cause(track):
+    steps = np.random.default_rng(4).normal(size=(len(track), 3)) * np.sqrt(0.04)
+    walked = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + 5e-6 * np.cumsum(steps, axis=0))
+    assert {one.effect for one in diagnose(walked).findings} <= {"gyro_bias_drift"}
+
+
+@pytest.mark.slow
+def test_what_is_small_beside_a_bias_that_walks_is_named_too(track):
+    steps = np.random.default_rng(3).normal(size=(len(track), 3)) * np.sqrt(0.04)
+    scaled = track.gyro_b_rad_s * np.array([1.004, 0.997, 1.005])
+    walked = replace(track, gyro_b_rad_s=scaled + 4e-5 * np.cumsum(steps, axis=0))
+    found = diagnose(walked)
+    assert {one.effect for one in found.findings} == {"gyro_bias_drift", "gyro_scale"}
+    assert all(one.confidence > 0.5 for one in found.findings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 4])
+def test_what_a_large_walk_hides_is_named_beside_it(seed):
+    """Iron that a walk of 1e-4 hides: once nothing but a course, or a height and the earth's turn.
+
+    What is left without the walk shows in the sensor, not in the gyro.
+    """
+    trial = Trial(seed=11, samples=7500, rate_hz=25.0, scenario="wam", noise="white")
+    iron = made(replace(trial, effects=(("soft_iron_step", 1.0),))).track
+    steps = np.random.default_rng(seed).normal(size=(len(iron), 3)) * np.sqrt(0.04)
+    walked = replace(iron, gyro_b_rad_s=iron.gyro_b_rad_s + 1e-4 * np.cumsum(steps, axis=0))
+    found = diagnose(walked)
+    assert {one.effect for one in found.findings} == {"gyro_bias_drift", "soft_iron_step"}
+    assert not found.unexplained.detected
+
+
+@pytest.mark.parametrize(
+    ("gained", "named", "there", "likelier"),
+    [
+        # 5040 nats in noise of 20 times white, 246 there, for a course of 175 (e215aba9)
+        (5040.0, True, True, True),
+        (20.0 * (175.0 + LIMITS.lead_nats) - 1.0, True, True, False),
+        (20.0 * (175.0 + LIMITS.lead_nats) + 1.0, True, True, True),
+        # where nothing is left there is no course to be likelier than
+        (20.0 * LIMITS.lead_nats + 1.0, True, False, True),
+        (20.0 * LIMITS.lead_nats - 1.0, True, False, False),
+        # a walk with nothing beside it is asked where the gyro has what is left
+        (5040.0, False, True, False),
+    ],
+)
+def test_a_walk_and_what_it_hides_are_likelier_than_a_course(
+    monkeypatch, gained, named, there, likelier
+):
+    of = {"beside": gained, "found": 0.0}
+    monkeypatch.setattr(walks, "likelihood", lambda state: of[state.which])
+    monkeypatch.setattr(walks.unknown, "detected", lambda *_: there)
+    problem = SimpleNamespace(limits=LIMITS)
+    beside = SimpleNamespace(which="beside", problem=problem, named=("iron",) if named else ())
+    left = SimpleNamespace(
+        strongest=SimpleNamespace(evidence=175.0), basis=SimpleNamespace(colour=20.0)
+    )
+    found = SimpleNamespace(state=SimpleNamespace(which="found"), left=left)
+    assert walks._likelier(beside, found) is likelier
+
+
+def fitted(log_likelihood: float, *steps: tuple[float, float, float]):
+    """What the comparison asks of a state with these steps of the gyro's bias."""
+    used = np.ones(100, dtype=bool)
+    filtered = SimpleNamespace(normalised_innovation=1.0, used=used)
+    terms = [SimpleNamespace(value=np.array(one)) for one in steps]
+    fit = SimpleNamespace(log_likelihood=log_likelihood, filtered=filtered, terms=terms)
+    return SimpleNamespace(names=("gyro_bias_step",) * len(steps), fit=fit)
+
+
+def test_a_bias_that_jumped_and_jumped_back_did_not_walk():
+    """Two steps that cancel, likelier than any walk by more than their eight numbers cost."""
+    there, back = (4e-4, -1.0e-3, -3.1e-3), (-4e-4, 1.1e-3, 3.1e-3)
+    walk = fitted(43492.0)
+    assert went_and_came(fitted(43576.7, there, back), walk)
+    assert not went_and_came(fitted(43500.0, there, back), walk)
+    assert not went_and_came(fitted(43576.7, there, there), walk)
+    assert not went_and_came(fitted(43576.7, there), walk)
