@@ -102,8 +102,9 @@ def onsets(readings: Readings) -> tuple[Setting, ...]:
 
 
 def since(readings: Readings, setting: Setting) -> Array:
-    """1 from the onset on, 0 before, (N, 1)."""
-    return np.where(readings.time_s >= setting["onset_s"], 1.0, 0.0)[:, None]
+    """1 from the onset on, until the end where there is one (`end_s`), else 0, (N, 1)."""
+    ended = readings.time_s >= setting.get("end_s", np.inf)
+    return np.where((readings.time_s >= setting["onset_s"]) & ~ended, 1.0, 0.0)[:, None]
 
 
 def middle_s(readings: Readings) -> float:

@@ -50,6 +50,10 @@ class Law(Protocol):
         """Log density of psi and its gradient (k,)."""
 
 
+#: of a setting, s: from when and until when something is there
+MOMENTS = ("onset_s", "end_s")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Component:
     """One part of the model.
@@ -82,6 +86,12 @@ class Component:
     def jumps(self) -> bool:
         """Whether it is one vector from a moment on."""
         return self.row is not None and self.row.jumps
+
+    @property
+    def moments_s(self) -> tuple[float, ...]:
+        """When it begins, and ends where its setting says so, s."""
+        times_s = (self.setting.get(name) for name in MOMENTS)
+        return tuple(float(one) for one in times_s if one is not None)
 
     @property
     def width(self) -> int:

@@ -7,6 +7,7 @@ course is as sure, or where a part of the ordinary remainder is beyond its 95 %.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
@@ -36,7 +37,13 @@ from ahrsd.diagnosis.one_model.effect_components import (
     plain_delay,
 )
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
-from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, beside
+from ahrsd.diagnosis.one_model.model_search import (
+    Hypotheses,
+    Hypothesis,
+    Space,
+    beside,
+    come_and_gone,
+)
 from ahrsd.diagnosis.one_model.near_settings import changed, opened
 from ahrsd.diagnosis.one_model.remainder import still_spells
 from ahrsd.diagnosis.values import Term
@@ -76,6 +83,7 @@ def decided(
     """The answer of a search."""
     best = _with_one_part(all_sets, space, best)
     best = _with_heading(all_sets, space, best)
+    best = _come_and_gone(all_sets, space, best)
     best, rivals = _borne_out(all_sets, space, best)
     best, rivals = _beside_others(all_sets, space, best, rivals)
     best, rivals = _held_to_form(all_sets, space, best, rivals)
@@ -162,9 +170,13 @@ def _jumping(
 ) -> tuple[tuple[str, ...], Unexplained]:
     """A source that goes in steps: its levels between the changes, along its direction."""
     keys = [key for key in sorted(best.names) if all_sets.component(key).effect == kind]
-    keys.sort(key=lambda key: float(all_sets.component(key).setting["onset_s"]))
-    changes = np.array([coefficients(all_sets, best, key)[0] for key in keys])
-    onsets = [float(all_sets.component(key).setting["onset_s"]) for key in keys]
+    moments = sorted(
+        (time_s, way, key)
+        for key in keys
+        for time_s, way in zip(all_sets.component(key).moments_s, (1.0, -1.0), strict=False)
+    )
+    changes = np.array([way * coefficients(all_sets, best, key)[0] for _, way, key in moments])
+    onsets = [time_s for time_s, _, _ in moments]
     time_s = all_sets.made.context.track.time_s
     at = np.linspace(time_s[0], time_s[-1], _PIECES)
     levels = np.vstack([np.zeros(3), np.cumsum(changes, axis=0)])
@@ -191,9 +203,48 @@ def _borne_out(
         odds = {key: best.score - rival.score for key, rival in rivals.items()}
         unsure = [key for key in own if odds[key] < asked[key]]
         if not unsure:
-            return best, rivals
+            fewer = _without_one_moment(all_sets, best, asked)
+            if fewer is best:
+                return best, rivals
+            best = fewer
+            continue
         key = min(unsure, key=lambda one: odds[one])
         best = _without(all_sets, space, best, key)
+
+
+def _come_and_gone(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+    """The set with one vector that comes and goes where further steps are not worth being told.
+
+    Each step more has to be worth what a name has to.
+    """
+    asked = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.NAME_ODDS
+    while True:
+        fewer = [
+            all_sets.judge(names, best) for names in come_and_gone(all_sets, space, best.names)
+        ]
+        likeliest = max((best, *fewer), key=lambda one: one.score - asked * len(one.names))
+        if likeliest is best:
+            return best
+        best = likeliest
+
+
+def _without_one_moment(
+    all_sets: Hypotheses, best: Hypothesis, asked: Mapping[str, float]
+) -> Hypothesis:
+    """The set without names of one moment that are not worth together what each has to be.
+
+    Steps of the field and of the iron at a moment undo each other: with one of them left out what
+    the other does is seen, and each looks sure.
+    """
+    moments = {key: all_sets.component(key).moments_s for key in asked}
+    for first, last in itertools.combinations(sorted(key for key in asked if moments[key]), 2):
+        apart_s = np.abs(np.subtract.outer(moments[first], moments[last]))
+        if np.min(apart_s) > priors.APPROACH_S:
+            continue
+        fewer = all_sets.judge(best.names - {first, last}, best)
+        if best.score - fewer.score < asked[first] + asked[last]:
+            return fewer
+    return best
 
 
 def _with_one_part(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
@@ -323,7 +374,7 @@ def _is_place(all_sets: Hypotheses, key: str) -> bool:
     spells = still_spells(recorded.time_s, recorded.gyro_b_rad_s)
     if not spells or one.frame != "world":
         return False
-    off = np.abs(np.array(spells) - float(one.setting["onset_s"]))
+    off = np.abs(np.ravel(spells)[:, None] - one.moments_s)
     return bool(np.min(off) < 2.0 * priors.TRANSITION_S)
 
 

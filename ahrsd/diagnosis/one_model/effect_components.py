@@ -12,7 +12,7 @@ import numpy as np
 from ahrsd.diagnosis.calibration_fit.delay import beyond_the_lag
 from ahrsd.diagnosis.effects.base import ANGLES, SCALES, Effect, Setting
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
+from ahrsd.diagnosis.one_model.component import MOMENTS, Component, Fixed, Sized
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.diagnosis.where_and_when.locate import Frame, unit_columns
 from ahrsd.samples import Array
@@ -182,11 +182,11 @@ def neighbours(setting: Setting, duration_s: float, round_: int) -> list[Setting
     """The setting with its onset a little earlier and later, and its scale less and more."""
     out: list[Setting] = []
     share = _FINE[min(round_, len(_FINE) - 1)]
-    if setting.get("onset_s"):
-        onset = float(setting["onset_s"])
-        steps = (-2, -1, 1, 2)
-        moved = [onset + k * share * duration_s / 2 for k in steps]
-        out += [{**setting, "onset_s": t} for t in moved if t > 0.0]
+    for name in MOMENTS:
+        if setting.get(name):
+            steps = (-2, -1, 1, 2)
+            moved = [float(setting[name]) + k * share * duration_s / 2 for k in steps]
+            out += [{**setting, name: t} for t in moved if t > 0.0]
     if "late_s" in setting:
         late_s, step_s = float(setting["late_s"]), LATE_STEP_S / 2 ** (1 + round_)
         out += [{**setting, "late_s": round(late_s + way * step_s, 4)} for way in (-1, 1)]
@@ -234,14 +234,30 @@ def _changes(around: list[Array | None]) -> Array | None:
 
 
 def _way_of(known: Component, law: Sized, context: Context, frame: Frame) -> Component:
-    """Of a step: pieces of time round its onset, each along each axis of its frame."""
-    onset_s, width_s = float(known.setting["onset_s"]), 2 * priors.APPROACH_S / PIECES
-    edges = onset_s - priors.APPROACH_S + width_s * np.arange(PIECES + 1)
-    piece = np.searchsorted(edges, context.track.time_s, side="right") - 1
-    inside = (piece[:, None] == np.arange(PIECES)).astype(float)
+    """Of a step: pieces of time round its onset, and its end, each along each axis of its frame."""
+    width_s = 2 * priors.APPROACH_S / PIECES
+    inside = []
+    for moment_s in known.moments_s:
+        edges = moment_s - priors.APPROACH_S + width_s * np.arange(PIECES + 1)
+        piece = np.searchsorted(edges, context.track.time_s, side="right") - 1
+        inside.append((piece[:, None] == np.arange(PIECES)).astype(float))
     axes = unit_columns(context, frame)
-    flat = np.einsum("nk,nia->nika", inside, axes).reshape(len(piece), 3, -1)
+    flat = np.einsum("nk,nia->nika", np.hstack(inside), axes)
+    flat = flat.reshape(len(context.track), 3, -1)
     columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
     sized = Sized(np.full(columns.width, float(law.scale[0])), law.low, law.high)
-    setting = {"onset_s": onset_s}
-    return Component(f"form of {known.key}", frame, columns, sized, setting=setting)
+    moments = {name: known.setting[name] for name in MOMENTS if name in known.setting}
+    return Component(f"form of {known.key}", frame, columns, sized, setting=moments)
+
+
+def while_there(
+    begins: Component, ends: Component, context: Context, library: Mapping[str, Effect], tried: int
+) -> list[Component]:
+    """What comes with one step and goes with another, as each vector that jumps.
+
+    What was put on is taken off: one vector where two steps have one each.
+    """
+    first, last = begins.moments_s[0], ends.moments_s[-1]
+    rows = [row for row in library.values() if row.jumps]
+    made = [component(context, row, {"onset_s": first, "end_s": last}, tried) for row in rows]
+    return [one for one in made if (one.columns.mag is None) == (begins.columns.mag is None)]

@@ -34,7 +34,7 @@ def lost_beside(came: Track, found: Searched, fast: Quick, lost: Sequence[Fact])
     answers = {
         key for key in best.names
         if (one := all_sets.component(key)).jumps
-        and any(abs(float(one.setting["onset_s"]) - at) < priors.TRANSITION_S for at in begin_s)
+        and any(abs(one.moments_s[0] - at) < priors.TRANSITION_S for at in begin_s)
     }  # fmt: skip
     rest = all_sets.judge(best.names - answers, best)
     point = moved(all_sets.made, rest.keys, rest.at)

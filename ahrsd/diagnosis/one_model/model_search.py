@@ -264,6 +264,7 @@ class Space:
 
     finer: neighbours of a setting;  remembered: those in what is from before the recording
     form: what a component leaves of its form;  steps_at: of a time
+    while_there: what comes with one step and goes with another
     sources: that switch or have one direction, of which one at most is added, and none beside a
              remainder: how large they are in rooms is not measured
     """
@@ -274,6 +275,7 @@ class Space:
     remembered: Callable[[Beside, Component, int], list[Component]]
     form: Callable[[Component], Component | None]
     steps_at: Callable[[float], list[Component]]
+    while_there: Callable[[Component, Component], list[Component]]
     sources: list[str] = field(default_factory=list)
 
 
@@ -366,11 +368,40 @@ def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
     if not all_sets.is_real(names):
         out += [names - sources | {key} for key in space.sources if key not in names]
     out.append(names - rest if rest <= names else (names - sources) | rest)
+    out += come_and_gone(all_sets, space, names)
     bare = names - set(space.courses)
     for base in dict.fromkeys((names, bare)):
         ranked = asked(all_sets, space, base, here)
         out += [all_sets.with_(base, key) for key in ranked]
     return list(dict.fromkeys(out))
+
+
+def come_and_gone(all_sets: Hypotheses, space: Space, names: Names) -> list[Names]:
+    """Sets with one vector that comes and goes in place of two steps of a sensor.
+
+    With it alone at its moments as well: what other steps there took is the vector's way.
+    """
+    steps = [key for key in names if _steps_of(all_sets, key)]
+    steps = [key for key in steps if len(all_sets.component(key).moments_s) == 1]
+    steps.sort(key=lambda key: (all_sets.component(key).moments_s, key))
+    out = []
+    for first, last in itertools.combinations(steps, 2):
+        begins, ends = all_sets.component(first), all_sets.component(last)
+        apart_s = ends.moments_s[0] - begins.moments_s[0]
+        if _steps_of(all_sets, first) != _steps_of(all_sets, last) or apart_s < priors.TRANSITION_S:
+            continue
+        found = space.while_there(begins, ends)
+        all_sets.made.add(found)
+        at_s = (*begins.moments_s, *ends.moments_s)
+        near = {key for key in steps if _begins_near(all_sets.component(key), at_s)}
+        for gone in dict.fromkeys((frozenset({first, last}), frozenset(near))):
+            out += [names - gone | {_formed(all_sets, space, one.key)} for one in found]
+    return out
+
+
+def _begins_near(one: Component, moments_s: Sequence[float]) -> bool:
+    """Whether it begins within a hand's time of one of these moments."""
+    return any(abs(one.moments_s[0] - at) <= priors.APPROACH_S for at in moments_s)
 
 
 def _propose_steps(all_sets: Hypotheses, space: Space, here: Hypothesis) -> None:
@@ -455,15 +486,12 @@ def _steps_of(all_sets: Hypotheses, key: str) -> str:
 def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
     """Whether a set has the same effect so near in time that the two are one."""
     one = all_sets.component(key)
-    onset_s = one.setting.get("onset_s")
-    if onset_s is None:
-        return False
     others = [all_sets.component(other) for other in base]
     return any(
-        other.effect == one.effect
-        and abs(float(other.setting["onset_s"]) - float(onset_s)) < priors.TRANSITION_S
+        other.effect == one.effect and abs(there_s - here_s) < priors.TRANSITION_S
         for other in others
-        if "onset_s" in other.setting
+        for there_s in other.moments_s
+        for here_s in one.moments_s
     )
 
 
@@ -486,9 +514,14 @@ def sought(
         first = max(total, key=lambda one: total[one])
         if total[first] > worth:
             key, worth = first, total[first]
+    return _formed(all_sets, space, key)
+
+
+def _formed(all_sets: Hypotheses, space: Space, key: str) -> str:
+    """A candidate, known to the sets with what it leaves of its form."""
     form = space.form(all_sets.component(key))
     if form is not None and key not in all_sets.forms:
-        made.add([form])
+        all_sets.made.add([form])
         all_sets.forms[key] = form.key
     listed = space.effects[all_sets.component(key).effect or ""]
     if key not in listed:

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.diagnosis.effects.base import ANGLES, SCALES, Setting
-from ahrsd.diagnosis.one_model.component import Component, Fixed
+from ahrsd.diagnosis.one_model.component import MOMENTS, Component, Fixed
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
@@ -29,9 +29,10 @@ _FAR = 25.0
 def changed(one: Component, context: Context) -> dict[str, Setting]:
     """The setting with each of its numbers changed a little."""
     setting, out = one.setting, dict[str, Setting]()
-    if setting.get("onset_s") is not None:
-        onset_s = float(setting["onset_s"]) + _ONSET * context.track.duration_s
-        out["onset_s"] = {**setting, "onset_s": onset_s}
+    for name in MOMENTS:
+        if setting.get(name) is not None:
+            at_s = float(setting[name]) + _ONSET * context.track.duration_s
+            out[name] = {**setting, name: at_s}
     for name in SCALES:
         if name in setting:
             out[name] = {**setting, name: float(setting[name]) * (1.0 + _SCALE)}

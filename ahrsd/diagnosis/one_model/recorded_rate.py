@@ -118,7 +118,9 @@ def _searched_in(
     step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN
     noise = rich.fitted(fast, (CALIBRATION,), step).log_noise
     all_sets = Hypotheses(fast, (), noise, {}, real=real)
-    space = Space(candidates, (), lambda *_: [], lambda *_: [], lambda _: None, lambda _: [])
+    space = Space(
+        candidates, (), lambda *_: [], lambda *_: [], lambda _: None, lambda _: [], lambda *_: []
+    )
     return fast, all_sets, space, searched(all_sets, space, [frozenset(), *starts])[0]
 
 

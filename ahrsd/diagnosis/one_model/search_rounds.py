@@ -70,30 +70,31 @@ def moved_in(all_sets: Hypotheses, best: Hypothesis) -> list[tuple[float, float]
         form = all_sets.forms.get(step.key)
         if form is None or step.columns.mag is None:
             continue
-        onset_s = float(step.setting["onset_s"])
-        beside = [one for one in starting if one is not step and _is_of_way(one, onset_s)]
-        if beside:
-            edges = [onset_s, *(time_s for one in beside for time_s in _lasting(one))]
-            out.append((min(edges) - 2 * half_s, max(edges) + 2 * half_s))
-        near = read & (np.abs(track.time_s - onset_s) <= priors.APPROACH_S)
-        way = np.where(near, np.linalg.norm(_put(all_sets, best, form), axis=1) / sigma, 0.0)
-        loud = _runs(way > priors.MOVED_LEAST, way > priors.MOVED)
-        out += [(track.time_s[a] - half_s, track.time_s[b - 1] + half_s) for a, b in loud]
+        way_of = np.linalg.norm(_put(all_sets, best, form), axis=1) / sigma
+        for moment_s in step.moments_s:
+            beside = [one for one in starting if one is not step and _is_of_way(one, moment_s)]
+            if beside:
+                edges = [moment_s, *(time_s for one in beside for time_s in _lasting(one))]
+                out.append((min(edges) - 2 * half_s, max(edges) + 2 * half_s))
+            near = read & (np.abs(track.time_s - moment_s) <= priors.APPROACH_S)
+            way = np.where(near, way_of, 0.0)
+            loud = _runs(way > priors.MOVED_LEAST, way > priors.MOVED)
+            out += [(track.time_s[a] - half_s, track.time_s[b - 1] + half_s) for a, b in loud]
     at_s = track.time_s[read]
     return [(float(a), float(b)) for a, b in out if np.any((at_s >= a) & (at_s <= b))]
 
 
-def _is_of_way(one: Component, onset_s: float) -> bool:
+def _is_of_way(one: Component, moment_s: float) -> bool:
     """Whether a member begins beside a step and does not outlast what a hand does there."""
     begin, end = _lasting(one)
-    near = abs(begin - onset_s) <= priors.APPROACH_S
+    near = abs(begin - moment_s) <= priors.APPROACH_S
     return near and end - begin <= 2 * priors.APPROACH_S and one.columns.mag is not None
 
 
 def _lasting(one: Component) -> tuple[float, float]:
     """From when to when a member changes, s."""
-    begin = float(one.setting["onset_s"])
-    return begin, begin + float(one.setting.get("length_s", 0.0))
+    begin, *end = one.moments_s
+    return begin, end[0] if end else begin + float(one.setting.get("length_s", 0.0))
 
 
 def _runs(wide: NDArray[np.bool], high: NDArray[np.bool]) -> list[tuple[int, int]]:

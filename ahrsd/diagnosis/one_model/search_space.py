@@ -16,6 +16,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
     holds,
     library_components,
     neighbours,
+    while_there,
 )
 from ahrsd.diagnosis.one_model.model_search import (
     Beside,
@@ -125,5 +126,8 @@ def space_at(
         jumping = [row for row in library.values() if row.jumps]
         return [component(context, row, setting, _ONSETS) for row in jumping]
 
-    space = Space(effects, COURSES, finer, closer, left_of, steps_at)
+    def come_and_gone(begins: Component, ends: Component) -> list[Component]:
+        return while_there(begins, ends, context, library, _SOUGHT**2)
+
+    space = Space(effects, COURSES, finer, closer, left_of, steps_at, come_and_gone)
     return all_sets, space
