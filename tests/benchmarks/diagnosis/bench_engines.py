@@ -148,13 +148,13 @@ def answered(engine: str, case: Case) -> Json:
 def verdict(case: Case, record: Json) -> tuple[str, str]:
     """One word, and what was said."""
     answer = read_answer(record)
-    said = [_short(one) for one in (record["answer"] or {}).get("findings", [])]
+    said = [_short(one) for one in _findings(record)]
     said += [f"unknown in {answer.unexplained_frame}"] * answer.unexplained
     words = ", ".join(said) or (answer.failure or "nothing")
     if case.truth is not None:
         return judge(case.truth, answer).word, words
     known = case.known or Known("", unknown=False)
-    steps = [f.spans_s[0][0] for f in answer.findings if f.effect == "hard_iron_step"]
+    steps = [at for one in _findings(record) for at in _moments(one)]
     dated = [any(abs(at - t) < NEAR_S for at in steps) for t in known.onsets_s]
     there = [name in answer.names for name in known.names]
     own = {*DELAYS, *known.names, *(["hard_iron_step"] if known.onsets_s else [])}
@@ -168,9 +168,23 @@ def verdict(case: Case, record: Json) -> tuple[str, str]:
     return (("unknown" if answer.unexplained else "missed") if wrong else "right"), words
 
 
+def _findings(record: Json) -> list[Json]:
+    found: list[Json] = (record["answer"] or {}).get("findings", [])
+    return found
+
+
+def _moments(finding: Json) -> list[float]:
+    """When the hard iron steps, s: a magnet that is put on and taken off may be one finding."""
+    setting = finding.get("setting") or {}
+    told = [setting.get(name) for name in ("onset_s", "end_s")]
+    return [float(at) for at in told if at is not None and finding["effect"] == "hard_iron_step"]
+
+
 def _short(finding: Json) -> str:
-    onset = finding["setting"].get("onset_s") if finding.get("setting") else None
-    at = "" if onset is None else f" at {onset:.0f} s"
+    setting = finding.get("setting") or {}
+    onset, end = (setting.get(name) for name in ("onset_s", "end_s"))
+    until = "" if end is None else f" to {end:.0f} s"
+    at = "" if onset is None else f" at {onset:.0f} s{until}"
     return f"{finding['effect']}{at} ({finding.get('evidence_nats') or 0.0:.0f})"
 
 
