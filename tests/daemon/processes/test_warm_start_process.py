@@ -22,7 +22,8 @@ from drivers.vn100.emulator.scenarios import Setup
 
 SPEED = 8.0
 AGAIN_S = 7.0  # within it the device is read once more, which every used sample needs
-MOTION = (("static", 12.0), ("tumble", 5000.0))
+#: it stands while a slow machine starts the program: the bias is known to what standing tells
+MOTION = (("static", 60.0), ("tumble", 5000.0))
 SCENE = Setup("rov", seed=2, output="binary", rate_hz=50, baud=115200, motion=MOTION)
 
 

@@ -50,11 +50,13 @@ def test_a_fit_like_those_of_simulations_is_no_mismatch(scenario: str, seed: int
         assert check.inside_after, name
 
 
+@pytest.mark.slow
 def test_a_magnetometer_without_noise_is_like_its_simulations() -> None:
     found = diagnose(track_of(_made(0.0, 5e-3, "lam", 2)))
     assert verdict(found) == "recording and model agree"
 
 
+@pytest.mark.slow
 def test_where_no_simulation_can_be_fitted_neither_yes_nor_no_is_said(monkeypatch) -> None:
     """What was seen may be chance, and nothing says how much chance makes."""
     track = track_of(_made(1e-4, 5e-2))

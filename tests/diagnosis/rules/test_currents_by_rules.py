@@ -86,6 +86,7 @@ def _late(seed: int, shape: str, lag_s: float) -> Track:
     return replace(track_of(made), mag_b_gauss=mag, covariates={"motor_current_a": current})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "shape"), [(6, "quick square"), pytest.param(11, "square", marks=pytest.mark.slow)]
 )

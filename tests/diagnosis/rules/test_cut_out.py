@@ -46,6 +46,7 @@ def state_of(track: Track) -> State:
     return State(problem, fit, tuple(SimpleNamespace(candidate=one) for one in candidates))
 
 
+@pytest.mark.slow
 def test_a_lag_is_named_with_its_value_beside_a_magnet_that_a_hand_puts_on() -> None:
     found = diagnose(handled(LAG_S))
     steps = [one for one in found.findings if one.effect == "hard_iron_step"]

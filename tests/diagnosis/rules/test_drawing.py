@@ -36,6 +36,7 @@ def test_without_names_nothing_is_drawn_twice():
     assert found.drawn.contributions == ()
 
 
+@pytest.mark.slow
 def test_every_finding_has_its_own_course_in_its_own_unit():
     found, one = answer(("hard_iron_step", 1.0), ("gyro_scale", 1.0))
     drawn = {x.effect: found.drawn.contributions[x.term] for x in found.findings}

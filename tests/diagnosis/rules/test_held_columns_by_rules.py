@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis.rules.logged import diagnose_logged
@@ -14,6 +15,7 @@ def held(values, rows):
     return values[(np.arange(len(values)) // rows) * rows]
 
 
+@pytest.mark.slow
 def test_a_current_that_was_logged_five_times_a_second_is_one_name():
     one = made(
         Trial(seed=11, effects=(("motor_current_field", 1.0),), samples=8_000, rate_hz=RATE_HZ)
