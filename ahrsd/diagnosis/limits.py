@@ -46,9 +46,9 @@ class Limits:
                     .2 at most, real recordings next to nothing but one that never moves
     chance_fits:    simulations to which the calibration alone is fitted, for the bands in which the
                     recording's own fit has to be where nothing is told
-    chance_copies, chance_times: how many of these are diagnosed, and how many times the largest
-                    evidence that they show must be surpassed: 1 in 126 of what chance makes does
-                    (`chance`)
+    chance_copies:  how many of these are diagnosed at most
+    chance_p, chance_early_p: of what chance makes, the part that is told when all of these were
+                    asked, and when so many fewer were that the rest need not be (`chance`)
     most_terms:     rounds of naming; real recordings beyond this are another model, not a repair
     """
 
@@ -73,7 +73,8 @@ class Limits:
     chance_bent: float = 0.3
     chance_fits: int = 16
     chance_copies: int = 5
-    chance_times: float = 4.0
+    chance_p: float = 1 / 126
+    chance_early_p: float = 1e-3
     most_terms: int = 5
 
     def alone(self) -> Limits:

@@ -16,6 +16,7 @@ from ahrsd.diagnosis.answer.chance import (
     copy_of,
     loudness,
     motion_of,
+    times_beyond,
 )
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Unexplained, Where
 from ahrsd.diagnosis.answer.spoken import verdict
@@ -73,15 +74,47 @@ def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> 
     )
 
 
-@pytest.mark.parametrize(("nats", "is_told"), [(30.0, False), (2000.0, True)])
-def test_what_simulations_show_is_said_beside_what_is_told(nats: float, is_told: bool) -> None:
-    """Four times what they show may be chance."""
+@pytest.mark.parametrize(
+    ("nats", "is_told", "chance"), [(30.0, False, 48), (100.0, True, 48), (2000.0, True, 519)]
+)
+def test_what_simulations_show_is_said_beside_what_is_told(
+    nats: float, is_told: bool, chance: int
+) -> None:
+    """Four times what five of them show may be chance, or 43 times what two do."""
     track, answered = _stepped()
     found = beyond_chance(track, lambda asked: answered(nats if asked is track else 12.0))
     assert found.unexplained.detected == is_told
     (note,) = found.notes[:1]
     beside = "" if is_told else ", and nothing is told"
-    assert note.endswith(f" up to 12 nats of such; up to 48 nats may be chance{beside}")
+    assert note.endswith(f" up to 12 nats of such; up to {chance} nats may be chance{beside}")
+
+
+@pytest.mark.parametrize(
+    ("nats", "asked"), [(30.0, 1), (100.0, 5), (300.0, 3), (600.0, 2), (20000.0, 1)]
+)
+def test_what_is_far_beyond_the_first_simulations_is_asked_of_no_more(
+    nats: float, asked: int
+) -> None:
+    """1 in 1000 is 999 times the first, 43 the larger of two, 16 the largest of three."""
+    track, answered = _stepped()
+    copies = list[Track]()
+
+    def ask(one: Track) -> Answered:
+        if one is track:
+            return answered(nats)
+        copies.append(one)
+        return answered(12.0)
+
+    beyond_chance(track, ask)
+    assert len(copies) == asked
+
+
+@pytest.mark.parametrize(
+    ("copies", "chance", "times"), [(1, 1e-3, 999.0), (2, 1e-3, 43.2), (5, 1 / 126, 4.0)]
+)
+def test_times_beyond_the_largest_of_several(copies: int, chance: float, times: float) -> None:
+    """Of exponential draws: n! / ((1 + t) ... (n + t))."""
+    assert times_beyond(copies, chance) == pytest.approx(times, rel=1e-3)
 
 
 @pytest.mark.parametrize(
