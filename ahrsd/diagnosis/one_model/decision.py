@@ -310,7 +310,11 @@ def _beside_others(
 def _held_to_form(
     all_sets: Hypotheses, space: Space, best: Hypothesis, rivals: dict[str, Hypothesis]
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
-    """With a free factor for each name that stands in for something: its coefficient varies."""
+    """With a free factor for each name that stands in for something: its coefficient varies.
+
+    A factor is taken once: one that is not borne out beside the names that are left stays out.
+    """
+    taken = set[str]()
     while True:
         asked = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.FORM_ODDS
         found, made = best, all_sets.made
@@ -318,7 +322,7 @@ def _held_to_form(
             one = all_sets.component(key)
             # a quick cause's phase is summed from its column, and wanders as that errs
             wanders = one.row is not None and one.row.quick and "covariate" in one.setting
-            if wanders or not best.names.isdisjoint(form_keys(key)):
+            if wanders or not taken.isdisjoint(form_keys(key)):
                 continue
             forms = varying(one, added_by(all_sets, best, key)[0], made.context)
             made.add(forms)
@@ -329,6 +333,7 @@ def _held_to_form(
                     found = free
         if found is best:
             return best, rivals
+        taken |= found.names - best.names
         best, rivals = _borne_out(all_sets, space, found)
 
 

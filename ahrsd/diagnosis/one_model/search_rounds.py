@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,7 +57,7 @@ def moved_in(all_sets: Hypotheses, best: Hypothesis) -> list[tuple[float, float]
 
     A step has its two levels right, but a form of some pieces is not the way from one to the other:
     what it leaves is louder than all else, and other names are told for it.  Of names that begin
-    within a hand's time of each other all but the levels is the way.
+    within a hand's time of each other, and end so or stay, all but the levels is the way.
     """
     point, half_s = all_sets.made.point, priors.APPROACH_S / 2 / PIECES
     track, sigma = point.filtered.track, point.filtered.model.sigma_mag_gauss
@@ -73,8 +73,10 @@ def moved_in(all_sets: Hypotheses, best: Hypothesis) -> list[tuple[float, float]
         way_of = np.linalg.norm(_put(all_sets, best, form), axis=1) / sigma
         for moment_s in step.moments_s:
             beside = [one for one in starting if one is not step and _is_of_way(one, moment_s)]
-            if beside:
-                edges = [moment_s, *(time_s for one in beside for time_s in _lasting(one))]
+            edges = [time_s for one in beside for time_s in _lasting(one)]
+            edges += _of_same_way(step, moment_s, starting)
+            if edges:
+                edges.append(moment_s)
                 out.append((min(edges) - 2 * half_s, max(edges) + 2 * half_s))
             near = read & (np.abs(track.time_s - moment_s) <= priors.APPROACH_S)
             way = np.where(near, way_of, 0.0)
@@ -89,6 +91,18 @@ def _is_of_way(one: Component, moment_s: float) -> bool:
     begin, end = _lasting(one)
     near = abs(begin - moment_s) <= priors.APPROACH_S
     return near and end - begin <= 2 * priors.APPROACH_S and one.columns.mag is not None
+
+
+def _of_same_way(step: Component, moment_s: float, starting: Sequence[Component]) -> list[float]:
+    """When steps of the same vector as one at a moment are there: all moments are those of it."""
+    out = list[float]()
+    for one in starting:
+        if one is step or one.frame != step.frame or len(one.moments_s) != len(step.moments_s):
+            continue
+        apart_s = np.abs(np.subtract(one.moments_s, step.moments_s))
+        if one.jumps and step.jumps and np.all(apart_s <= priors.APPROACH_S):
+            out.append(min(one.moments_s, key=lambda at: abs(at - moment_s)))
+    return out
 
 
 def _lasting(one: Component) -> tuple[float, float]:
