@@ -80,6 +80,16 @@ class Columns:
         side = self.gyro if self.mag is None else self.mag
         return 0 if side is None else int(side.shape[2])
 
+    @property
+    def on_mag(self) -> bool:
+        """Whether the magnetometer's readings move."""
+        return self.mag is not None
+
+    @property
+    def on_gyro(self) -> bool:
+        """Whether the gyro's readings move."""
+        return self.gyro is not None
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Context:

@@ -8,13 +8,13 @@ variances and their slopes in its hyperparameters psi, all of which are logarith
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 
 from ahrsd.diagnosis.effects.base import Effect
-from ahrsd.diagnosis.values import Columns
+from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
 
@@ -55,6 +55,31 @@ MOMENTS = ("onset_s", "end_s")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MadeAnew:
+    """An effect's columns in a setting, which are made whenever they are asked for.
+
+    Those of a thousand candidates would be as much as their rows, and few of them are asked for.
+    """
+
+    effect: Effect
+    context: Context
+    setting: dict[str, Any]
+    width: int
+    on_mag: bool
+    on_gyro: bool
+
+    @property
+    def mag(self) -> Array | None:
+        """(N, 3, p) on the magnetometer."""
+        return self.effect.columns(self.context, self.setting).mag if self.on_mag else None
+
+    @property
+    def gyro(self) -> Array | None:
+        """(N, 3, p) on the gyro."""
+        return self.effect.columns(self.context, self.setting).gyro if self.on_gyro else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Component:
     """One part of the model.
 
@@ -70,7 +95,7 @@ class Component:
 
     key: str
     frame: str
-    columns: Columns
+    columns: Columns | MadeAnew
     law: Law
     prior: float = 0.0
     row: Effect | None = None
@@ -97,6 +122,14 @@ class Component:
     def width(self) -> int:
         """Number of coefficients."""
         return self.columns.width
+
+    def lightly(self, context: Context) -> Component:
+        """The same, which makes its columns of the context whenever they are asked for."""
+        if self.row is None or self.beside:
+            raise ValueError(f"{self.key} is no effect of the library in a setting")
+        columns = self.columns
+        sides = columns.width, columns.on_mag, columns.on_gyro
+        return replace(self, columns=MadeAnew(self.row, context, self.setting, *sides))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

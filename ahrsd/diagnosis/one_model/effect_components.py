@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import cast
 
@@ -12,7 +12,7 @@ import numpy as np
 from ahrsd.diagnosis.calibration_fit.delay import beyond_the_lag
 from ahrsd.diagnosis.effects.base import ANGLES, SCALES, Effect, Setting
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.component import MOMENTS, Component, Fixed, Sized
+from ahrsd.diagnosis.one_model.component import MOMENTS, Component, Fixed, MadeAnew, Sized
 from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.diagnosis.where_and_when.locate import Frame, unit_columns
 from ahrsd.samples import Array
@@ -38,16 +38,14 @@ _TURN_DEG = 20.0
 
 def library_components(
     context: Context, library: Mapping[str, Effect]
-) -> dict[str, list[Component]]:
-    """Every effect's settings that can be computed here, by identifier."""
-    out = {}
+) -> Iterator[tuple[str, list[Component]]]:
+    """Every effect's settings that can be computed here, with its identifier, one by one."""
     for name, effect in library.items():
         settings = () if effect.delay or effect.quick else effect.settings(context)
         settings = tuple(late for one in settings for late in in_time(context, effect, one))
         found = [component(context, effect, one, len(settings)) for one in settings]
         if found:
-            out[name] = found
-    return out
+            yield name, found
 
 
 def in_time(context: Context, effect: Effect, setting: Setting) -> tuple[Setting, ...]:
@@ -65,7 +63,7 @@ def in_time(context: Context, effect: Effect, setting: Setting) -> tuple[Setting
     return (setting, *({**setting, "late_s": late_s} for late_s in priors.LOGGED_LATE_S))
 
 
-def _flat(columns: Columns) -> Array:
+def _flat(columns: Columns | MadeAnew) -> Array:
     """(N, 3 p) columns about their means: a constant is the calibration's."""
     side = columns.gyro if columns.mag is None else columns.mag
     if side is None:
@@ -136,9 +134,9 @@ def holds(one: Component, part: Component, least: float = _ALIKE) -> bool:
 
     least: of the other's power that may be beyond
     """
-    if one.width <= part.width or (one.columns.mag is None) != (part.columns.mag is None):
+    if one.width <= part.width or one.columns.on_mag != part.columns.on_mag:
         return False
-    if one.columns.mag is not None and one.columns.gyro is not None:
+    if one.columns.on_mag and one.columns.on_gyro:
         return False
     X, y = (_flat(each.columns).reshape(-1, each.width) for each in (one, part))
     left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
@@ -147,9 +145,10 @@ def holds(one: Component, part: Component, least: float = _ALIKE) -> bool:
 
 def beyond(one: Component, part: Component) -> Component:
     """A component that holds another, without it: both in one set would share what they have."""
-    if one.columns.mag is None or part.columns.mag is None:
+    mag, part_mag = one.columns.mag, part.columns.mag
+    if mag is None or part_mag is None:
         raise ValueError(f"{one.key} and {part.key} are not of the magnetometer")
-    X, y = one.columns.mag, part.columns.mag[:, :, 0]
+    X, y = mag, part_mag[:, :, 0]
     along = np.einsum("nia,ni->a", X, y) / np.sum(y**2)
     rest = Columns(mag=X - y[:, :, None] * along)
     return replace(one, key=beside_key(one.key), columns=rest, beside=part.key)
@@ -260,4 +259,4 @@ def while_there(
     first, last = begins.moments_s[0], ends.moments_s[-1]
     rows = [row for row in library.values() if row.jumps]
     made = [component(context, row, {"onset_s": first, "end_s": last}, tried) for row in rows]
-    return [one for one in made if (one.columns.mag is None) == (begins.columns.mag is None)]
+    return [one for one in made if one.columns.on_mag == begins.columns.on_mag]

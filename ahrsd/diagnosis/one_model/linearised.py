@@ -88,7 +88,9 @@ class Seen:
 class Linearised:
     """A point, the context there, and products of components, each made once.
 
-    batches: (3 M, p) rows of components that passed the filter together, as the noise sees them
+    batches: (3 M, p) rows of components that passed the filter together, as the noise sees them,
+             in single precision, which is one part in ten million of a column; a member of a model
+             has a batch of its own in double
     alone: numbers of bands of the noise that stand alone, None where there are none
     """
 
@@ -115,10 +117,11 @@ class Linearised:
         unknown = [one for one in unknown if one.key not in self.seen]
         first = {id(one.columns): one for one in reversed(unknown)}
         new = list(reversed(first.values()))
-        parts = [one.columns for one in new]
+        parts = [Columns(one.columns.mag, one.columns.gyro) for one in new]
         for batch in batches(parts, _BATCH):
             cube = sensitivities(self.regressing, joined([parts[k] for k in batch]))
-            self.batches.append(by_frequency(cube / self.point.loud.amplitude[:, None, None]))
+            rows = by_frequency(cube / self.point.loud.amplitude[:, None, None])
+            self.batches.append(rows.astype(np.float32))
             at = 0
             for k in batch:
                 columns = slice(at, at + new[k].width)
@@ -136,7 +139,23 @@ class Linearised:
     def rows(self, key: str) -> Array:
         """(3 M, q) of a component, by frequency, lowest first."""
         one = self.seen[key]
-        return self.batches[one.batch][:, one.columns]
+        return self.batches[one.batch][:, one.columns].astype(float)
+
+    def keep_lightly(self, components: Sequence[Component]) -> None:
+        """Keep no columns of effects that have passed: they are made again when asked for."""
+        for one in components:
+            known = self.seen[one.key]
+            if known.component is one:
+                self.seen[one.key] = replace(known, component=one.lightly(self.context))
+
+    def _apart(self, keys: Sequence[str]) -> None:
+        """Give each a batch of its own: it meets all others, and its neighbours need not."""
+        for key in keys:
+            one = self.seen[key]
+            if self.batches[one.batch].dtype == np.float32:
+                self.batches.append(self.rows(key))
+                own = slice(0, one.component.width)
+                self.seen[key] = replace(one, batch=len(self.batches) - 1, columns=own)
 
     def put_back(self, values: Mapping[str, Array]) -> None:
         """Add what is taken out of the readings to y, for components that are known here."""
@@ -149,7 +168,8 @@ class Linearised:
         if (left, right) not in self.blocks:
             X = self.batches[left]
             Y = self.y[:, None] if right == _Y else self.batches[right]
-            found = np.stack([X[a:b].T @ Y[a:b] for a, b in self._bands()])
+            bands = self._bands()
+            found = np.stack([X[a:b].astype(float).T @ Y[a:b].astype(float) for a, b in bands])
             self.blocks[left, right] = found
             if right != _Y:
                 self.blocks[right, left] = np.swapaxes(found, 1, 2)
@@ -170,6 +190,7 @@ class Linearised:
 
     def products(self, keys: Sequence[str], step: float) -> Products:
         """All that the data say of these components; step: prior of the noise's spectrum."""
+        self._apart(keys)
         G = np.concatenate(
             [np.concatenate([self.pair(a, b) for b in keys], axis=2) for a in keys], axis=1
         )
@@ -193,6 +214,7 @@ class Linearised:
 
         (q, p) with the model, each other with itself, and (p,) with y
         """
+        self._apart(keys)
         mean: dict[tuple[int, int], Array] = {}
 
         def part(left: str, right: str) -> Array:
@@ -428,7 +450,7 @@ def added(
     """(count, 3) gauss and rad/s, what components add to the readings."""
     mag, gyro = np.zeros((count, 3)), np.zeros((count, 3))
     for key, value in values.items():
-        columns: Columns = components[key].columns
+        columns = components[key].columns
         if columns.mag is not None:
             mag += columns.mag @ value
         if columns.gyro is not None:

@@ -68,7 +68,7 @@ def moved_in(all_sets: Hypotheses, best: Hypothesis) -> list[tuple[float, float]
     out = []
     for step in starting:
         form = all_sets.forms.get(step.key)
-        if form is None or step.columns.mag is None:
+        if form is None or not step.columns.on_mag:
             continue
         way_of = np.linalg.norm(_put(all_sets, best, form), axis=1) / sigma
         for moment_s in step.moments_s:
@@ -90,7 +90,7 @@ def _is_of_way(one: Component, moment_s: float) -> bool:
     """Whether a member begins beside a step and does not outlast what a hand does there."""
     begin, end = _lasting(one)
     near = abs(begin - moment_s) <= priors.APPROACH_S
-    return near and end - begin <= 2 * priors.APPROACH_S and one.columns.mag is not None
+    return near and end - begin <= 2 * priors.APPROACH_S and one.columns.on_mag
 
 
 def _of_same_way(step: Component, moment_s: float, starting: Sequence[Component]) -> list[float]:

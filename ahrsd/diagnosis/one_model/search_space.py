@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.one_model.component import Component
@@ -32,6 +32,8 @@ from ahrsd.diagnosis.one_model.rich import Judged, psi_by_key
 from ahrsd.diagnosis.one_model.switching import switching
 
 COURSES = ("free sensor", "free world", "free gyro")
+#: columns that are made before the first of them pass the filter
+_TOGETHER = 500
 #: settings that an onset which was sought finely counts for at least
 _SOUGHT = 40
 #: onsets among which one that the data proposed was chosen
@@ -73,23 +75,41 @@ def _offered(all_sets: Hypotheses, space: Space, here: Hypothesis, *, clean: boo
     return [one.key for one in new]
 
 
+def _by_hundreds(
+    parts: Iterable[tuple[str, list[Component]]],
+) -> Iterator[list[tuple[str, list[Component]]]]:
+    """Effects together that have some hundred columns: few batches, and few columns at a time."""
+    some: list[tuple[str, list[Component]]] = []
+    for one in parts:
+        some.append(one)
+        if sum(each.width for _, found in some for each in found) >= _TOGETHER:
+            yield some
+            some = []
+    if some:
+        yield some
+
+
 def space_at(
     rich: Judged, library: Mapping[str, Effect], named: Sequence[Component]
 ) -> tuple[Hypotheses, Space]:
     """The sets at a richest model, none judged yet, and what they may be made of."""
     base = rich.base
     made, context = base.made.copied(), base.made.context
-    found = library_components(context, library)
+    delay = made.seen[LAG].component if LAG in made.seen else None
     whole: list[Component] = []
-    if LAG in made.seen:
-        delay = made.seen[LAG].component
-        whole = [one for parts in found.values() if holds(parts[0], delay) for one in parts]
-        for one in whole:
-            found[one.effect or ""].append(beyond(one, delay))
-    effects = {name: [one.key for one in parts] for name, parts in found.items()}
-    if LAG in made.seen:
-        effects[made.seen[LAG].component.effect or LAG] = [LAG]
-    made.add([one for parts in found.values() for one in parts])
+    effects: dict[str, list[str]] = {}
+    for some in _by_hundreds(library_components(context, library)):
+        passed = []
+        for name, parts in some:
+            held = [] if delay is None or not holds(parts[0], delay) else parts
+            beside = [] if delay is None else [beyond(one, delay) for one in held]
+            effects[name] = [one.key for one in (*parts, *beside)]
+            passed += [*parts, *beside]
+            whole += held
+        made.add(passed)
+        made.keep_lightly([one for _, parts in some for one in parts])
+    if delay is not None:
+        effects[delay.effect or LAG] = [LAG]
     forms = {}
     for one in named:
         listed = effects.setdefault(one.effect or one.key, [])

@@ -80,7 +80,7 @@ def test_a_delay_that_is_long_is_found_from_none():
 
 def test_eddy_currents_hold_a_delay_and_no_other_effect_does(bare):
     delay = bare.base.made.seen[LAG].component
-    parts = library_components(bare.base.made.context, EFFECTS)
+    parts = dict(library_components(bare.base.made.context, EFFECTS))
     assert [name for name, some in parts.items() if holds(some[0], delay)] == ["eddy_current"]
     eddy = beyond(parts["eddy_current"][0], delay)
     assert eddy.beside == LAG
@@ -189,7 +189,9 @@ def test_what_is_made_of_the_field_row_by_row_does_not_follow_that_rows_reading(
         fit = SimpleNamespace(filtered=run_filter(track, model), terms_gyro=None)
         context = build_context(track, fit)
         known = {one.key: one for one in ordinary_remainder(context)}
-        made = known[name] if name in known else library_components(context, EFFECTS)[name][-1]
+        made = (
+            known[name] if name in known else dict(library_components(context, EFFECTS))[name][-1]
+        )
         assert made.columns.mag is not None
         return made.columns.mag[row]
 

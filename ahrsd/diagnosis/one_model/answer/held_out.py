@@ -24,6 +24,7 @@ from scipy import linalg
 from ahrsd.diagnosis.answer.diagnosis import Heldout
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.answer.white_rows import WhiteRows, root_of, white_rows
+from ahrsd.diagnosis.one_model.component import MadeAnew
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, averaged
 from ahrsd.diagnosis.values import Columns
 from ahrsd.samples import Array
@@ -217,7 +218,7 @@ def _foretold(parts: _Parts, rows: WhiteRows) -> Foretold:
     return Foretold(total, float(np.exp(rows.log_power)) * left / float(parts.rows.sum()))
 
 
-def _rolled(columns: Columns, step: int) -> Columns:
+def _rolled(columns: Columns | MadeAnew, step: int) -> Columns:
     """The columns so many rows later, their end at the beginning."""
     mag, gyro = (
         None if part is None else np.roll(part, step, axis=0)
