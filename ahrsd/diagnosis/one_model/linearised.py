@@ -89,8 +89,8 @@ class Linearised:
     """A point, the context there, and products of components, each made once.
 
     batches: (3 M, p) rows of components that passed the filter together, as the noise sees them,
-             in single precision, which is one part in ten million of a column; a member of a model
-             has a batch of its own in double
+             in single precision, which is one part in ten million of a column
+    apart: what has a batch of its own: each that was a member of a model
     alone: numbers of bands of the noise that stand alone, None where there are none
     """
 
@@ -103,6 +103,7 @@ class Linearised:
     batches: list[Array] = field(default_factory=list)
     blocks: dict[tuple[int, int], Array] = field(default_factory=dict)
     alone: slice | None = None
+    apart: set[str] = field(default_factory=set)
 
     def add(self, components: Sequence[Component]) -> None:
         """Pass components through the filter; what is known already is left out.
@@ -134,7 +135,7 @@ class Linearised:
     def copied(self) -> Linearised:
         """The same, to which components can be added that end with it."""
         seen, rows, blocks = dict(self.seen), list(self.batches), dict(self.blocks)
-        return replace(self, seen=seen, batches=rows, blocks=blocks)
+        return replace(self, seen=seen, batches=rows, blocks=blocks, apart=set(self.apart))
 
     def rows(self, key: str) -> Array:
         """(3 M, q) of a component, by frequency, lowest first."""
@@ -150,12 +151,12 @@ class Linearised:
 
     def _apart(self, keys: Sequence[str]) -> None:
         """Give each a batch of its own: it meets all others, and its neighbours need not."""
-        for key in keys:
+        for key in set(keys) - self.apart:
             one = self.seen[key]
-            if self.batches[one.batch].dtype == np.float32:
-                self.batches.append(self.rows(key))
-                own = slice(0, one.component.width)
-                self.seen[key] = replace(one, batch=len(self.batches) - 1, columns=own)
+            self.batches.append(self.batches[one.batch][:, one.columns].copy())
+            own = slice(0, one.component.width)
+            self.seen[key] = replace(one, batch=len(self.batches) - 1, columns=own)
+        self.apart.update(keys)
 
     def put_back(self, values: Mapping[str, Array]) -> None:
         """Add what is taken out of the readings to y, for components that are known here."""

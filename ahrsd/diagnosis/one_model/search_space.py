@@ -130,7 +130,7 @@ def space_at(
         if one.row is None or one.key == LAG:
             return []
         row, tried = one.row, max(_SOUGHT, len(effects[one.row.identifier]))
-        return [component(context, row, setting, tried) for setting in settings]
+        return [component(context, row, one, tried).lightly(context) for one in settings]
 
     def finer(one: Component, round_: int) -> list[Component]:
         return made_of(one, neighbours(one.setting, length_s, round_))
@@ -144,7 +144,7 @@ def space_at(
     def steps_at(time_s: float) -> list[Component]:
         setting = {"onset_s": round(time_s, 3)}
         jumping = [row for row in library.values() if row.jumps]
-        return [component(context, row, setting, _ONSETS) for row in jumping]
+        return [component(context, row, setting, _ONSETS).lightly(context) for row in jumping]
 
     def come_and_gone(begins: Component, ends: Component) -> list[Component]:
         return while_there(begins, ends, context, library, _SOUGHT**2)
