@@ -263,7 +263,7 @@ def times_beyond(copies: int, chance: float) -> float:
     orders = np.arange(1, copies + 1)
 
     def too_likely(log_times: float) -> float:
-        return float(np.sum(np.log1p(np.exp(log_times) / orders))) + np.log(chance)
+        return float(np.sum(np.log1p(np.exp(log_times) / orders)) + np.log(chance))
 
     return float(np.exp(brentq(too_likely, -20.0, -np.log(chance) + 1.0)))
 

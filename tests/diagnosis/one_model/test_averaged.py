@@ -35,6 +35,7 @@ def driven() -> Track:
     return track.with_columns({"motor_current_a": logged})
 
 
+@pytest.mark.slow
 def test_nothing_is_named_beside_the_current_but_half_a_step(driven: Track) -> None:
     found = diagnose(driven)
     names = {one.effect: one for one in found.findings}

@@ -218,6 +218,7 @@ def test_the_way_of_a_hand_with_a_magnet_is_no_name_beside_its_step():
     assert not found.unexplained.detected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("varies", [0.0, 1.5])
 def test_a_name_whose_coefficient_varies_by_as_much_as_itself_is_not_told(varies):
     track = made(Trial(seed=31, effects=(), samples=4000)).track
@@ -269,6 +270,7 @@ def test_a_delay_is_no_eddy_current():
     assert found.findings[0].parameters[0].value == pytest.approx(0.06, abs=3e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("aligned", [0.0, 1.0])
 def test_a_mount_that_was_aligned_under_its_load_is_no_crooked_gyro_as_well(aligned):
     run = simulate(ScenarioSettings("mam", "rov", 47, 6000, 25.0, 0.0, 0.0))
@@ -303,6 +305,7 @@ def test_a_scale_that_creeps_is_no_compensation_on_board():
     assert told.parameters[0].value == pytest.approx(one.truth[0][1][0], abs=0.1)
 
 
+@pytest.mark.slow
 def test_beside_a_large_unknown_of_one_sensor_a_small_name_of_the_other_is_not_told():
     track = made(Trial(seed=71, effects=(("gyro_g_sensitivity", 1.0),), samples=3000)).track
     assert [one.effect for one in diagnose(track).findings] == ["gyro_g_sensitivity"]

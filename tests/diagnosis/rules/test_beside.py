@@ -53,6 +53,7 @@ def test_a_lamp_is_named_beside_a_room_that_nothing_explains():
     assert found.unexplained.detected
 
 
+@pytest.mark.slow
 def test_a_misalignment_is_named_beside_a_room_with_its_value():
     track = room()
     angle = np.array([0.05, -0.03, 0.04])

@@ -26,6 +26,7 @@ def _made(sigma_mag: float, sigma_gyro: float, scenario: str = "wam", seed: int 
     )
 
 
+@pytest.mark.slow
 def test_a_step_far_beyond_what_simulations_show_is_told() -> None:
     """2 mG of hard iron beside 0.1 mG and 50 mrad/s."""
     track = track_of(_made(1e-4, 5e-2))

@@ -60,6 +60,7 @@ def _at_the_instant(track: Track) -> Track:
     return replace(track, gyro_b_rad_s=rate)
 
 
+@pytest.mark.slow
 def test_a_strong_current_is_not_turned_with_the_field_and_no_eddy_is_named_for_that() -> None:
     """0.3 G of a rover's motor, averaged in pairs at 20 Hz: nothing but the current, and a lag."""
     track = _at_the_instant(track_of(experiment("mam", seed=3, samples=3000, rate_hz=20.0)))

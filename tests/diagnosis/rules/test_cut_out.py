@@ -60,6 +60,7 @@ def test_a_lag_is_named_with_its_value_beside_a_magnet_that_a_hand_puts_on() -> 
     assert any("left out" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_the_way_of_a_hand_is_cut_out_and_a_sharp_step_has_none() -> None:
     state = state_of(handled())
     spans = brief(state)

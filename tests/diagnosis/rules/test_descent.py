@@ -28,6 +28,7 @@ def _another_fit_gains() -> float:
     return likelihood(refitted(state, state.named)) - likelihood(state)
 
 
+@pytest.mark.slow
 def test_a_fit_does_not_stop_at_columns_that_its_own_step_made_stale(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

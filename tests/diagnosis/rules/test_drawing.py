@@ -12,6 +12,7 @@ def answer(*effects, seed=3):
     return diagnose(one.track), one
 
 
+@pytest.mark.slow
 def test_a_field_by_place_stands_in_the_map_at_its_places_and_is_gone_after():
     found, _ = answer(("field_gradient", 1.0))
     maps = {one.quantity: one for one in found.regime_map}
@@ -60,6 +61,7 @@ def test_a_delay_is_drawn_as_it_is_in_the_recording():
     assert added.max() > 5e-3  # half a gauss that turns by half a radian a second: 15 mG
 
 
+@pytest.mark.slow
 def test_all_names_together_gain_what_they_gain_one_by_one_where_they_are_apart():
     found, _ = answer(("motor_current_field", 0.5), ("gyro_scale", 1.0))
     alone = [x.heldout.nll_gain_per_sample for x in found.findings]

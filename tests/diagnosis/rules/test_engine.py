@@ -75,6 +75,7 @@ def test_swapped_axes_stop_everything_else():
     assert found.baseline is None
 
 
+@pytest.mark.slow
 def test_the_answer_is_the_contracts_object_and_the_same_every_time():
     found, one = answer(("mag_time_lag", 1.0))
     body = found.to_json()

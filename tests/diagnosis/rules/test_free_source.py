@@ -216,6 +216,7 @@ def warming(time_s):
     return 1.0 - np.exp(-time_s / 250.0)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_warms_is_no_iron_that_remembers() -> None:
     """328 nats as that; a smooth course has hardly less, and nobody logged a temperature."""
     library = {name: EFFECTS[name] for name in ("viscous_magnetisation", "hard_iron_step")}

@@ -117,6 +117,7 @@ def jumped(made, track):
     return replace(track, mag_b_gauss=track.mag_b_gauss + later * read)
 
 
+@pytest.mark.slow
 def test_a_field_that_jumps_is_held_out_by_the_second(jumped, track, monkeypatch):
     """The filter has followed it before a stretch is over: no stretch knows it for another one."""
     monkeypatch.setattr(findings, "gain_of", lambda *_, **__: None)

@@ -70,6 +70,7 @@ def test_the_motor_current_is_not_named_on_the_outer_compass() -> None:
     assert 0.05 < values(lag)[0] < 0.12
 
 
+@pytest.mark.slow
 def test_a_current_that_nobody_logged_is_a_source_fixed_to_the_vehicle() -> None:
     name, channels = "arducopter/log171_MAG2_10hz.csv.gz", ("motor_current_a", "throttle")
     found = diagnosed(name, *channels, "battery_v")
@@ -89,6 +90,7 @@ def test_a_current_that_nobody_logged_is_a_source_fixed_to_the_vehicle() -> None
     assert np.degrees(np.arccos(cosine)) < 30.0
 
 
+@pytest.mark.slow
 def test_a_magnet_is_put_on_and_taken_off() -> None:
     found = diagnosed("broad/36_disturbed_attached_magnet_5cm.csv.gz")
     on, off = sorted(named(found, "hard_iron_step"), key=lambda one: one.where.intervals_s[0][0])
@@ -121,6 +123,7 @@ def test_an_undisturbed_trial_shows_its_lag_and_no_other_name() -> None:
     assert values(lag)[0] == pytest.approx(0.0115, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_an_ordinary_recording_gets_no_name_of_physics() -> None:
     found = diagnosed("repoimu/TStick_Test11_Trial1.csv.gz")
     assert {one.effect for one in found.findings} <= {"noise_burst", "noise_level"}

@@ -122,6 +122,7 @@ def named(track: Track, name: str) -> State:
     return refitted(start, (survey(start).judged[0],))
 
 
+@pytest.mark.slow
 def test_a_gyro_bias_that_comes_and_goes_is_no_pair_of_steps(track: Track) -> None:
     phase = np.clip((track.time_s - 120.0) / 40.0, 0.0, 1.0)
     bump = np.sin(np.pi * phase)[:, None] ** 2 * np.array([6e-4, -5e-4, 7e-4])
