@@ -86,11 +86,25 @@ def per_covariate(readings: Readings, role: str, **more: object) -> tuple[Settin
     )
 
 
+#: of a setting: how a logged cause differs from what flowed
+LOGGED = ("late_s", "mean_s")
+
+
 def course_of(readings: Readings, setting: Setting) -> Array:
-    """The setting's covariate minus its reference, (N, 1); `late_s`: how late it is logged."""
-    values = readings.covariates[setting["covariate"]]
-    if late_s := setting.get("late_s", 0.0):
-        values = np.interp(readings.time_s + late_s, readings.time_s, values)
+    """The setting's covariate minus its reference, (N, 1), as it was before it was logged.
+
+    late_s: how late it is logged
+    mean_s: over how long the logger takes its mean.  What that leaves of the ups and downs is put
+            back by a third of what the column's middle has beyond its neighbours half of that away:
+            exact for slow ones, and never more than two thirds more
+    """
+    values, time_s = readings.covariates[setting["covariate"]], readings.time_s
+    late_s, half_s = setting.get("late_s", 0.0), setting.get("mean_s", 0.0) / 2
+    if late_s or half_s:
+        before, at, behind = (
+            np.interp(time_s + late_s + by_s, time_s, values) for by_s in (-half_s, 0.0, half_s)
+        )
+        values = at + (2.0 * at - before - behind) / 6.0
     return np.asarray(values - setting["reference"])[:, None]
 
 

@@ -1,4 +1,4 @@
-"""A logged cause that comes late into the log, or early: its own clock, sought where it matters.
+"""A logged cause that comes late into the log, early or as a mean: sought where it matters.
 
 A current that is averaged in the logger, or stamped when it is written, is some tenths of a second
 off.  Held against the field as it is logged its coefficients come out too small, since its edges
@@ -11,15 +11,24 @@ from dataclasses import replace
 
 import numpy as np
 
+from ahrsd.diagnosis.effects.base import Setting
+from ahrsd.diagnosis.effects.shapes import LOGGED
 from ahrsd.diagnosis.rules.regression import Base, Candidate
 from ahrsd.diagnosis.rules.settings import WORTH_NATS, evidence_of
 
 #: names whose cause may change within tenths of a second
 QUICK_CAUSES = ("motor_current_field",)
 LATE_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
-CLOSER_S = (-0.05, 0.05)
+CLOSER_S = (-0.05, 0.05, -0.025, 0.025)
+#: spans of which a logger takes its mean, which comes late by half of that or has its middle's time
+MEANS_S = (0.2, 0.4, 0.8)
+READ: tuple[Setting, ...] = (
+    *({"late_s": late_s} for late_s in LATE_S),
+    *({"mean_s": mean_s} for mean_s in MEANS_S),
+    *({"mean_s": mean_s, "late_s": mean_s / 2} for mean_s in MEANS_S),
+)
 #: alternatives that the choice among them costs
-TRIED = len(LATE_S) + len(CLOSER_S) + 1
+TRIED = len(READ) + len(CLOSER_S) + 1
 
 
 def in_time(basis: Base, candidate: Candidate) -> Candidate:
@@ -27,14 +36,11 @@ def in_time(basis: Base, candidate: Candidate) -> Candidate:
     if candidate.name not in QUICK_CAUSES or candidate.evidence < WORTH_NATS:
         return candidate
     best = replace(candidate, evidence=evidence_of(basis, candidate))
-    for around in (LATE_S, CLOSER_S):
-        at_s = float(best.setting.get("late_s", 0.0))
-        for step_s in around:
-            moved = replace(
-                candidate, setting={**candidate.setting, "late_s": round(at_s + step_s, 3)}
-            )
-            moved = replace(moved, evidence=evidence_of(basis, moved))
-            best = moved if moved.evidence > best.evidence else best
+    for read in READ:
+        best = _better(basis, best, {**candidate.setting, **read})
+    for step_s in CLOSER_S:
+        late_s = round(float(best.setting.get("late_s", 0.0)) + step_s, 3)
+        best = _better(basis, best, {**best.setting, "late_s": late_s})
     paid = best.evidence - _cost(candidate)
     if paid < candidate.evidence + WORTH_NATS:
         return candidate
@@ -43,9 +49,16 @@ def in_time(basis: Base, candidate: Candidate) -> Candidate:
 
 def on_time(basis: Base, candidate: Candidate) -> Candidate:
     """The candidate with its cause as it was logged."""
-    setting = {key: value for key, value in candidate.setting.items() if key != "late_s"}
+    setting = {key: value for key, value in candidate.setting.items() if key not in LOGGED}
     logged = replace(candidate, setting=setting, tried=1, alike=1.0)
     return replace(logged, evidence=evidence_of(basis, logged))
+
+
+def _better(basis: Base, best: Candidate, setting: Setting) -> Candidate:
+    """The candidate in another setting where that explains more."""
+    moved = replace(best, setting=setting)
+    moved = replace(moved, evidence=evidence_of(basis, moved))
+    return moved if moved.evidence > best.evidence else best
 
 
 def _cost(candidate: Candidate) -> float:

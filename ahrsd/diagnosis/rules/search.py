@@ -20,6 +20,7 @@ from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.calibration_fit.prior import prior_of
 from ahrsd.diagnosis.calibration_fit.problem import Problem
 from ahrsd.diagnosis.calibration_fit.resting import at_rest
+from ahrsd.diagnosis.effects.shapes import LOGGED
 from ahrsd.diagnosis.innovation_filter.context import Given, build_context
 from ahrsd.diagnosis.innovation_filter.innovation import bearings
 from ahrsd.diagnosis.rules.delays import DELAYS, plain
@@ -36,7 +37,13 @@ from ahrsd.diagnosis.rules.regression import (
     columns_of,
     quieter,
 )
-from ahrsd.diagnosis.rules.settings import best_settings, closest_scale, evidence_of, scale_of
+from ahrsd.diagnosis.rules.settings import (
+    as_read,
+    best_settings,
+    closest_scale,
+    evidence_of,
+    scale_of,
+)
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.diagnosis.where_and_when.locate import Frame
@@ -168,13 +175,32 @@ def added(state: State, judged: Judged) -> State:
     name = judged.candidate.name
     if name not in DELAYS:
         more = _scaled_again(refitted(state, (*state.named, judged)))
-        return shaped_again(_riding_apart(more), newest=False)
+        # when a cause was logged was sought in noise that held what it does
+        return _as_logged(shaped_again(_riding_apart(more), newest=name in QUICK_CAUSES))
     step_s = float(np.nanmedian(state.problem.track.dt_s)) / 2
     lag_s = DELAYS[name] * float(judged.what.value[0])
     lag_s *= step_s if name == "gyro_integration" else 1.0
     effect = state.problem.library[plain(lag_s)]
     lag = replace(judged, candidate=replace(judged.candidate, effect=effect, setting={}))
     return shaped_again(_lag_taken_out(state, lag, lag_s), newest=False)
+
+
+def _as_logged(state: State) -> State:
+    """The state with the newest term's cause as it was logged, where the names by it explain more.
+
+    Read late, a current has some of what its change does, as long as that has no name.
+    """
+    column = state.named[-1].candidate.setting.get("covariate")
+    by_it = [j for j in state.named if j.candidate.setting.get("covariate") == column]
+    read = any(key in j.candidate.setting for j in by_it for key in LOGGED)
+    if column is None or len(by_it) < 2 or not read:
+        return state
+    basis = formed_basis_of(state)
+    named = [
+        replace(j, candidate=on_time(basis, j.candidate)) if j in by_it else j for j in state.named
+    ]
+    tried = refitted(state, tuple(named))
+    return tried if tried.fit.log_likelihood > state.fit.log_likelihood else state
 
 
 def _riding_apart(state: State) -> State:
@@ -224,6 +250,10 @@ def _sought_again(state: State, number: int, basis: Base, left: Base) -> Candida
     at = state.named[number].candidate
     if at.name in QUICK_CAUSES:  # late as the magnetometer was taken to be when it was named
         return in_time(left, on_time(left, at))
+    taken = [(j.candidate.name, j.candidate.setting) for j in state.named if j.candidate is not at]
+    if (read := as_read(at.setting, taken)) != at.setting:
+        moved = replace(at, setting=read)
+        return replace(moved, tried=1, alike=1.0, evidence=evidence_of(left, moved))
     key = scale_of(at)
     if key is None and not any(name in at.setting for name in ("onset_s", *FORMS)):
         return None
@@ -233,7 +263,6 @@ def _sought_again(state: State, number: int, basis: Base, left: Base) -> Candida
         setting = moved_together(basis, at, keys, state.fit.terms[number].value)
         found = replace(at, setting=setting)
         return replace(found, tried=1, alike=1.0, evidence=evidence_of(left, found))
-    taken = [(j.candidate.name, j.candidate.setting) for j in state.named if j.candidate is not at]
     return next(iter(best_settings(left, {at.name: at.effect}, taken)), None)
 
 

@@ -15,6 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 from ahrsd.diagnosis.effects.base import ANGLES, SCALES, Effect, Setting
+from ahrsd.diagnosis.effects.shapes import LOGGED
 from ahrsd.diagnosis.innovation_filter.gram import solve
 from ahrsd.diagnosis.rules.choices import choices
 from ahrsd.diagnosis.rules.objects import closest_object, moved_object
@@ -28,8 +29,8 @@ ONSET_STEPS, ONSET_PASSES = 12, 2
 #: rows that an onset leaves on either side: a run's first row opens the filter, and what begins
 #: with it has no before.  A field of a quarter of a gauss then takes up how the gyro drifts
 ROWS_BESIDE = 3
-#: how a logged cause is read: by how much it is late, and by how much its north is turned
-READ_ONCE = ("late_s", "turn_deg")
+#: how a logged cause is read: late and as a mean of so long, and its north turned by so much
+READ_ONCE = (*LOGGED, "turn_deg")
 #: what the choice of a size between those of its grid costs, as so many values
 SCALE_CHOICES = 3
 WORTH_NATS = 4.0
@@ -48,7 +49,9 @@ def best_settings(
     for name, effect in library.items():
         options = _settings(effect, basis.context) if effect.kind == "mean" else ()
         given = [_cause(setting) for other, setting in taken if other == name]
-        offered[name] = tuple(option for option in options if _cause(option) not in given)
+        offered[name] = tuple(
+            as_read(option, taken) for option in options if _cause(option) not in given
+        )
     _summed(basis, [(library[name], o) for name, options in offered.items() for o in options])
     for name, options in offered.items():
         effect = library[name]
@@ -63,6 +66,19 @@ def best_settings(
         paid = best.evidence + float(np.log(ways))
         found.append(replace(best, alike=best.alike * ways, evidence=paid))
     return sorted(found, key=lambda candidate: -candidate.evidence)
+
+
+def as_read(setting: Setting, taken: Sequence[tuple[str, Setting]]) -> Setting:
+    """The setting with its column read as it is by what is named: a log is late by one time.
+
+    The change of a current at another time than the current would make up for what its mean lost.
+    """
+    column = setting.get("covariate")
+    for _, named in taken:
+        if column is not None and named.get("covariate") == column:
+            read = {key: named[key] for key in LOGGED if key in named}
+            return {**{key: setting[key] for key in setting if key not in LOGGED}, **read}
+    return setting
 
 
 def _cause(setting: Setting) -> Setting:
