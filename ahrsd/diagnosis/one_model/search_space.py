@@ -18,6 +18,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
     neighbours,
     while_there,
 )
+from ahrsd.diagnosis.one_model.linearised import Linearised
 from ahrsd.diagnosis.one_model.model_search import (
     Beside,
     Hypotheses,
@@ -89,16 +90,14 @@ def _by_hundreds(
         yield some
 
 
-def space_at(
-    rich: Judged, library: Mapping[str, Effect], named: Sequence[Component]
-) -> tuple[Hypotheses, Space]:
-    """The sets at a richest model, none judged yet, and what they may be made of."""
-    base = rich.base
-    made, context = base.made.copied(), base.made.context
+def _passed(
+    made: Linearised, library: Mapping[str, Effect]
+) -> tuple[dict[str, list[str]], list[Component]]:
+    """Keys of the library's components by effect, all passed; and those that hold the delay."""
     delay = made.seen[LAG].component if LAG in made.seen else None
     whole: list[Component] = []
     effects: dict[str, list[str]] = {}
-    for some in _by_hundreds(library_components(context, library)):
+    for some in _by_hundreds(library_components(made.context, library)):
         passed = []
         for name, parts in some:
             held = [] if delay is None or not holds(parts[0], delay) else parts
@@ -110,6 +109,16 @@ def space_at(
         made.keep_lightly([one for _, parts in some for one in parts])
     if delay is not None:
         effects[delay.effect or LAG] = [LAG]
+    return effects, whole
+
+
+def space_at(
+    rich: Judged, library: Mapping[str, Effect], named: Sequence[Component]
+) -> tuple[Hypotheses, Space]:
+    """The sets at a richest model, none judged yet, and what they may be made of."""
+    base = rich.base
+    made, context = base.made.copied(), base.made.context
+    effects, whole = _passed(made, library)
     forms = {}
     for one in named:
         listed = effects.setdefault(one.effect or one.key, [])
