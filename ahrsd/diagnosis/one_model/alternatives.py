@@ -87,7 +87,7 @@ def varying(known: Component, added: Array, context: Context) -> list[Component]
     found = []
     for key, (factor, law) in zip(form_keys(known.key), factors, strict=True):
         flat = added[:, :, None] * (factor - weight @ factor)[:, None, :]
-        columns = Columns(gyro=flat) if not known.columns.on_mag else Columns(mag=flat)
+        columns = Columns(mag=flat) if known.columns.on_mag else Columns(gyro=flat)
         found.append(Component(key, known.frame, columns, law, float(np.log(priors.COURSE))))
     return found
 

@@ -563,9 +563,9 @@ def added_by(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, s
     """(N, 3) what a member adds to the readings, and its unit: gauss, or rad/s of the gyro's."""
     one, track = all_sets.component(key), all_sets.made.context.track
     value, _ = coefficients(all_sets, best, key)
-    matrix = one.columns.gyro if not one.columns.on_mag else one.columns.mag
+    matrix = one.columns.mag if one.columns.on_mag else one.columns.gyro
     added = np.zeros((len(track), 3)) if matrix is None else np.asarray(matrix @ value)
-    return added, "rad/s" if not one.columns.on_mag else "gauss"
+    return added, "gauss" if one.columns.on_mag else "rad/s"
 
 
 def _where(all_sets: Hypotheses, best: Hypothesis, key: str, frame: str) -> Where:

@@ -480,7 +480,7 @@ def _steps_of(all_sets: Hypotheses, key: str) -> str:
     one = all_sets.component(key)
     if one.row is None or not one.row.recurs:
         return ""
-    return "gyro" if not one.columns.on_mag else "magnetometer"
+    return "magnetometer" if one.columns.on_mag else "gyro"
 
 
 def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:

@@ -74,11 +74,11 @@ def as_read(setting: Setting, taken: Sequence[tuple[str, Setting]]) -> Setting:
     The change of a current at another time than the current would make up for what its mean lost.
     """
     column = setting.get("covariate")
-    for _, named in taken:
-        if column is not None and named.get("covariate") == column:
-            read = {key: named[key] for key in LOGGED if key in named}
-            return {**{key: setting[key] for key in setting if key not in LOGGED}, **read}
-    return setting
+    by_it = [named for _, named in taken if column and named.get("covariate") == column]
+    if not by_it:
+        return setting
+    read = {key: named[key] for named in by_it for key in LOGGED if key in named}
+    return {**{key: setting[key] for key in setting if key not in LOGGED}, **read}
 
 
 def _cause(setting: Setting) -> Setting:

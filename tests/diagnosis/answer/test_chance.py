@@ -111,6 +111,16 @@ def test_times_beyond_the_largest_of_several(copies: int, chance: float, times: 
     assert times_beyond(copies, chance) == pytest.approx(times, rel=1e-3)
 
 
+def test_with_every_early_look_one_in_94_of_what_chance_makes_is_told() -> None:
+    """Of exponential draws beside five others: 1 in 126 at the last, 1 in 1000 at each before."""
+    told, *others = np.random.default_rng(5).exponential(size=(6, 500_000))
+    largest = np.maximum.accumulate(others)
+    early = [times_beyond(count, LIMITS.chance_early_p) for count in (1, 2, 3, 4)]
+    beyond = told > np.array([*early, times_beyond(5, LIMITS.chance_p)])[:, None] * largest
+    assert np.mean(beyond[-1]) == pytest.approx(1 / 126, rel=0.05)
+    assert np.mean(beyond.any(axis=0)) == pytest.approx(1 / 94, rel=0.05)
+
+
 @pytest.mark.parametrize(
     ("sigma_mag", "sigma_gyro", "ratio"), [(1e-3, 5e-3, 0.1), (1e-4, 5e-2, 10.0)]
 )
