@@ -8,13 +8,16 @@ variances and their slopes in its hyperparameters psi, all of which are logarith
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.where_and_when.locate import Frame, unit_columns
 from ahrsd.samples import Array
 
 
@@ -56,14 +59,12 @@ MOMENTS = ("onset_s", "end_s")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MadeAnew:
-    """An effect's columns in a setting, which are made whenever they are asked for.
+    """Columns that are made whenever they are asked for.
 
     Those of a thousand candidates would be as much as their rows, and few of them are asked for.
     """
 
-    effect: Effect
-    context: Context
-    setting: dict[str, Any]
+    make: Callable[[], Columns]
     width: int
     on_mag: bool
     on_gyro: bool
@@ -71,12 +72,23 @@ class MadeAnew:
     @property
     def mag(self) -> Array | None:
         """(N, 3, p) on the magnetometer."""
-        return self.effect.columns(self.context, self.setting).mag if self.on_mag else None
+        return self.make().mag if self.on_mag else None
 
     @property
     def gyro(self) -> Array | None:
         """(N, 3, p) on the gyro."""
-        return self.effect.columns(self.context, self.setting).gyro if self.on_gyro else None
+        return self.make().gyro if self.on_gyro else None
+
+
+def in_frame(context: Context, frame: Frame, courses: Callable[[], Array], count: int) -> MadeAnew:
+    """Courses in time, (N, count), each along each axis of a frame: three columns a course."""
+
+    def make() -> Columns:
+        axes = unit_columns(context, frame)
+        flat = (courses()[:, None, :, None] * axes[:, :, None, :]).reshape(len(axes), 3, -1)
+        return Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
+
+    return MadeAnew(make, 3 * count, on_mag=frame != "gyro", on_gyro=frame == "gyro")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,8 +140,9 @@ class Component:
         if self.row is None or self.beside:
             raise ValueError(f"{self.key} is no effect of the library in a setting")
         columns = self.columns
-        sides = columns.width, columns.on_mag, columns.on_gyro
-        return replace(self, columns=MadeAnew(self.row, context, self.setting, *sides))
+        make = partial(self.row.columns, context, self.setting)
+        light = MadeAnew(make, columns.width, columns.on_mag, columns.on_gyro)
+        return replace(self, columns=light)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

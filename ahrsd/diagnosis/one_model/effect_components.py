@@ -12,9 +12,16 @@ import numpy as np
 from ahrsd.diagnosis.calibration_fit.delay import beyond_the_lag
 from ahrsd.diagnosis.effects.base import ANGLES, SCALES, Effect, Setting
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.component import MOMENTS, Component, Fixed, MadeAnew, Sized
+from ahrsd.diagnosis.one_model.component import (
+    MOMENTS,
+    Component,
+    Fixed,
+    MadeAnew,
+    Sized,
+    in_frame,
+)
 from ahrsd.diagnosis.values import Columns, Context
-from ahrsd.diagnosis.where_and_when.locate import Frame, unit_columns
+from ahrsd.diagnosis.where_and_when.locate import Frame
 from ahrsd.samples import Array
 
 #: the delay that stands for all delays: which of them it is, is asked at the end
@@ -234,16 +241,17 @@ def _changes(around: list[Array | None]) -> Array | None:
 
 def _way_of(known: Component, law: Sized, context: Context, frame: Frame) -> Component:
     """Of a step: pieces of time round its onset, and its end, each along each axis of its frame."""
-    width_s = 2 * priors.APPROACH_S / PIECES
-    inside = []
-    for moment_s in known.moments_s:
-        edges = moment_s - priors.APPROACH_S + width_s * np.arange(PIECES + 1)
-        piece = np.searchsorted(edges, context.track.time_s, side="right") - 1
-        inside.append((piece[:, None] == np.arange(PIECES)).astype(float))
-    axes = unit_columns(context, frame)
-    flat = np.einsum("nk,nia->nika", np.hstack(inside), axes)
-    flat = flat.reshape(len(context.track), 3, -1)
-    columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
+    width_s, moments_s = 2 * priors.APPROACH_S / PIECES, known.moments_s
+
+    def inside() -> Array:
+        pieces = []
+        for moment_s in moments_s:
+            edges = moment_s - priors.APPROACH_S + width_s * np.arange(PIECES + 1)
+            piece = np.searchsorted(edges, context.track.time_s, side="right") - 1
+            pieces.append((piece[:, None] == np.arange(PIECES)).astype(float))
+        return np.hstack(pieces)
+
+    columns = in_frame(context, frame, inside, PIECES * len(moments_s))
     sized = Sized(np.full(columns.width, float(law.scale[0])), law.low, law.high)
     moments = {name: known.setting[name] for name in MOMENTS if name in known.setting}
     return Component(f"form of {known.key}", frame, columns, sized, setting=moments)

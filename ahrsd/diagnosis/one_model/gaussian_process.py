@@ -10,14 +10,15 @@ Each axis of the frame has such a course of its own, all of one size.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.component import Component, log_density, stiff
-from ahrsd.diagnosis.values import Columns, Context
-from ahrsd.diagnosis.where_and_when.locate import Frame, unit_columns
+from ahrsd.diagnosis.one_model.component import Component, in_frame, log_density, stiff
+from ahrsd.diagnosis.values import Context
+from ahrsd.diagnosis.where_and_when.locate import Frame
 from ahrsd.samples import Array
 
 #: half waves of a course: one in so many seconds, and from few to many
@@ -102,7 +103,8 @@ def course(
     if quick is not None:
         waves = np.clip(context.track.duration_s / QUICK_S, FEWEST, MOST_QUICK)
     order = np.arange(1, int(waves) + 1)
-    columns = _cosines(context, frame, order) if like is None else like.columns
+    waves_of = partial(_cosines, context.track.time_s, order)
+    columns = in_frame(context, frame, waves_of, len(order)) if like is None else like.columns
     unit = priors.COURSE_UNIT[frame]
     law = CourseLaw(np.repeat(order, 3).astype(float), unit)
     key = quick or f"free {frame}"
@@ -114,11 +116,7 @@ def course(
     return Component(key, frame, columns, law, odds)
 
 
-def _cosines(context: Context, frame: Frame, order: NDArray[np.int_]) -> Columns:
-    """So many half waves (k,) along each axis of a frame."""
-    time_s = context.track.time_s
+def _cosines(time_s: Array, order: NDArray[np.int_]) -> Array:
+    """(N, k) half waves."""
     phase = np.pi * (time_s - time_s[0]) / (time_s[-1] - time_s[0])
-    axes = unit_columns(context, frame)
-    waves = np.cos(phase[:, None] * order)
-    flat = (waves[:, None, :, None] * axes[:, :, None, :]).reshape(len(time_s), 3, -1)
-    return Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
+    return np.asarray(np.cos(phase[:, None] * order))

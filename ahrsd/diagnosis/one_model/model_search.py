@@ -88,7 +88,7 @@ class Hypotheses:
 
         near: a set of the same class from whose noise and sizes the climb begins, which is short;
         else it begins where the richest model is; where either is loud, in quiet noise: from loud
-        noise what a member explains is noise still
+        noise what a member explains is noise still.  What has only lost members begins in near's
         """
         members = frozenset(names)
         ordered = sorted(members)
@@ -104,7 +104,8 @@ class Hypotheses:
                 noise, known = near.at.log_noise, {**known, **self.psi_of(near)}
             psi = [known.get(key, law.start) for key, law in zip(keys, laws, strict=True)]
             start = np.concatenate([*psi, np.zeros(0)])
-            if np.max(noise) > noise[-1] + priors.LOUD:
+            fewer = near is not None and members < near.names
+            if not fewer and np.max(noise) > noise[-1] + priors.LOUD:
                 noise = np.minimum(noise, noise[-1])
             odds = sum(self.component(key).prior for key in ordered)
             odds += self._again(members) + self._of_class(members)

@@ -19,20 +19,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.component import Component, Sized, log_density
+from ahrsd.diagnosis.one_model.component import Component, Sized, in_frame, log_density
 from ahrsd.diagnosis.one_model.evidence import At
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, beside
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.values import Context
 from ahrsd.diagnosis.where_and_when.locate import (
     Frame,
     frame_columns,
     segments_between,
-    unit_columns,
 )
 from ahrsd.samples import Array
 
@@ -150,8 +150,9 @@ def _closest(
                     one = _coming(made.context, "sensor", [(a, b)], 0.0, _FEW)
                     tried[one.key] = number, (a, b)
                     new.append(one)
-            made.add(new)
-            worth = scan.worth(list(tried))
+            trial = made.copied()  # what was tried ends with its round
+            trial.add(new)
+            worth = replace(scan, made=trial).worth(list(tried))
             best: dict[int, float] = {}
             for key, nats in worth.items():
                 number, spell = tried[key]
@@ -258,21 +259,28 @@ def _coming(
     step_s = float(time_s[-1] - time_s[0]) / (len(time_s) - 1)
     lasting = step_s * sum(b - a for a, b in spells)
     shortest_s = max(priors.SPELL_PIECE_S, lasting / priors.MOST_WAVES)
-    waves, order = [], []
-    for a, b in spells:
-        length_s = step_s * (b - a)
-        k = np.arange(np.clip(round(length_s / shortest_s), 1, most))
-        inside = np.zeros((len(time_s), len(k)))
-        inside[a:b] = np.cos(np.pi * k * (np.arange(b - a)[:, None] + 0.5) / (b - a))
-        waves.append(inside)
-        order.append(k / length_s)
-    axes, flat = unit_columns(context, frame), np.hstack(waves)
-    flat = (flat[:, None, :, None] * axes[:, :, None, :]).reshape(len(time_s), 3, -1)
+    counts = [int(np.clip(round(step_s * (b - a) / shortest_s), 1, most)) for a, b in spells]
+    order = [
+        np.arange(count) / (step_s * (b - a)) for (a, b), count in zip(spells, counts, strict=True)
+    ]
+    waves = partial(_waves, len(time_s), tuple(spells), counts)
+    columns = in_frame(context, frame, waves, sum(counts))
     law = SpellLaw(np.repeat(np.concatenate(order), 3), priors.COURSE_UNIT[frame])
     spans = tuple((float(time_s[a]), float(time_s[b - 1])) for a, b in spells)
     key = f"{frame} that is there from and to {spans} s"
     odds = float(np.log(priors.COURSE * _share(frame))) + log_odds
-    return Component(key, frame, Columns(mag=flat), law, odds, setting={"spans_s": spans})
+    return Component(key, frame, columns, law, odds, setting={"spans_s": spans})
+
+
+def _waves(rows: int, spells: Sequence[tuple[int, int]], counts: Sequence[int]) -> Array:
+    """(rows, sum of counts) half waves in each spell, from its mean on."""
+    out = np.zeros((rows, sum(counts)))
+    first = 0
+    for (a, b), count in zip(spells, counts, strict=True):
+        phase = np.pi * (np.arange(b - a)[:, None] + 0.5) / (b - a)
+        out[a:b, first : first + count] = np.cos(phase * np.arange(count))
+        first += count
+    return out
 
 
 def _share(frame: Frame) -> float:

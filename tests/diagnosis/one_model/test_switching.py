@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from tracks import experiment, track_of
 
-from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.switching import SpellLaw, changes, likeliest_states
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.limits import LIMITS
+from ahrsd.diagnosis.one_model import priors, rich
+from ahrsd.diagnosis.one_model.search_space import space_at
+from ahrsd.diagnosis.one_model.switching import (
+    SpellLaw,
+    changes,
+    likeliest_states,
+    switching,
+)
+from ahrsd.diagnosis.track import Spec
 
 PIECE_S, ROWS = 0.2, 5
 
@@ -62,3 +76,27 @@ def test_a_spell_s_slopes_are_those_of_differences():
     volume = np.prod(law.high - law.low)
     assert law.log_prior(psi)[0] == pytest.approx(-np.log(volume))
     np.testing.assert_array_equal(law.log_prior(psi)[1], [0.0, 0.0])
+
+
+def test_spells_are_found_to_a_second_and_what_was_tried_is_not_kept():
+    track = replace(track_of(experiment("wam", seed=22, samples=3000)), accel_b_m_s2=None)
+    since_s = track.time_s - track.time_s[0]
+    true = [(20.0, 22.0), (50.0, 51.5), (80.0, 83.0)]
+    on = np.any([(since_s >= a) & (since_s < b) for a, b in true], axis=0)
+    lamp = on[:, None] * np.array([0.02, -0.015, 0.01])
+    track = replace(track, mag_b_gauss=track.mag_b_gauss + lamp)
+    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    fit = fit_null(problem.track, problem.spec, cold, walk=False)
+    all_sets, _ = space_at(rich.richest(problem, fit.filtered, EFFECTS), EFFECTS, ())
+    nothing = all_sets.judge(())
+    known = set(all_sets.made.seen)
+    comes = [one for one in switching(all_sets, nothing) if "spans_s" in one.setting]
+    assert [one.frame for one in comes] == ["sensor", "world"]
+    assert all_sets.made.seen.keys() == known
+    told = np.array(comes[0].setting["spans_s"]) - track.time_s[0]
+    assert told.shape == (3, 2)
+    np.testing.assert_allclose(told, true, atol=1.0)
+    assert comes[0].columns.mag is not None
+    outside = ~np.any([(since_s >= a - 1.0) & (since_s < b + 1.0) for a, b in true], axis=0)
+    at_rows = np.interp(problem.track.time_s, track.time_s, outside) > 0.5
+    assert not np.any(comes[0].columns.mag[at_rows])
