@@ -45,7 +45,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from ahrsd.baselines.data import (
     MethodData,
@@ -263,6 +262,7 @@ def distances(field: Array, b: Array) -> tuple[Array, Array]:
 
 def minimise(function: ResidualOfCentre, start: Array) -> MethodFit:
     """b that minimises the sum of squares of `function`: b -> r (N,), dr/db (N, 3)."""
+    from scipy.optimize import least_squares  # dear to import, and seldom needed
 
     def value(b: Array) -> Array:
         return function(b)[0]

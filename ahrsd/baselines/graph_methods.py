@@ -49,8 +49,6 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.signal import savgol_filter
 
 from ahrsd import so3
 from ahrsd.baselines.data import (
@@ -152,6 +150,8 @@ def _join(parts: list[Kinematics]) -> Kinematics:
 def _segment(data: MethodData, rows: slice, settings: MethodSettings) -> Kinematics | None:
     m, w, dt = data.raw_b_gauss[rows], data.gyro_b_rad_s[rows], data.dt_s[rows][1:, None]
     if settings.derivative == "savgol":
+        from scipy.signal import savgol_filter  # a second that most commands need not wait
+
         length = settings.savgol_window
         if len(m) < length:
             return None
@@ -484,6 +484,8 @@ def unit_volume_model() -> Model:
 
 def estimate_magical_nls(data: MethodData, settings: MethodSettings) -> MethodFit:
     """A, b and w_b.  MethodError where the search diverges or does not end."""
+    from scipy.optimize import least_squares  # dear to import, and only this method needs it
+
     kin, m = per_sample(data, settings), unit_volume_model()
     # the solver asks for the two at the same point one after the other
     kept: dict[bytes, tuple[Array, Array]] = {}

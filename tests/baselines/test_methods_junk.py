@@ -32,7 +32,7 @@ def junk(seed, n, size, smooth, rate):
     derivative=st.sampled_from(["median", "savgol"]),
     constraint=st.sampled_from(["trace", "fang"]),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_junk(method, seed, n, size, smooth, rate, derivative, constraint):
     chosen = MethodSettings(
         derivative=derivative, ellipsoid_constraint=constraint, sigma_mag_gauss=1e-3 * size

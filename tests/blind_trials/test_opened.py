@@ -55,11 +55,13 @@ def test_coarse_steps_are_named_and_nothing_rings_beside_them(tmp_path):
     assert not found.unexplained.detected
 
 
+@pytest.mark.slow
 def test_coarse_steps_that_repeat_are_not_stuck(tmp_path):
     found, _ = answered("ring600b", "f51c6850", tmp_path)
     assert [one.effect for one in found.findings] == ["mag_quantisation"]
 
 
+@pytest.mark.slow
 def test_bursts_have_no_name_of_something_that_passes(tmp_path):
     found, _ = answered("ring600b", "5f89b619", tmp_path)
     assert found.findings == ()

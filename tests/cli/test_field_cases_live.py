@@ -52,7 +52,7 @@ def ahrsd(*arguments: object, timeout_s: float = PATIENCE_S) -> subprocess.Compl
     [
         ("f01_ros2_default.vnbin.gz", 1200, "FA 29 7FFF 0210 000C: skipped"),
         ("f04_ardupilot_50hz.mcap", 2754, "50 Hz (register 75: 800 Hz / 16)"),
-        ("f25_crcrlf.txt", 400, "VNYMR carries no time: 20 Hz"),
+        pytest.param("f25_crcrlf.txt", 400, "VNYMR carries no time: 20 Hz", marks=pytest.mark.slow),
     ],
 )
 def test_a_recording_is_calibrated(name: str, samples: int, said: str, tmp_path: Path) -> None:

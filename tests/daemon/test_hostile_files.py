@@ -93,7 +93,9 @@ def test_a_word_that_ends_in_a_trial_undoes_it_whatever_else_hangs(program, tmp_
         assert running.stop(30.0) == 0
 
 
-@pytest.mark.parametrize("name", ["columns", "operator's word", "journal"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("columns", marks=pytest.mark.slow), "operator's word", "journal"]
+)
 def test_a_fifo_at_any_path_of_others_stops_neither_stream_nor_stop(program, tmp_path, name):
     columns = tmp_path / "columns.json"
     with program(more=f'[terms]\nfile = "{columns}"\n') as running:
@@ -123,7 +125,14 @@ def test_dev_full_as_journal_writes_nothing_and_stops_nothing(program):
         assert running.writes(running.unit.serial) == []
 
 
-@pytest.mark.parametrize("place", ["config", "capture directory", "model", "state directory"])
+@pytest.mark.parametrize(
+    "place",
+    [
+        "capture directory",
+        "state directory",
+        *(pytest.param(one, marks=pytest.mark.slow) for one in ("config", "model")),
+    ],
+)
 def test_a_fifo_where_a_start_reads_ends_in_one_line(program, tmp_path, place):
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)
@@ -194,7 +203,9 @@ def test_a_folder_of_words_that_others_may_write_is_refused_by_name(program, own
         running.stop()
 
 
-@pytest.mark.parametrize("umask", [0o077, 0o022, 0o777])
+@pytest.mark.parametrize(
+    "umask", [0o777, *(pytest.param(one, marks=pytest.mark.slow) for one in (0o077, 0o022))]
+)
 def test_a_caller_with_any_umask_is_heard(program, umask):
     with program() as running:
         running.start()
@@ -204,7 +215,7 @@ def test_a_caller_with_any_umask_is_heard(program, umask):
         running.stop()
 
 
-@pytest.mark.parametrize("umask", [0o022, 0o000])
+@pytest.mark.parametrize("umask", [pytest.param(0o022, marks=pytest.mark.slow), 0o000])
 def test_captures_are_the_owners_alone(program, umask):
     with program(more=LOCATION) as running:
         running.start(umask=umask)

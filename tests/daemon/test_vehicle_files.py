@@ -88,8 +88,17 @@ def until(process, condition):
         time.sleep(0.05)
 
 
-@pytest.mark.parametrize("kind", ["a FIFO", "a folder", "a device"])
-@pytest.mark.parametrize("key", ["interlock", "terms"])
+@pytest.mark.parametrize(
+    ("key", "kind"),
+    [
+        ("interlock", "a FIFO"),
+        ("terms", "a folder"),
+        ("interlock", "a device"),
+        pytest.param("terms", "a FIFO", marks=pytest.mark.slow),
+        pytest.param("interlock", "a folder", marks=pytest.mark.slow),
+        pytest.param("terms", "a device", marks=pytest.mark.slow),
+    ],
+)
 def test_the_daemon_runs_on_says_so_once_and_ends_at_once(emulated, program, tmp_path, kind, key):
     path = tmp_path / "word"
     if kind == "a FIFO":

@@ -106,7 +106,9 @@ def test_a_reading_that_stays_for_long_counts_again():
     assert np.max(thin[1:, 1]) == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize(("rate_hz", "hold"), [(100.0, 10), (100.0, 20), (50.0, 2)])
+@pytest.mark.parametrize(
+    ("rate_hz", "hold"), [(100.0, 10), pytest.param(100.0, 20, marks=pytest.mark.slow), (50.0, 2)]
+)
 def test_held_readings_are_no_magnet_and_the_answer_is_right(rate_hz, hold):
     estimator = Estimator()
     for piece in pieces(recorded(rate_hz, hold, seconds=150.0), 500):

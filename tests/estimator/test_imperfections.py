@@ -72,8 +72,17 @@ def beyond(made, found):
     return float(np.max(np.abs(made.errors(found)[6:9]) / found.sigma[6:9]))
 
 
-@pytest.mark.parametrize("trouble", [scales, shears, turned])
-@pytest.mark.parametrize("motion", [RICH, LEVEL], ids=["rich", "level"])
+@pytest.mark.parametrize(
+    ("trouble", "motion"),
+    [
+        pytest.param(scales, RICH, id="scales-rich"),
+        pytest.param(shears, RICH, id="shears-rich", marks=pytest.mark.slow),
+        pytest.param(turned, RICH, id="turned-rich", marks=pytest.mark.slow),
+        pytest.param(scales, LEVEL, id="scales-level", marks=pytest.mark.slow),
+        pytest.param(shears, LEVEL, id="shears-level"),
+        pytest.param(turned, LEVEL, id="turned-level"),
+    ],
+)
 def test_what_the_instrument_has_is_within_the_sigmas(trouble, motion):
     """Taken for perfect, it makes answers that are wrong by many of their sigmas.
 
@@ -94,7 +103,7 @@ def test_what_the_instrument_has_is_within_the_sigmas(trouble, motion):
     "motion",
     [
         (("roll", 100.0),),
-        (("roll", 60.0), ("circles", 60.0)),
+        pytest.param((("roll", 60.0), ("circles", 60.0)), marks=pytest.mark.slow),
         (("circles", 100.0), ("pitch", 40.0)),
     ],
     ids=["roll", "roll, circles", "circles, pitch"],
@@ -175,7 +184,7 @@ def test_a_field_that_differs_by_attitude_is_no_gyro():
     assert np.all(found.sigma > 0.999 * perfect.sigma)
 
 
-@pytest.mark.parametrize("noise_rad_s", [5e-3, 1e-2])
+@pytest.mark.parametrize("noise_rad_s", [pytest.param(5e-3, marks=pytest.mark.slow), 1e-2])
 def test_noise_of_the_gyro_asks_for_no_scale(noise_rad_s):
     """On slow motion it is large beside the rates: each axis' scale, over its announced sigma."""
     found = []
@@ -393,7 +402,11 @@ LEVEL_AND_LEANING = (("circles", 120.0), ("roll", 40.0), ("pitch", 40.0), ("circ
 CIRCLES = (("circles", 160.0),)
 
 
-@pytest.mark.parametrize("motion", [CIRCLES, LEVEL, LEVEL_AND_LEANING], ids=["c", "l", "ll"])
+@pytest.mark.parametrize(
+    "motion",
+    [CIRCLES, pytest.param(LEVEL, marks=pytest.mark.slow), LEVEL_AND_LEANING],
+    ids=["c", "l", "ll"],
+)
 def test_a_field_that_differs_with_the_heading_is_within_the_sigmas(motion):
     """What of it is the same on all headings is taken for hard iron, and no fit shows that."""
     off = []

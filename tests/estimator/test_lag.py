@@ -65,7 +65,7 @@ def test_where_there_is_no_lag_none_is_found(bench):
     assert lags == [0.0] * 6
 
 
-@pytest.mark.parametrize("factor", [0.75, 1.1])
+@pytest.mark.parametrize("factor", [pytest.param(0.75, marks=pytest.mark.slow), 1.1])
 def test_times_or_units_that_are_wrong_are_no_answer(bench, factor):
     run = bench.simulate("mam", "rov", 2, samples=5000)
     gyro = run.block.gyro_b_rad_s * factor
@@ -110,7 +110,13 @@ def test_a_rate_across_a_cut_is_that_of_the_side_that_is_linked():
 
 
 @pytest.mark.recordings
-@pytest.mark.parametrize("name", ["02_undisturbed_slow_rotation_B", "21_undisturbed_fast_combined"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("02_undisturbed_slow_rotation_B", marks=pytest.mark.slow),
+        "21_undisturbed_fast_combined",
+    ],
+)
 def test_the_lag_of_a_real_instrument(name):
     found = calibrate(BROAD / f"{name}.csv.gz", Config()).estimate
     # optics say 11.5 ms; half a step of its 286 Hz more, because its rate is sampled

@@ -46,7 +46,9 @@ def test_a_magnet_put_on_early(bench, kind, seed):
     assert np.linalg.norm(error) < 0.01
 
 
-@pytest.mark.parametrize("kind", ["wam", "mam", pytest.param("lam", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", ["wam", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("mam", "lam"))]
+)
 def test_iron_that_stays_is_not_divided(bench, kind):
     for seed in range(3):
         run = bench.simulate(kind, "slow", seed, samples=4000)
@@ -56,9 +58,12 @@ def test_iron_that_stays_is_not_divided(bench, kind):
 @pytest.mark.recordings
 @pytest.mark.parametrize(
     "name",
-    ["32_disturbed_attached_magnet_1cm", "34_disturbed_attached_magnet_3cm",
-     "36_disturbed_attached_magnet_5cm"],
-)  # fmt: skip
+    [
+        "36_disturbed_attached_magnet_5cm",
+        pytest.param("32_disturbed_attached_magnet_1cm", marks=pytest.mark.slow),
+        pytest.param("34_disturbed_attached_magnet_3cm", marks=pytest.mark.slow),
+    ],
+)
 def test_a_magnet_that_was_taken_off_again(name):
     found = calibrate(BROAD / f"{name}.csv.gz", Config()).estimate
     # 0.58, 0.135 and 0.06 G from about 40 to 97 s; without it the sensor has next to none
@@ -136,7 +141,7 @@ def misalignment_of(bench, run):
     return estimator.misalignment()
 
 
-@pytest.mark.parametrize("kind", ["wam", "mam"])
+@pytest.mark.parametrize("kind", [pytest.param("wam", marks=pytest.mark.slow), "mam"])
 def test_a_turned_magnetometer_is_found(bench, kind):
     theta = np.array([0.012, -0.02, 0.009])
     run = bench.simulate(kind, "rov", 7)

@@ -29,11 +29,12 @@ from ahrsd.simulation import ScenarioSettings, simulate
 pytest.importorskip("duckdb", reason="duckdb (the extra fleet) is not installed")
 
 PLACE = Place(2, LOADS)
+ONE = Place(1, LOADS)  # for a single recording
 
 
-def ran(archive: Path | str, out: Path, **orders: object) -> Progress:
+def ran(archive: Path | str, out: Path, place: Place = ONE, **orders: object) -> Progress:
     given = Orders(out=str(out), **orders)  # type: ignore[arg-type]
-    return run(Archive(str(archive)), given, EXAMINER, PLACE, lambda _: None)
+    return run(Archive(str(archive)), given, EXAMINER, place, lambda _: None)
 
 
 def rows(out: Path) -> dict[str, dict[str, object]]:
@@ -59,7 +60,7 @@ def archive(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def out(archive):
-    done = ran(archive, archive.parent / "out")
+    done = ran(archive, archive.parent / "out", PLACE)
     assert done.left_out == {".md": 1}
     assert done.done == done.total == 8
     assert done.failed == 4

@@ -129,8 +129,15 @@ def besides(experiment, kind, around):
     return trajectory, nuisances.together(*parts)
 
 
-@pytest.mark.parametrize("around", [None, AROUND], ids=["instrument", "and surroundings"])
-@pytest.mark.parametrize("kind", [AS_SPECIFIED, ASSEMBLED], ids=["as specified", "assembled"])
+@pytest.mark.parametrize(
+    ("kind", "around"),
+    [
+        pytest.param(AS_SPECIFIED, None, id="as specified"),
+        pytest.param(ASSEMBLED, AROUND, id="assembled, and surroundings"),
+        pytest.param(ASSEMBLED, None, id="assembled", marks=pytest.mark.slow),
+        pytest.param(AS_SPECIFIED, AROUND, id="specified, and around", marks=pytest.mark.slow),
+    ],
+)
 def test_equals_a_dense_fisher_matrix_with_what_is_known_of_the_imperfections(kind, around):
     experiment = turning()
     readings = Readings(experiment, kind, around)

@@ -58,7 +58,7 @@ def test_the_decisions_are_the_same_to_the_last_digit(found, name):
     assert found(name)["sha256"] == FACTS[name]["sha256"], why
 
 
-@pytest.mark.parametrize("kernels", ["Prescott", "Nehalem"])
+@pytest.mark.parametrize("kernels", ["Prescott", pytest.param("Nehalem", marks=pytest.mark.slow)])
 def test_the_decisions_are_the_same_with_the_kernels_of_another_processor(kernels):
     """OpenBLAS has kernels for each; with those of an older one the last digits differ."""
     names = ["clean_rov_binary", "clean_narrow", "fault_iron"]

@@ -25,6 +25,11 @@ FACTS = tomllib.loads(
 )
 
 
+#: long ones, in the slow form
+LONG = ("drive_2022_rahul.vnraw.gz", "hand_2023_thumatti.vnraw.gz")
+EACH = [pytest.param(one, marks=pytest.mark.slow if one in LONG else ()) for one in FACTS]
+
+
 class Found:
     """A replay and the samples that it saw."""
 
@@ -60,7 +65,7 @@ def replayed(recordings):
     return get
 
 
-@pytest.mark.parametrize("name", FACTS)
+@pytest.mark.parametrize("name", EACH)
 def test_a_recording_replays_to_its_facts(replayed, name):
     facts, summary = FACTS[name], replayed(name).summary
     assert summary["packets"]["valid"] == facts["valid"]
@@ -78,7 +83,7 @@ def test_a_recording_replays_to_its_facts(replayed, name):
         assert np.abs(found - facts["hard_iron_gauss"]).max() < facts["within_gauss"]
 
 
-@pytest.mark.parametrize("name", FACTS)
+@pytest.mark.parametrize("name", EACH)
 def test_the_summary_is_the_contracts(replayed, name):
     found = replayed(name)
     assert faults(found.summary, REPLAY) == []
@@ -152,8 +157,8 @@ def test_a_message_without_a_magnetometer_is_one_line_and_exit_2(run, recordings
 @pytest.mark.parametrize(
     "name",
     [
-        "vn100/walk_circle_2024_sazgar.csv.gz",
-        "vn100/punch_2024_satish.csv.gz",
+        pytest.param("vn100/walk_circle_2024_sazgar.csv.gz", marks=pytest.mark.slow),
+        pytest.param("vn100/punch_2024_satish.csv.gz", marks=pytest.mark.slow),
         "vn100/circles_2024_liu.csv.gz",
         "vn100_distorters/clearIMU.csv.gz",
         "arducopter/log171_MAG_10hz.csv.gz",
@@ -176,7 +181,7 @@ def test_a_replay_costs_little_more_than_its_parsing(recordings):
 
     Both are measured here (benchmarks/daemon/bench_replay.py), so a busy machine does not matter.
     """
-    path = recordings / "vn100" / "hand_2023_thumatti.vnraw.gz"
+    path = recordings / "vn100" / "punch_2024_satish.vnraw.gz"
     spec = importlib.util.spec_from_file_location("bench_replay", BENCHMARK)
     bench = importlib.util.module_from_spec(spec)
     sys.modules["bench_replay"] = bench  # dataclasses look their module up

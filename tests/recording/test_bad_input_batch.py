@@ -140,7 +140,7 @@ def test_too_few_samples(tmp_path, seed, n):
     refused_by(result, ["magical-bfg", "magical-ifg", "magyc-bfg", "magyc-ifg"])
 
 
-@FEW
+@settings(FEW, max_examples=2)
 @given(seed=seeds)
 def test_a_planar_turn(tmp_path, seed):
     result = tried(tmp_path, tumbling(seed, planar=True))

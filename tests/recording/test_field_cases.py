@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -107,19 +105,18 @@ def test_every_case_of_the_folder_is_tried():
     assert listed - here - {name for names in ELSEWHERE.values() for name in names} == set()
 
 
-def ahrsd(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "ahrsd", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+def of_case(case: Case) -> object:
+    """Its diagnosis of several causes takes half a minute."""
+    name = f"{case.file.split('_')[0]}-{case.command}"
+    return pytest.param(case, id=name, marks=pytest.mark.slow if case.named else ())
 
 
-@pytest.mark.parametrize(
-    "case", CASES, ids=lambda case: f"{case.file.split('_')[0]}-{case.command}"
-)
-def test_the_command_line_says_what_is_right(tmp_path, case):
+@pytest.mark.parametrize("case", [of_case(case) for case in CASES])
+def test_the_command_line_says_what_is_right(tmp_path, run, capsys, case):
     written = tmp_path / "answer.json"
-    done = ahrsd(case.command, FOLDER / case.file, "--json", written)
-    shown = done.stdout + done.stderr
-    assert done.returncode == case.code, shown
+    code = run(case.command, FOLDER / case.file, "--json", written)
+    shown = "".join(capsys.readouterr())
+    assert code == case.code, shown
     assert all(line.isprintable() for line in shown.splitlines())
     for words in case.has:
         assert words in shown

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 
 import pytest
@@ -15,8 +14,10 @@ from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.permissions import WRITES
 from ahrsd.writeback.states import Purpose
 
+SEEDS = [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))]
 
-@pytest.mark.parametrize("seed", range(8))
+
+@pytest.mark.parametrize("seed", SEEDS)
 def test_nothing_that_must_not_be(seed):
     history = played(seed)
     assert history.wrong == {}, history.run.notes[-10:]
@@ -24,7 +25,7 @@ def test_nothing_that_must_not_be(seed):
     assert "TRIAL" in history.run.states
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_nothing_that_must_not_be_where_the_owner_may_write_what_calibrates(seed):
     history = ClientHistory(seed, passes=True)
     history.play()
@@ -44,14 +45,12 @@ def test_a_rollback_over_what_the_owner_wrote_would_be_seen(monkeypatch):
     monkeypatch.setattr(flow.Flow, "client_wrote", end_the_trial)
     monkeypatch.setattr(flow, "roll_back", lambda what, **_: undo(what, only_ours=False))
     hits = (9, 15, 16)  # of the first two dozen: such a write must fall into a trial
-    wrong = sum((played(seed, passes=True).wrong for seed in hits), Counter())
-    assert wrong["overwritten"] > 0
+    assert any(played(seed, passes=True).wrong["overwritten"] > 0 for seed in hits)
 
 
 def test_a_save_in_the_middle_of_a_trial_would_be_seen(monkeypatch):
     monkeypatch.setattr(WriteBack, "no_client_save", "")
-    wrong = sum((played(seed).wrong for seed in range(4)), Counter())
-    assert wrong["flash"] > 0
+    assert any(played(seed).wrong["flash"] > 0 for seed in range(4))
 
 
 def test_a_client_that_may_write_what_calibrates_would_be_seen(monkeypatch):

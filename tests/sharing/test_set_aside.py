@@ -21,6 +21,7 @@ SHARES = (SharePolicy("owner", owner=True), SharePolicy("log"))
 ONE = ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2
 NEW = ("1,0,0,0,1,0,0,0,1,0.05,-0.03,0.04", "1,0,0,0,1,0,0,0,1,0.01,-0.02,0.005")
 SLOW = pytest.mark.slow
+QUICK = ((None, True), (1.5, False), (6.0, True))
 TROUBLE = ("power", "swap", "theirs", "silent", "unsafe")
 UNDONE = ["ROLLBACK", "ROLLED_BACK", "CLIENT_SAVED"]
 RESTING = ("OBSERVING", "CANDIDATE", "QUALIFIED", "ROLLED_BACK", "LOCKED")
@@ -162,8 +163,14 @@ def reset(run: CabledRun) -> None:
     assert run.answers("owner") == ["VNRST"]
 
 
-@pytest.mark.parametrize("binary", [True, False])
-@pytest.mark.parametrize("saved_s", [None, 0.0, 1.5, 6.0])
+@pytest.mark.parametrize(
+    ("saved_s", "binary"),
+    [
+        pytest.param(saved_s, binary, marks=() if (saved_s, binary) in QUICK else SLOW)
+        for saved_s in (None, 0.0, 1.5, 6.0)
+        for binary in (True, False)
+    ],
+)
 def test_a_reset_in_a_trial_alone_or_behind_a_save_and_the_trial_goes_on(binary, saved_s):
     """As ntnu's driver saves and resets at every start; another one may only reset."""
     run = on_trial(binary=binary)
@@ -310,7 +317,7 @@ def test_a_driver_in_a_loop_of_resets_keeps_nothing_set_aside_for_ever():
 @pytest.mark.parametrize(
     ("what", "at"),
     [
-        pytest.param(what, at, marks=[] if (at - k) % 30 == 6 else SLOW)
+        pytest.param(what, at, marks=[] if at - k in (6, 36 + 30 * (k % 2)) else SLOW)
         for k, what in enumerate(TROUBLE)
         for at in range(1 + k, 75, 5)
     ],

@@ -101,7 +101,10 @@ def test_while_the_values_are_on_trial_or_proven(binary, when):
 
 
 @STREAMS
-@pytest.mark.parametrize("at", range(1, 36, 5))
+@pytest.mark.parametrize(
+    "at",
+    [pytest.param(at, marks=[] if at % 3 == 1 else pytest.mark.slow) for at in range(1, 36, 5)],
+)
 def test_at_every_command_of_the_save(binary, at):
     run = CabledRun(two_units(binary=binary))
     run.proven()
@@ -121,7 +124,10 @@ def test_at_every_command_of_the_save(binary, at):
 
 
 @STREAMS
-@pytest.mark.parametrize("at", range(1, 22, 4))
+@pytest.mark.parametrize(
+    "at",
+    [pytest.param(at, marks=[] if at % 8 == 1 else pytest.mark.slow) for at in range(1, 22, 4)],
+)
 def test_a_rollback_writes_nothing_into_another_unit(binary, at):
     run = CabledRun(two_units(binary=binary))
     run.approve()
@@ -144,7 +150,10 @@ def test_a_rollback_writes_nothing_into_another_unit(binary, at):
     assert np.allclose(float(spare.held()[0].split(",")[9]), 0.2)
 
 
-@pytest.mark.parametrize("steps", range(16, 30))
+@pytest.mark.parametrize(
+    "steps",
+    [pytest.param(n, marks=[] if n % 4 == 0 else pytest.mark.slow) for n in range(16, 30)],
+)
 def test_a_unit_that_has_the_cable_while_a_save_ends_confirms_nothing(steps):
     """It starts up there, so a time falls; the first one did not restart and is back.
 

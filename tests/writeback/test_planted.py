@@ -137,6 +137,8 @@ ROLLED_BACK: tuple[Bad, ...] = (
     planar_cap, partial_motion, other_compass, soft_iron_twice, soft_iron_inverted, wrong_sign,
     magnet_nearby, double_correction, another_device, hsi_active, gyro_sign,
 )  # fmt: skip
+# too much or too little iron, as others of these have it
+LIKE_OTHERS: tuple[Bad, ...] = (partial_motion, other_compass, soft_iron_twice, another_device)
 # A matrix that is not symmetric is none that the estimator can find: refused before the first byte.
 REFUSED: tuple[Bad, ...] = (other_compass_turned, mounting_turned, soft_iron_in_place)
 
@@ -205,7 +207,14 @@ def holds_what_it_held(run: VirtualRun, scenario: str) -> bool:
 
 
 @pytest.mark.parametrize("scenario", ["rov", pytest.param("calibrated", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("bad", ROLLED_BACK, ids=lambda bad: bad.__name__)
+@pytest.mark.parametrize(
+    "bad",
+    [
+        pytest.param(bad, marks=pytest.mark.slow if bad in LIKE_OTHERS else ())
+        for bad in ROLLED_BACK
+    ],
+    ids=lambda bad: bad.__name__,
+)
 def test_what_got_past_the_gates_is_rolled_back_within_the_trial(bad, scenario):
     if bad is hsi_active:
         scenario = "calibrated"  # on a device in factory state it is no change at all
@@ -225,7 +234,7 @@ def test_what_no_estimate_can_be_is_never_sent(bad):
     assert any("not symmetric" in text for _, text in run.notes)
 
 
-@pytest.mark.parametrize("output", ["ascii", "imu", "binary"])
+@pytest.mark.parametrize("output", ["ascii", "imu", pytest.param("binary", marks=pytest.mark.slow)])
 def test_the_right_values_are_proven_and_stay(output):
     """Also on streams without the device's time, which stands still while the output is paused."""
     run = on_trial("rov", right(draw_truth(SEED)), output=output)
@@ -256,6 +265,9 @@ GATED = {
     "the on-board estimator": Setup("hsi-active", SEED, output="binary", rate_hz=20),
 }
 
+#: in the quick form a motion that leaves something open, and an estimator on board
+SLOW_GATED = ("partial motion", "a magnet nearby")
+
 GUARDS = {  # one of these is red in the end
     "planar motion": {"motion.planar_circle", "observability.held", "heldout_heading.windows"},
     "partial motion": {"motion.heading", "observability.converged"},
@@ -264,7 +276,10 @@ GUARDS = {  # one of these is red in the end
 }
 
 
-@pytest.mark.parametrize("name", GATED)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name in SLOW_GATED else ()) for name in GATED],
+)
 def test_through_the_real_gates_nothing_of_it_reaches_the_flash(name):
     """Whatever qualifies is approved at once; three minutes, with the world model's field."""
     policy = WriteBackPolicy(mode=Mode.COMMIT)

@@ -49,7 +49,10 @@ def test_a_step_of_the_iron_ends_what_is_not_saved_yet(when):
     assert run.core.writeback.history.rollbacks == 0  # the values were right when they were written
 
 
-@pytest.mark.parametrize("at", range(1, 36, 5))
+@pytest.mark.parametrize(
+    "at",
+    [pytest.param(at, marks=[] if at % 3 == 1 else pytest.mark.slow) for at in range(1, 36, 5)],
+)
 def test_at_every_command_of_the_save(at):
     run, heard = CabledRun(two_units()), []
     run.proven()
@@ -66,7 +69,7 @@ def test_at_every_command_of_the_save(at):
     undone(run)
 
 
-@pytest.mark.parametrize("at", [1, 12, 30])
+@pytest.mark.parametrize("at", [1, 12, pytest.param(30, marks=pytest.mark.slow)])
 def test_a_save_whose_checks_take_long_is_decided_anew(at, monkeypatch):
     """No sample comes during the checks, so nobody sees whether the vehicle changed."""
     monkeypatch.setattr("ahrsd.writeback.flow.RETRY_SAVE_S", 12.0)  # not ten minutes

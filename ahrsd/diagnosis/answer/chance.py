@@ -33,7 +33,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq
 
 from ahrsd.diagnosis.answer.diagnosis import Check, Diagnosis, Finding, Unexplained
 from ahrsd.diagnosis.answer.predictive import beside_refitted, checks, usual_noise
@@ -260,6 +259,8 @@ def _told(found: Diagnosis) -> list[float]:
 
 def times_beyond(copies: int, chance: float) -> float:
     """How many times the largest of so many must be surpassed for so small a chance."""
+    from scipy.optimize import brentq  # dear to import, and seldom needed
+
     orders = np.arange(1, copies + 1)
 
     def too_likely(log_times: float) -> float:

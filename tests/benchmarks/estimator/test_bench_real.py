@@ -21,6 +21,7 @@ def bench():
     return module
 
 
+@pytest.mark.slow
 @pytest.mark.benchmark
 def test_circles_calibrate_and_the_drive_judges(bench, recordings):
     """A car with 0.35 G of iron: useless before, as good as the reference can tell after."""
@@ -53,6 +54,7 @@ def test_a_sensor_at_rest_is_refused_by_all(bench, recordings):
         assert row.reason
 
 
+@pytest.mark.slow
 @pytest.mark.benchmark
 def test_one_sensor_on_two_fists(bench, recordings):
     """y and z are about (0.03, -0.45) G whoever wears it; x, along the arm, is the weak one."""

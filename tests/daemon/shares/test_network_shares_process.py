@@ -38,6 +38,7 @@ class Reader:
 
     def __init__(self, connection: socket.socket) -> None:
         self.connection, self.data, self.ended = connection, b"", False
+        self._read, self._records = 0, []
         connection.settimeout(0.2)
         self._closing = False
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -56,8 +57,11 @@ class Reader:
                 self.data += piece
 
     def records(self, kind: str) -> list[dict]:
-        lines = self.data.splitlines()[: self.data.count(b"\n")]
-        return [record for record in map(json.loads, lines) if record["record"] == kind]
+        """Asked again and again: each line is read once."""
+        whole = self.data.rfind(b"\n") + 1
+        self._records += map(json.loads, self.data[self._read : whole].splitlines())
+        self._read = max(whole, self._read)
+        return [record for record in self._records if record["record"] == kind]
 
     def close(self) -> None:
         self._closing = True

@@ -126,7 +126,14 @@ def test_the_noise_is_as_loud_as_it_is_where_it_is_loud():
     assert [name for name, check in known.items() if not check.inside_after] == []
 
 
-@pytest.mark.parametrize("step_gauss", [2e-3, 6e-3, 1.5e-2])
+@pytest.mark.parametrize(
+    "step_gauss",
+    [
+        pytest.param(2e-3, marks=pytest.mark.slow),
+        pytest.param(6e-3, marks=pytest.mark.slow),
+        1.5e-2,
+    ],
+)
 def test_readings_in_coarse_steps_are_simulated_so_and_their_noise_is_what_was_there_before(
     step_gauss,
 ):

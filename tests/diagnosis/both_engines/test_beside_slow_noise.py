@@ -24,6 +24,7 @@ def quiet() -> Track:
     return replace(made(Trial(seed=8)).track, covariates={})
 
 
+@pytest.mark.slow
 def test_a_source_is_told_beside_slow_noise(quiet: Track, ask) -> None:
     noise = 5e-4 * slow(np.random.default_rng(1), len(quiet), 25.0, 2.0)
     on = (quiet.time_s % 97.0) < 41.0

@@ -35,7 +35,7 @@ def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:
 @pytest.mark.parametrize(
     "shape",
     [
-        "quick square",
+        pytest.param("quick square", marks=pytest.mark.slow),
         "pulses",
         *(pytest.param(shape, marks=pytest.mark.slow) for shape in ("square", "levels")),
     ],

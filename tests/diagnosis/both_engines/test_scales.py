@@ -23,6 +23,7 @@ def _quiet(seed: int) -> tuple[Track, Readings]:
     return track, readings_of(fit_null(track, walk=False).context())
 
 
+@pytest.mark.slow
 def test_a_compensation_on_board_is_named_once_with_its_part(ask: Ask) -> None:
     track, readings = _quiet(3)
     effect = EFFECTS["onboard_calibration_active"]
@@ -37,7 +38,7 @@ def test_a_compensation_on_board_is_named_once_with_its_part(ask: Ask) -> None:
     assert found.where.frame == "sensor"
 
 
-@pytest.mark.parametrize("seed", [3, 6])
+@pytest.mark.parametrize("seed", [pytest.param(3, marks=pytest.mark.slow), 6])
 def test_what_creeps_in_steps_is_known_to_what_its_onset_leaves_open(seed: int, ask) -> None:
     """A device that updates every eight seconds; of a smooth curve the part is known too well."""
     track, readings = _quiet(seed)

@@ -53,7 +53,9 @@ def _agrees(found: Diagnosis) -> None:
     assert found.p_value > 1e-3
 
 
-@pytest.mark.parametrize("kind", PLAIN)
+@pytest.mark.parametrize(
+    "kind", [PLAIN[0], *(pytest.param(kind, marks=pytest.mark.slow) for kind in PLAIN[1:])]
+)
 def test_an_exact_reference_attitude_is_no_mismatch_and_changes_nothing(
     kind: tuple[str, str, int, float, float],
 ) -> None:
@@ -67,15 +69,15 @@ def test_an_exact_reference_attitude_is_no_mismatch_and_changes_nothing(
     "kind",
     [
         ("wam", "slow", 0, 5e-2, 5e-2),
-        ("wam", "slow", 3, 5e-2, 5e-2),
-        ("mam", "slow", 0, 5e-2, 5e-2),
+        pytest.param(("wam", "slow", 3, 5e-2, 5e-2), marks=pytest.mark.slow),
+        pytest.param(("mam", "slow", 0, 5e-2, 5e-2), marks=pytest.mark.slow),
         ("wam", "slow", 0, 0.0, 5e-3),
-        ("mam", "rov", 1, 0.0, 5e-3),
-        ("wam", "slow", 0, 1e-4, 5e-2),
-        ("wam", "slow", 3, 1e-4, 5e-2),
+        pytest.param(("mam", "rov", 1, 0.0, 5e-3), marks=pytest.mark.slow),
+        pytest.param(("wam", "slow", 0, 1e-4, 5e-2), marks=pytest.mark.slow),
+        pytest.param(("wam", "slow", 3, 1e-4, 5e-2), marks=pytest.mark.slow),
         ("mam", "rov", 1, 1e-4, 5e-2),
-        ("mam", "rov", 0, 0.0, 5e-3),
-        ("mam", "rov", 0, 1e-4, 5e-2),
+        pytest.param(("mam", "rov", 0, 0.0, 5e-3), marks=pytest.mark.slow),
+        pytest.param(("mam", "rov", 0, 1e-4, 5e-2), marks=pytest.mark.slow),
     ],
 )
 def test_noise_far_from_the_usual_is_no_mismatch(
@@ -129,10 +131,10 @@ def _stronger(track: Track) -> Track:
     [
         _turned,
         _permuted,
-        _stronger,
+        pytest.param(_stronger, marks=pytest.mark.slow),
         lambda track: _rows(track, slice(0, 1500)),
-        lambda track: _rows(track, slice(1500, 3000)),
-        lambda track: replace(track, accel_b_m_s2=None),
+        pytest.param(lambda track: _rows(track, slice(1500, 3000)), marks=pytest.mark.slow),
+        pytest.param(lambda track: replace(track, accel_b_m_s2=None), marks=pytest.mark.slow),
     ],
     ids=["turned", "permuted", "stronger", "first half", "second half", "no accelerometer"],
 )

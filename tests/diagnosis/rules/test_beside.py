@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,6 +26,7 @@ from ahrsd.diagnosis.rules.spectrum import spectrum_of
 from ahrsd.diagnosis.track import Spec, Track
 
 
+@cache
 def room(samples: int = 4000) -> Track:
     """A recording in whose remainder a field in sensor axes changes every eight seconds."""
     track = track_of(experiment("wam", motion="rov", samples=samples))
@@ -120,7 +122,9 @@ def test_a_temperature_that_has_a_course_of_its_own_is_named_beside_a_room():
     assert beside_a_room(bent, degrees) == ("mag_bias_temperature",)
 
 
-@pytest.mark.parametrize(("form", "said"), [("field", True), ("gain", False)])
+@pytest.mark.parametrize(
+    ("form", "said"), [pytest.param("field", True, marks=pytest.mark.slow), ("gain", False)]
+)
 def test_a_gain_that_follows_a_current_is_no_field_of_it(form, said, monkeypatch):
     """A supply that sags with the motor's current: what is read grows with the field."""
     track = room()

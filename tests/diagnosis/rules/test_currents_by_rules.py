@@ -26,6 +26,9 @@ SHAPES = {
     "levels": lambda t: np.random.default_rng(7).uniform(0, 10, 100)[(t / 8).astype(int)],
 }
 
+#: those that a test takes which is not slow
+QUICK = ("square", "pulses")
+
 
 def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:
     covariates = {"motor_current_a": current} if logged else {}
@@ -34,7 +37,10 @@ def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:
     )
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+    "shape",
+    [pytest.param(one, marks=() if one in QUICK else pytest.mark.slow) for one in SHAPES],
+)
 @pytest.mark.parametrize("seed", [6, pytest.param(11, marks=pytest.mark.slow)])
 def test_a_logged_current_alone_is_named(shape: str, seed: int) -> None:
     track = track_of(experiment("wam", seed=seed, samples=2500))

@@ -18,7 +18,7 @@ def answer(*effects, seed=3, **more):
     return diagnose(one.track), one
 
 
-@pytest.mark.parametrize("noise", ["white", "red"])
+@pytest.mark.parametrize("noise", ["white", pytest.param("red", marks=pytest.mark.slow)])
 def test_nothing_is_said_where_nothing_is_wrong(noise):
     found, _ = answer(noise=noise)
     assert not found.mismatch
@@ -54,6 +54,7 @@ def test_two_effects_are_both_named_and_nothing_else():
     assert step.cost_if_left_out.hard_iron_shift_gauss > 2e-4
 
 
+@pytest.mark.slow
 def test_the_current_is_named_if_logged_and_unknown_if_not():
     seen, one = answer(("motor_current_field", 0.5))
     assert [x.effect for x in seen.findings] == ["motor_current_field"]

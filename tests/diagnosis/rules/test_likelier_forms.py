@@ -47,11 +47,17 @@ def swung(track: Track, temperature_c: np.ndarray) -> Track:
     return replace(track, covariates={"temperature_c": temperature_c})
 
 
-def test_a_jump_of_the_field_that_is_half_a_bump_of_the_gyro(track: Track) -> None:
+@pytest.fixture(scope="module")
+def bumped(track: Track) -> tuple[State, list[Survey], unknown.Remainder]:
+    """A jump of the field for what is a bump of the gyro."""
     phase = np.clip((track.time_s - 120.0) / 40.0, 0.0, 1.0)
     bump = np.sin(np.pi * phase)[:, None] ** 2 * np.array([8e-4, -6e-4, 9e-4])
-    bumped = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + bump, covariates={})
-    state, surveys, left = named(bumped, "field_step")
+    gyro = track.gyro_b_rad_s + bump
+    return named(replace(track, gyro_b_rad_s=gyro, covariates={}), "field_step")
+
+
+def test_a_jump_of_the_field_that_is_half_a_bump_of_the_gyro(bumped) -> None:
+    state, surveys, left = bumped
     assert unknown.detected(left, LIMITS)
     after, seen, rest = without_likelier_forms(state, surveys, left)
     assert (after.names, seen) == ((), [])
@@ -123,12 +129,9 @@ def test_a_mount_no_worse_than_any_is_not_said_amid_more(track: Track) -> None:
     assert likelier_forms._of_sensors_themselves(large, loud, [0]) == []
 
 
-def test_what_is_worth_more_than_the_rest_it_was_found_in_stays(track: Track) -> None:
+def test_what_is_worth_more_than_the_rest_it_was_found_in_stays(bumped) -> None:
     """A bump of the gyro beside a step: in white noise one is the other's, in a room it is not."""
-    phase = np.clip((track.time_s - 120.0) / 40.0, 0.0, 1.0)
-    bump = np.sin(np.pi * phase)[:, None] ** 2 * np.array([8e-4, -6e-4, 9e-4])
-    bumped = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + bump, covariates={})
-    state, surveys, left = named(bumped, "field_step")
+    state, surveys, left = bumped
     rest = left.strongest.evidence
     found = replace(state, named=(replace(state.named[0], evidence=rest + 1.0),))
     beside = frozenset({"field_step"})

@@ -63,6 +63,7 @@ def test_the_motor_current_is_named_on_the_inner_compass() -> None:
     assert len(named(found, "mag_time_lag")) == 1
 
 
+@pytest.mark.slow
 def test_the_motor_current_is_not_named_on_the_outer_compass() -> None:
     found = diagnosed("arducopter/log171_MAG_10hz.csv.gz")
     assert named(found, "motor_current_field") == []

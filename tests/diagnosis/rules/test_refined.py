@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -53,9 +54,32 @@ def drifting(rad_s_sqrt_s: float) -> Track:
     return replace(track, gyro_b_rad_s=track.gyro_b_rad_s + np.cumsum(walk, axis=0))
 
 
+@cache
+def left_of_switched(gauss: float) -> tuple[State, Remainder]:
+    """What several tests begin with."""
+    return left_of(switched(gauss))
+
+
+@cache
+def left_of_step() -> tuple[State, Remainder]:
+    """A step of the hard iron, before it has a name."""
+    return left_of(stepped())
+
+
+@cache
+def stepped() -> Track:
+    return made(Trial(7, effects=(("hard_iron_step", 0.6),))).track
+
+
+@cache
+def robust_p_of_step() -> float:
+    """What its blocks say of the step."""
+    return survey(left_of_step()[0]).judged[0].robust_family_p
+
+
 @pytest.mark.parametrize(("gauss", "alone", "beside"), [(0.0, 0, 0), (2.2e-4, 1, 0), (4e-4, 1, 1)])
 def test_alone_less_is_asked_of_it_than_beside_a_name(gauss, alone, beside) -> None:
-    state, left = left_of(switched(gauss))
+    state, left = left_of_switched(gauss)
     assert unknown.detected(left, LIMITS) == bool(beside)
     same, rest, seen = left_alone(state.fit, state, left)
     assert same is state
@@ -93,12 +117,12 @@ def wobbling(gauss: float, noise: str, turn_s: float) -> Track:
         (0.9e-4, "white", 8.5, False),
         (1.0e-4, "white", 30.0, True),
         # what is red may be the noise's own, also where that is next to white
-        (0.0, "red", 8.5, False),
+        pytest.param(0.0, "red", 8.5, False, marks=pytest.mark.slow),
         pytest.param(1.2e-4, "white", 8.5, False, marks=pytest.mark.slow),
         # and where it is slow; but nothing that forgets within two seconds is as slow as this
         pytest.param(8e-4, "white", 8.5, False, marks=pytest.mark.slow),
         (8e-4, "red", 8.5, False),
-        (1.2e-3, "white", 8.5, True),
+        pytest.param(1.2e-3, "white", 8.5, True, marks=pytest.mark.slow),
     ],
 )
 def test_a_quick_course_is_seen_alone_where_it_can_be_no_noise(gauss, noise, turn_s, told) -> None:
@@ -143,7 +167,7 @@ def test_where_a_quick_course_can_be_no_noise(monkeypatch, colour, slow, asked) 
     ],
 )
 def test_a_field_alone_of_whatever_course(slow, quick, gyro, frame) -> None:
-    _, left = left_of(switched(0.0))
+    _, left = left_of_switched(0.0)
     nats = {"sensor": -1.1, "world": slow, "gyro": gyro}
     located = {k: replace(one, evidence=nats[k]) for k, one in left.located.items()}
     courses = {"sensor": replace(left.quick["sensor"], evidence=quick)}
@@ -160,11 +184,9 @@ def test_a_field_alone_of_whatever_course(slow, quick, gyro, frame) -> None:
 
 @pytest.mark.parametrize(("times", "named"), [(5.0, True), (50.0, False)])
 def test_a_name_that_few_blocks_show_is_told_where_it_explains_all(times, named) -> None:
-    track = made(Trial(7, effects=(("hard_iron_step", 0.6),))).track
-    state, left = left_of(track)
-    assert unknown.detected(left, LIMITS)
-    strict = replace(LIMITS, robust_family_p=survey(state).judged[0].robust_family_p / times)
-    state, left = left_of(track, strict)
+    assert unknown.detected(left_of_step()[1], LIMITS)
+    strict = replace(LIMITS, robust_family_p=robust_p_of_step() / times)
+    state, left = left_of(stepped(), strict)
     assert survey(state).judged[0].refused == (ROBUST,)
     found = explained(state, left, strict.alone())
     assert (found is not None) == named
@@ -193,7 +215,7 @@ def test_a_name_that_few_blocks_show_is_told_where_it_explains_all(times, named)
     ],
 )
 def test_a_smooth_course_alone(monkeypatch, nats, colour, frame) -> None:
-    state, left = left_of(switched(0.0))
+    state, left = left_of_switched(0.0)
     basis = replace(formed_basis_of(state), colour=colour)
     monkeypatch.setattr(refined_module, "formed_basis_of", lambda _: basis)
     monkeypatch.setattr(refined_module, "smooth_nats", lambda _: dict(nats))
@@ -208,11 +230,8 @@ def test_a_smooth_course_alone(monkeypatch, nats, colour, frame) -> None:
 
 
 def test_a_name_hardly_likelier_than_a_smooth_course_is_none(monkeypatch) -> None:
-    track = made(Trial(7, effects=(("hard_iron_step", 0.6),))).track
-    strict = replace(
-        LIMITS, robust_family_p=survey(left_of(track)[0]).judged[0].robust_family_p / 5
-    )
-    state, left = left_of(track, strict)
+    strict = replace(LIMITS, robust_family_p=robust_p_of_step() / 5)
+    state, left = left_of(stepped(), strict)
     asked: list[tuple[str, ...]] = []
 
     def hardly(tried: State) -> tuple[list[int], str]:
@@ -237,6 +256,6 @@ def test_a_name_that_leaves_something_is_none() -> None:
 
 
 def test_a_name_that_passes_everything_was_asked_before_and_is_not_told_here() -> None:
-    state, left = left_of(made(Trial(7, effects=(("hard_iron_step", 0.6),))).track)
+    state, left = left_of_step()
     assert survey(state).judged[0].accepted
     assert explained(state, left, LIMITS.alone()) is None

@@ -36,6 +36,7 @@ def test_a_start_up_between_the_grids_time_constants() -> None:
     assert np.abs(got - value).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_a_slow_pulsation_may_be_a_way_where_no_position_is_logged() -> None:
     """Through a field that differs from place to place."""
     nowhere = diagnose(_pulsed()[0])

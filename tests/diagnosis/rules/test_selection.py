@@ -180,7 +180,9 @@ def test_a_name_is_borne_out_by_what_is_gained_beyond_its_price(crossed):
     assert borne_out(crossed, crossed, more, seen)
 
 
-@pytest.mark.parametrize(("share", "named"), [(0.03, 1), (0.5, 2)])
+@pytest.mark.parametrize(
+    ("share", "named"), [pytest.param(0.03, 1, marks=pytest.mark.slow), (0.5, 2)]
+)
 def test_vibration_by_two_columns_is_named_once_unless_both_say_much(share, named) -> None:
     """How it shakes is told by the shaft and by the current, neither exactly."""
     track = made(Trial(7, scenario="wam", samples=8000)).track

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import pytest
 from mismatch_trials import Trial, made
 
@@ -17,6 +19,7 @@ from ahrsd.diagnosis.track import Spec
 DRIFT, OUTSIDE = "hard_iron_drift", "geomagnetic_drift"
 
 
+@cache
 def named(true: str, said: str) -> tuple[State, Survey, Survey]:
     """A state with that name for what is in the recording, the survey without it, and the last."""
     trial = Trial(5, samples=4_000, sigma_mag=5e-4, effects=((true, 1.0),))

@@ -1,6 +1,7 @@
 """A drift of the hard iron and a compensation on board, each forced in the other's place."""
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 from mismatch_trials import Trial, made
@@ -18,6 +19,7 @@ from ahrsd.diagnosis.track import Spec
 DRIFT, ON_BOARD = "hard_iron_drift", "onboard_calibration_active"
 
 
+@cache
 def forced(true: str, strength: float, said: str) -> tuple[State, list[Survey], Survey]:
     """A state that has another name for what is in the recording, its surveys and the last."""
     trial = Trial(5, samples=4_000, sigma_mag=5e-4, effects=((true, strength),))

@@ -69,7 +69,9 @@ def test_random_faults_end_in_samples_and_in_a_stop():
     assert tally.samples > 500
 
 
-@pytest.mark.parametrize("number", [506, 1079, 1499, 2375])
+@pytest.mark.parametrize(
+    "number", [506, 1079, *(pytest.param(n, marks=pytest.mark.slow) for n in (1499, 2375))]
+)
 def test_schedules_that_once_ended_badly_end_well(number):
     """Two went on without a sample, two with outputs in the device that nobody had kept."""
     tally = campaign_faults.FaultTally()

@@ -9,7 +9,7 @@ from ahrsd.writeback.states import Mode, State
 from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Word, Write
 
-HISTORIES, STEPS = 60, 120
+STEPS = 120
 
 
 class Watchman:
@@ -75,9 +75,10 @@ def act(rig, watchman, rng):
 
 
 @pytest.mark.parametrize("mode", [Mode.OBSERVE, Mode.STAGE, Mode.COMMIT])
-def test_what_never_happens(make_rig, mode):
+@pytest.mark.parametrize("histories", [30, pytest.param(120, marks=pytest.mark.slow)])
+def test_what_never_happens(make_rig, mode, histories):
     stages = saves = 0
-    for seed in range(HISTORIES):
+    for seed in range(histories):
         rng = np.random.default_rng(seed)
         trial = TrialPolicy(interlock=bool(seed % 2))
         rig = make_rig(mode, trial=trial, cooldown_s=0.0, min_interval_s=0.0)
@@ -90,5 +91,5 @@ def test_what_never_happens(make_rig, mode):
                 assert rig.device.held()[23] != rig.device.held("flash")[23]
         assert rig.device.flash_writes <= rig.wb.history.flashes
         stages, saves = stages + watchman.stages, saves + watchman.saves
-    assert (stages > 100) is (mode >= Mode.STAGE)
-    assert (saves > 5) is (mode is Mode.COMMIT)
+    assert (stages > histories) is (mode >= Mode.STAGE)
+    assert (saves > histories / 12) is (mode is Mode.COMMIT)

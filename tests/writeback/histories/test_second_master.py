@@ -49,7 +49,7 @@ def test_their_value_is_found_within_the_interval_and_stays(binary, when):
 @STREAMS
 @pytest.mark.parametrize(
     "at",
-    [pytest.param(at, marks=[] if at % 2 else pytest.mark.slow) for at in range(1, 33, 5)],
+    [pytest.param(at, marks=[] if at in (1, 21) else pytest.mark.slow) for at in range(1, 33, 5)],
 )
 def test_just_before_the_save(binary, at):
     run, heard = CabledRun(two_units(binary=binary)), []
@@ -79,7 +79,7 @@ def test_a_rollback_does_not_write_over_it():
 
 @STREAMS
 @pytest.mark.parametrize(
-    "nth", [1, 5, *(pytest.param(nth, marks=pytest.mark.slow) for nth in (3, 7, 9))]
+    "nth", [1, *(pytest.param(nth, marks=pytest.mark.slow) for nth in (3, 5, 7, 9))]
 )
 def test_a_restart_between_the_two_registers_leaves_no_half_a_calibration(binary, nth):
     """After 23 was written; its time goes on in a text stream, which carries none."""
@@ -145,11 +145,11 @@ def test_passive_asks_nothing():
 def test_the_reads_are_rare_and_the_stream_goes_on():
     run = CabledRun(two_units(binary=True), planted=False, mode=Mode.OBSERVE)
     heard, samples = len(run.cable.unit.log), run.core.stream.facts.samples
-    run.run(300.0)
+    run.run(100.0)
     reads = run.cable.unit.log[heard:]
-    assert 28 * 9 <= len(reads) <= 32 * 9  # who, what it holds, and again who; every 10 s
+    assert 9 * 9 <= len(reads) <= 11 * 9  # who, what it holds, and again who; every 10 s
     assert {line.split(",")[0] for line in reads} == {"VNRRG"}
-    assert run.core.stream.facts.samples - samples >= 300.0 * 20 - 20
+    assert run.core.stream.facts.samples - samples >= 100.0 * 20 - 20
     assert run.core.stream.gaps == []
 
 

@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
+import pytest
 import write_histories
 from scripted_world import fitted
 
-HISTORIES, CLIENTS, REAL = 100, 40, 1
+REAL = 1
 
 
-def test_random_histories_write_nothing_wrong():
+@pytest.mark.parametrize("histories", [40, pytest.param(200, marks=pytest.mark.slow)])
+def test_random_histories_write_nothing_wrong(histories):
     tally = write_histories.HistoriesTally()
     with fitted():
-        for number in range(HISTORIES):
+        for number in range(histories):
             write_histories.run_one(number, 1, tally)
     assert tally.wrong == []
-    assert tally.seen["writes"] > HISTORIES
-    assert tally.seen["saves"] > HISTORIES / 10
-    assert tally.seen["CONFIRMED"] > HISTORIES / 30
+    assert tally.seen["writes"] > histories
+    assert tally.seen["saves"] > histories / 10
+    assert tally.seen["CONFIRMED"] > histories / 30
 
 
-def test_histories_with_a_driver_that_saves_and_writes_are_as_right():
+@pytest.mark.parametrize("histories", [16, pytest.param(80, marks=pytest.mark.slow)])
+def test_histories_with_a_driver_that_saves_and_writes_are_as_right(histories):
     tally = write_histories.HistoriesTally()
     with fitted():
-        for number in range(CLIENTS):
+        for number in range(histories):
             write_histories.run_with_client(number, 1, tally)
     assert tally.wrong == []
-    assert tally.seen["client saves"] > CLIENTS / 2
+    assert tally.seen["client saves"] > histories / 2
     assert tally.seen["client writes"] > 0
     assert tally.seen["CONFIRMED"] > 0
 

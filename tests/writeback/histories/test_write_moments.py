@@ -38,14 +38,27 @@ def wrong(event: str, places: list[str], **options: object) -> list[str]:
     return tally.wrong
 
 
-#: of what follows from a client's save in a trial: 15 moments of the 240 that there are
-BEHIND_A_SAVE = range(0, 240, 16)
+def moments(events: list[str]) -> pytest.MarkDecorator:
+    """Each event at a third of the moments, another third for the next; in the slow form at all."""
+    thirds = [pytest.param(event, PLACES[k % 3 :: 3], id=event) for k, event in enumerate(events)]
+    whole = [
+        pytest.param(event, PLACES, id=f"{event}, all", marks=pytest.mark.slow) for event in events
+    ]
+    return pytest.mark.parametrize(("event", "places"), [*thirds, *whole])
 
 
-@pytest.mark.parametrize("event", ["kill and other writes", "swap", "restart", "disk full", "lie",
-    "client saves and resets", "client calibrates",
-    *(pytest.param(event, marks=pytest.mark.slow) for event in ("kill", "host reboots",
-        "other writes", "unsafe for a while", "bad line", "client saves"))])  # fmt: skip
+#: of what follows from a client's save in a trial: 10 moments of the 240 that there are
+BEHIND_A_SAVE = range(0, 240, 24)
+
+
+QUICK = ("kill and other writes", "swap", "disk full", "client saves and resets")
+OTHERS = ("kill", "host reboots", "restart", "other writes", "unsafe for a while", "bad line",
+    "lie", "client saves", "client calibrates")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "event", [*QUICK, *(pytest.param(event, marks=pytest.mark.slow) for event in OTHERS)]
+)
 def test_anything_at_every_moment_behind_a_clients_save_or_reset_in_a_trial(event):
     names = [*write_histories.NAMES, *write_histories.CLIENT_EVENTS]
     tally, does = write_histories.HistoriesTally(), write_histories.ASIDE_FOR
@@ -59,27 +72,37 @@ def test_anything_at_every_moment_behind_a_clients_save_or_reset_in_a_trial(even
 
 
 @pytest.mark.parametrize("stream", ["binary", "imu"])
-@pytest.mark.parametrize("event", ["swap", "swap and back"])
-def test_another_unit_at_every_moment(event, stream):
-    assert wrong(event, PLACES, streams=(stream,)) == []
+@moments(["swap", "swap and back"])
+def test_another_unit_at_every_moment(event, places, stream):
+    assert wrong(event, places, streams=(stream,)) == []
 
 
-def test_another_unit_at_every_moment_where_the_first_is_bound():
-    assert wrong("swap", PLACES, policy=replace(POLICY, serial=ORIGIN_SERIAL)) == []
+@moments(["swap"])
+def test_another_unit_at_every_moment_where_the_first_is_bound(event, places):
+    assert wrong(event, places, policy=replace(POLICY, serial=ORIGIN_SERIAL)) == []
 
 
-@pytest.mark.parametrize("event", ["other writes", "other writes and saves", "other saves"])
-def test_a_second_master_at_every_moment(event):
-    assert wrong(event, PLACES) == []
+@moments(["other writes", "other writes and saves", "other saves"])
+def test_a_second_master_at_every_moment(event, places):
+    assert wrong(event, places) == []
 
 
-@pytest.mark.parametrize("event", ["restart", "other resets"])
-def test_a_restart_seen_or_unseen_at_every_moment(event):
-    assert wrong(event, PLACES) == []
+@moments(["restart", "other resets"])
+def test_a_restart_seen_or_unseen_at_every_moment(event, places):
+    assert wrong(event, places) == []
 
 
-@pytest.mark.parametrize("wall_s", write_histories.WALLS_S)
-@pytest.mark.parametrize("event", ["clock", "kill and time is set", "host reboots"])
+CLOCKS = ("clock", "kill and time is set", "host reboots")
+
+
+@pytest.mark.parametrize(
+    ("event", "wall_s"),
+    [
+        pytest.param(event, wall_s, marks=() if k == j else pytest.mark.slow)
+        for k, event in enumerate(CLOCKS)
+        for j, wall_s in enumerate(write_histories.WALLS_S)
+    ],
+)
 def test_the_hosts_clock_at_every_moment(event, wall_s):
     places = [*PLACES[::3], "after PROVEN", "after VNWNV", "after FLASH_ACKED"]
     assert wrong(event, places, wall_s=wall_s, streams=("binary",)) == []
@@ -91,9 +114,9 @@ def test_a_calibration_that_becomes_void_at_every_moment(event):
     assert wrong(event, ["after RAM_VERIFIED", *proven_on]) == []
 
 
-@pytest.mark.parametrize("event", ["kill", "kill and swap", "kill and other writes"])
-def test_a_killed_program_at_every_moment(event):
-    assert wrong(event, PLACES) == []
+@moments(["kill", "kill and swap", "kill and other writes"])
+def test_a_killed_program_at_every_moment(event, places):
+    assert wrong(event, places) == []
 
 
 @pytest.mark.parametrize("event", ["stop and start", "unsafe for a while", "disk full", "person"])
@@ -101,6 +124,6 @@ def test_ordinary_trouble_at_every_moment(event):
     assert wrong(event, PLACES[::2]) == []
 
 
-@pytest.mark.parametrize("event", ["lie", "bad line", "silence", "journal lost"])
-def test_a_device_and_a_disk_that_lie_at_every_moment(event):
-    assert wrong(event, PLACES) == []
+@moments(["lie", "bad line", "silence", "journal lost"])
+def test_a_device_and_a_disk_that_lie_at_every_moment(event, places):
+    assert wrong(event, places) == []
