@@ -137,12 +137,18 @@ WAM = {
 }
 
 
+LONG = (("magical-ifg", "savgol"), ("magyc-ifg", "median"))
+
+
 @pytest.fixture(scope="module")
 def wam_runs():
     return [simulate("wam", seed).data for seed in range(4)]
 
 
-@pytest.mark.parametrize(("method", "derivative"), WAM)
+@pytest.mark.parametrize(
+    ("method", "derivative"),
+    [pytest.param(*one, marks=pytest.mark.slow if one in LONG else ()) for one in WAM],
+)
 def test_noisy_wam_is_as_published(method, derivative, wam_runs):
     settings = MethodSettings(derivative=derivative, **KNOWN)
     found = [errors(run(method, data, settings)) for data in wam_runs]

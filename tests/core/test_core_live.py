@@ -145,6 +145,7 @@ def same_decisions(run, config):
     return live
 
 
+@pytest.mark.slow
 def test_a_run_and_its_replay_decide_the_same(tmp_path):
     config = config_for(tmp_path, gates={})
     port = tmp_path / "vn100"

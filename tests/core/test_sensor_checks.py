@@ -72,15 +72,23 @@ def said(time_s, field, gyro, rows=10):
 
 
 @pytest.mark.parametrize("kind", ["rest", "planar", "3D"])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 5))]
+)
 def test_a_sound_sensor_is_not_spoken_of(kind, seed):
     checks, told = said(*stream(kind, seed=seed))
     assert told == []
     assert checks.findings == {}
 
 
-@pytest.mark.parametrize("kind", ["xy", "xz", "yz"])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        pytest.param(kind, seed, marks=() if k == seed else pytest.mark.slow)
+        for k, kind in enumerate(("xy", "xz", "yz"))
+        for seed in range(3)
+    ],
+)
 def test_soft_iron_on_a_vehicle_that_turns_about_one_axis_is_no_wrong_sign(kind, seed):
     """What soft iron makes of that turn looks like a large one about the others, to either side."""
     iron = np.eye(3)

@@ -93,7 +93,7 @@ def until(condition):
     ("change", "words"),
     [
         (constant, "the magnetometer gives the same value on all axes"),
-        (saturated_axis, "saturated"),
+        pytest.param(saturated_axis, "saturated", marks=pytest.mark.slow),
         pytest.param(OneInFifty(1e30), "% of the newest", marks=pytest.mark.slow),
         (OneInFifty(float("nan")), "% of the newest"),
         pytest.param(OneInFifty(float("inf")), "% of the newest", marks=pytest.mark.slow),

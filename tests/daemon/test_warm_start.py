@@ -35,6 +35,7 @@ SCENE = Setup(
     baud=115200,
     motion=(("static", 12.0), ("tumble", 2000.0)),
 )
+HALF = replace(SCENE, rate_hz=25)  # for what drives for minutes
 DRIVEN_S, MORE_S = 270.0, 110.0
 VERDICT_S = 45.0  # between two verdicts, at most: a slot is held out
 UNIT = Unit("VN-100", 7, "2.0.0.0")
@@ -42,9 +43,9 @@ FACTORY = {23: (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), 44:
 NOW = inputs.WallClock(0, 1.8e9, "boot", 5000.0)
 
 
-def recorded(folder, **tables):
+def recorded(folder, scene=SCENE, **tables):
     tables = {"gates": lenient_gates(), "write_back": {"recheck_s": 5.0}, **tables}
-    return RecordedRun(build(SCENE), folder, **tables)
+    return RecordedRun(build(scene), folder, **tables)
 
 
 # -- a run that was killed -------------------------------------------------------------------------
@@ -53,9 +54,9 @@ def recorded(folder, **tables):
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """One that goes on for `MORE_S` after `DRIVEN_S`, and one that is killed then."""
-    whole = recorded(tmp_path_factory.mktemp("whole"))
+    whole = recorded(tmp_path_factory.mktemp("whole"), HALF)
     whole.run(DRIVEN_S + 2.0 + MORE_S)
-    killed = recorded(tmp_path_factory.mktemp("killed"))
+    killed = recorded(tmp_path_factory.mktemp("killed"), HALF)
     killed.run(DRIVEN_S)
     first_s = killed.qualified_s
     killed.again(2.0)

@@ -81,6 +81,7 @@ def test_the_journal_tells_the_whole_way(done):
     assert {*records[0]["new"]} == {"23", "84"}
 
 
+@pytest.mark.slow
 def test_a_replay_takes_the_same_decisions(done):
     directory, result, *_ = done
     replayed = replay(directory / "capture.mcap", Config())

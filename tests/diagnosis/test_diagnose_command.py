@@ -144,6 +144,7 @@ def test_a_column_that_cannot_be_used_is_said_and_the_rest_is_answered(run, save
     assert "note: column motor_current_a was left out" in said
 
 
+@pytest.mark.slow
 def test_a_recording_at_rest_names_nothing(run, saved, clean, capsys):
     rng = np.random.default_rng(3)
     rows = len(clean["time_s"])

@@ -355,8 +355,14 @@ def test_single_wild_samples_do_not_move_the_answer():
     assert moved.max() < 3.0
 
 
-@pytest.mark.parametrize("at_once", [1, 5, WHOLE])
-@pytest.mark.parametrize("step_gauss", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize(
+    ("step_gauss", "at_once"),
+    [
+        pytest.param(step, at_once, marks=() if k == j else pytest.mark.slow)
+        for k, step in enumerate((0.02, 0.1, 0.5))
+        for j, at_once in enumerate((1, 5, WHOLE))
+    ],
+)
 def test_a_magnet_that_stays_starts_the_calibration_anew(step_gauss, at_once):
     """Body-fixed from 200 s on: what follows is as good as if nothing had been before."""
     run = bench.simulate("wam", "rov", 4)

@@ -16,6 +16,7 @@ from ahrsd.recording.bytestream import read_received, stamped
 from drivers.vn100.messages import crc16, encode_sentence
 
 COUNT, RATE_HZ = 6000, 100.0
+SLOW = pytest.mark.slow
 DATA = sensor(COUNT, RATE_HZ)
 
 
@@ -51,8 +52,13 @@ STAMPS = {
     "csv": lambda t: f'{1.7e12 + 1e3 * t:.0f},"',
 }
 
+TOLD = ("epoch", "counts", "csv")
 
-@pytest.mark.parametrize("kind", list(STAMPS))
+
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(kind, marks=() if kind in TOLD else pytest.mark.slow) for kind in STAMPS],
+)
 def test_a_time_in_front_of_each_line_is_its_arrival(tmp_path, kind):
     """Messages without a time of their own have the rate at which they came, not a factory's."""
     path = tmp_path / ("a.csv" if kind == "csv" else "a.txt")
@@ -84,16 +90,21 @@ def test_stamps_come_back_in_nanoseconds(tmp_path):
     assert b"".join(item.data for item in items) == "".join(LINES[:80]).encode()
 
 
+CHANGED = {
+    "no line ends": "".join(lines(end="")) + "\r\n",
+    "small letters": "".join(line[:-4] + line[-4:].lower() for line in LINES),
+    "quotes": "".join(f'"{line}"\n' for line in lines(end="")),
+}
+
+
 @pytest.mark.parametrize(
-    "content",
+    ("content", "name"),
     [
-        "".join(lines(end="")) + "\r\n",
-        "".join(line[:-4] + line[-4:].lower() for line in LINES),
-        "".join(f'"{line}"\n' for line in lines(end="")),
+        pytest.param(CHANGED[how], name, id=f"{how}-{name}", marks=() if k == j else SLOW)
+        for k, how in enumerate(CHANGED)
+        for j, name in enumerate(("a.txt", "a.log", "a.csv"))
     ],
-    ids=["no line ends", "small letters", "quotes"],
 )
-@pytest.mark.parametrize("name", ["a.txt", "a.log", "a.csv"])
 def test_lines_that_a_program_changed_are_read(tmp_path, content, name):
     path = tmp_path / name
     path.write_text(content, newline="")
@@ -148,8 +159,15 @@ def test_a_true_stream_with_cr_lf_is_left_alone(tmp_path):
     assert result.core.stream.facts.damaged == 0
 
 
-@pytest.mark.parametrize("first", ["field", "rates"])
-@pytest.mark.parametrize("every", [1, 4])
+@pytest.mark.parametrize(
+    ("every", "first"),
+    [
+        (1, "rates"),
+        (4, "field"),
+        pytest.param(1, "field", marks=pytest.mark.slow),
+        pytest.param(4, "rates", marks=pytest.mark.slow),
+    ],
+)
 def test_field_and_rates_of_two_outputs_are_put_together(tmp_path, first, every):
     """By the device's time, whichever of the two comes first."""
     parts = []

@@ -174,7 +174,7 @@ def test_what_the_device_sent_calibrates_as_its_byte_stream(tmp_path, container,
 
 
 def test_a_real_stream_in_a_bag_calibrates_as_the_stream(recordings, tmp_path):
-    packed = recordings / "vn100" / "circles_2022_rahul.vnraw.gz"
+    packed = recordings / "vn100" / "punch_2024_satish.vnraw.gz"
     lines = gzip.decompress(packed.read_bytes()).splitlines(keepends=True)
     messages = [
         ("/raw", "std_msgs/msg/String", ns_of(k / 40.0), {"data": line.decode("latin-1")})

@@ -47,7 +47,15 @@ def test_nothing_known_before_the_first_arrival() -> None:
     assert clock.to_host(np.array([5.0, 6.5])).tolist() == [100.0, 101.5]
 
 
-@pytest.mark.parametrize("ppm", [-50.0, 0.0, 10.0, 50.0])
+@pytest.mark.parametrize(
+    "ppm",
+    [
+        -50.0,
+        pytest.param(0.0, marks=pytest.mark.slow),
+        10.0,
+        pytest.param(50.0, marks=pytest.mark.slow),
+    ],
+)
 def test_drift_is_found_through_latency_bursts(ppm: float) -> None:
     device_s = np.arange(0.0, 600.0, 0.005)
     rate = 1.0 / (1.0 + ppm * 1e-6)

@@ -56,7 +56,7 @@ def test_before_the_approval(binary, bound):
 @pytest.mark.parametrize(("binary", "silent_s"), [(False, 0.6), (True, 2.0)])
 @pytest.mark.parametrize(
     "at",
-    [pytest.param(at, marks=[] if at % 8 == 1 else pytest.mark.slow) for at in range(1, 57, 4)],
+    [pytest.param(at, marks=[] if at % 16 == 1 else pytest.mark.slow) for at in range(1, 57, 4)],
 )
 def test_at_every_command_of_the_write(binary, at, silent_s):
     """The cable goes at the n-th command after the approval."""

@@ -188,6 +188,7 @@ def test_a_proof_that_nothing_was_heard_of_for_long_is_undone():
     run.cable.unit.measure = measure
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_the_estimator_itself_sees_the_step_and_the_old_values_are_not_saved():
     """The real estimator from the first sample; the vehicle says safe after it is sure again."""

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 
+import pytest
 from cabled_run import lenient_gates
 from patience import PATIENCE_S
 
@@ -88,6 +89,7 @@ class Started:
         return next(f["at_s"] for f in self.facts() if f.get("note", "").startswith("warm start"))
 
 
+@pytest.mark.slow
 def test_a_kill_does_not_lose_the_drive(tmp_path):
     port = tmp_path / "vn100"
     with EmulatorProcess(SCENE, link=port, speed=SPEED, lossless=True):

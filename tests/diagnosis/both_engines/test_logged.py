@@ -76,6 +76,7 @@ def test_a_clock_that_is_wrong_is_said_and_the_cause_named(
         assert value.value == pytest.approx(truth, abs=max(5 * value.std, 1e-4))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", [11, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (12, 13))]
 )
@@ -123,15 +124,15 @@ def test_columns_with_holes(driven) -> None:
 def test_a_current_is_named_at_rest_if_the_field_follows_it(own: bool, ask_logged) -> None:
     """The manoeuvre that tells a current from what the turning does: pulses at rest."""
     rng = np.random.default_rng(5)
-    time_s = np.arange(3000) / 10.0
+    time_s = np.arange(1500) / 10.0
     current, other = levels(time_s, 3), levels(time_s, 9)
-    mag = np.array([0.2, -0.1, 0.4]) + 1e-3 * rng.standard_normal((3000, 3))
+    mag = np.array([0.2, -0.1, 0.4]) + 1e-3 * rng.standard_normal((1500, 3))
     mag += 1e-3 * current[:, None] * np.array([1.0, -0.5, 0.8])
-    gyro = 1e-3 * rng.standard_normal((3000, 3))
-    dt_s = np.full(3000, 0.1)
+    gyro = 1e-3 * rng.standard_normal((1500, 3))
+    dt_s = np.full(1500, 0.1)
     dt_s[0] = np.nan
     columns = {"motor_current_a": current if own else other}
-    still = Track(time_s, dt_s, mag, gyro, None, columns, (slice(0, 3000),))
+    still = Track(time_s, dt_s, mag, gyro, None, columns, (slice(0, 1500),))
     found = ask_logged(still)
     names = [one.effect for one in found.findings]
     assert names == (["motor_current_field"] if own else [])

@@ -59,6 +59,7 @@ def test_iron_that_had_not_settled_is_no_step_and_no_drift(ask) -> None:
     assert abs(seen.setting["time_constant_s"] / 25.0 - 1) < 0.15
 
 
+@pytest.mark.slow
 def test_iron_that_had_settled_is_given_no_memory(ask) -> None:
     track = made(Trial(6, (("viscous_magnetisation", 2.0),), scenario="wam", samples=6000)).track
     (seen,) = ask(track).findings

@@ -54,6 +54,7 @@ def test_what_creeps_in_steps_is_known_to_what_its_onset_leaves_open(seed: int, 
     assert 4e-4 < part.std < 6e-3  # of an onset that is known, 2.5e-4
 
 
+@pytest.mark.slow
 def test_a_slow_pulsation_of_the_outside_field_is_one_name_where_positions_are_logged(
     ask: Ask,
 ) -> None:

@@ -40,10 +40,14 @@ LIBRARY = {
 }
 
 
-def test_a_source_that_swells_is_unknown_and_a_step_a_step(ask) -> None:
+def test_a_source_that_swells_is_unknown(ask) -> None:
     swelled = ask(with_field(swelling), library=LIBRARY)
     assert [one.effect for one in swelled.findings] == []
     assert swelled.unexplained.detected and swelled.unexplained.where.frame == "sensor"
+
+
+@pytest.mark.slow
+def test_a_step_is_a_step(ask) -> None:
     stepped = ask(with_field(stepping), library=LIBRARY)
     assert [one.effect for one in stepped.findings] == ["hard_iron_step"]
     assert not stepped.unexplained.detected

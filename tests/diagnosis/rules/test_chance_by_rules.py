@@ -78,6 +78,7 @@ def test_where_no_simulation_can_be_fitted_neither_yes_nor_no_is_said(monkeypatc
     assert found.to_json()["undecided"].startswith("of 16 simulations")
 
 
+@pytest.mark.slow
 def test_where_the_gyro_is_the_quieter_sensor_nothing_is_simulated() -> None:
     track = track_of(_made(1e-3, 5e-3))
     since = (np.arange(len(track)) >= 1500)[:, None]

@@ -51,6 +51,7 @@ def test_a_logged_current_alone_is_named(shape: str, seed: int) -> None:
         assert parameter.value == pytest.approx(truth, abs=4 * parameter.std + 2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.slow)])
 def test_the_steps_of_an_unlogged_current_are_no_lost_samples(seed: int) -> None:
     track = track_of(experiment("wam", seed=seed, samples=3000))

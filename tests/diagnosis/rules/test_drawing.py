@@ -53,6 +53,7 @@ def test_every_finding_has_its_own_course_in_its_own_unit():
     assert {k: found.terms[v].identifier for k, v in told.items()} == {k: k for k in told}
 
 
+@pytest.mark.slow
 def test_a_delay_is_drawn_as_it_is_in_the_recording():
     found, _ = answer(("mag_time_lag", 3.0))  # 60 ms
     (lag,) = found.findings

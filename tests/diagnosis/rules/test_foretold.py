@@ -104,11 +104,19 @@ def test_what_has_a_moment_of_its_own_is_not_asked(once):
     assert share_foretold(replace(state, named=(judged,)), 0, seen) == 1.0
 
 
-def test_a_diagnosis_asks_and_what_is_refused_is_unknown(monkeypatch):
-    track = made(Trial(3, (("mag_cross_axis", 2.0),), samples=6000)).track
-    assert [one.effect for one in diagnose(track).findings] == ["mag_cross_axis"]
+@pytest.fixture(scope="module")
+def crossed():
+    return made(Trial(3, (("mag_cross_axis", 2.0),), samples=6000)).track
+
+
+@pytest.mark.slow
+def test_what_is_not_refused_is_named(crossed):
+    assert [one.effect for one in diagnose(crossed).findings] == ["mag_cross_axis"]
+
+
+def test_a_diagnosis_asks_and_what_is_refused_is_unknown(crossed, monkeypatch):
     monkeypatch.setattr(foretold, "gain_of", lambda *_, **__: Gain(1.0, 1.01))
-    found = diagnose(track)
+    found = diagnose(crossed)
     assert found.findings == ()
     assert found.unexplained.detected
 

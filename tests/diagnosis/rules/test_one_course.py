@@ -19,6 +19,7 @@ from ahrsd.diagnosis.rules.search import State, formed_basis_of
 from ahrsd.diagnosis.track import Spec
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_two_smooth_effects_are_still_two(seed):
     effects = (("hard_iron_drift", 3.0), ("mag_scale_temperature", 1.0))

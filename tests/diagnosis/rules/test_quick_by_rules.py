@@ -49,7 +49,11 @@ def test_an_alternating_field_needs_no_turns() -> None:
     found = diagnose(replace(still, mag_b_gauss=still.mag_b_gauss + wave))
     assert [one.effect for one in found.findings] == ["ac_interference"]
     assert abs(found.findings[0].setting["frequency_hz"] - 18.46) < 1e-3
-    assert diagnose(still).findings == ()
+
+
+@pytest.mark.slow
+def test_where_hardly_anything_turns_no_line_is_named_of_none() -> None:
+    assert diagnose(_rocking(np.random.default_rng(5))).findings == ()
 
 
 def _rocking(rng: np.random.Generator) -> Track:

@@ -86,6 +86,7 @@ def test_noise_that_forgets_in_two_seconds_is_no_unknown(quiet: Track, seed: int
     assert not answer.unexplained.detected
 
 
+@pytest.mark.slow
 def test_a_name_holds_beside_slow_noise_that_seen_as_white_would_be_a_rest() -> None:
     """Seen as white, what such noise leaves is a rest that no name of this size stands out of."""
     one = made(Trial(12, (("gyro_scale", 1.0),), samples=10_000, rate_hz=40.0, noise="red"))

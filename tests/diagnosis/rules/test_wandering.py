@@ -22,6 +22,7 @@ def track():
     return made(Trial(seed=11, samples=7500, rate_hz=25.0, scenario="wam", noise="white")).track
 
 
+@pytest.mark.slow
 def test_a_bias_that_walks_a_lot_is_named_and_leaves_nothing(track):
     steps = np.random.default_rng(3).normal(size=(len(track), 3)) * np.sqrt(0.04)
     walked = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + 4e-5 * np.cumsum(steps, axis=0))
