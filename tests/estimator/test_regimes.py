@@ -76,22 +76,21 @@ def test_fast_rows_and_readings_that_are_held_do_no_harm(name, hold):
     assert ratio.min() > 0.8 and ratio.max() < 1.5
 
 
-@pytest.mark.parametrize("most", [15, pytest.param(30, marks=pytest.mark.slow)])
-def test_motions_put_together_from_pieces(monkeypatch, most):
+def test_motions_put_together_from_pieces(monkeypatch):
     """Numbers of the iron: hardly one below 0.9 times its bound, and rarely one above 1.5."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     bench = importlib.import_module("bench_regimes")
-    runs = [bench.run(seed, at_once=32) for seed in range(200, 200 + most)]
+    runs = [bench.run(seed, at_once=32) for seed in range(200, 230)]
     sure = [r for r in runs if r.converged and r.told]
-    assert len(sure) >= 2 * most / 3
+    assert len(sure) >= 20
     ratio = np.concatenate([r.iron for r in sure])
     assert np.mean(ratio < 0.9) < 0.04 and ratio.min() > 0.7
     assert np.mean(ratio > 1.5) < 0.04 and ratio.max() < 3.0
     assert 0.6 < np.mean([r.nees for r in sure]) < 1.5
 
 
-@pytest.mark.parametrize("most", [8, pytest.param(16, marks=pytest.mark.slow)])
-def test_an_instrument_with_imperfections_is_known_as_well_as_the_motion_allows(monkeypatch, most):
+@pytest.mark.slow  # a shorter form: test_imperfections
+def test_an_instrument_with_imperfections_is_known_as_well_as_the_motion_allows(monkeypatch):
     """Turned axes, a lag, wrong scales, a bias that drifts: beside the bound that has them too.
 
     The long form is `bench_regimes.py --instrument iron-still`; what is wanted is none below 0.9
@@ -101,10 +100,10 @@ def test_an_instrument_with_imperfections_is_known_as_well_as_the_motion_allows(
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     bench = importlib.import_module("bench_regimes")
     kind = bench.INSTRUMENTS["iron-still"]
-    runs = [bench.run(seed, 32, kind) for seed in range(5000, 5000 + most)]
-    assert sum(r.converged for r in runs) >= 10 * most / 16
+    runs = [bench.run(seed, 32, kind) for seed in range(5000, 5016)]
+    assert sum(r.converged for r in runs) >= 10
     sure = [r for r in runs if r.told]
-    assert len(sure) >= 13 * most / 16
+    assert len(sure) >= 13
     ratio = np.concatenate([r.iron for r in sure])
     assert 0.95 < np.median(ratio) < 1.2
     assert np.mean(ratio < 0.9) < 0.05 and ratio.min() > 0.6

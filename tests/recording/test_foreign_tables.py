@@ -592,7 +592,15 @@ def test_a_gzip_that_unpacks_to_far_too_much_ends_in_one_line(tmp_path):
     refused(limited("calibrate", rows, gigabytes=2.5), "bytes of text and more; the limit is")
 
 
-def test_a_stream_without_a_message_is_given_up(tmp_path):
+def test_a_stream_without_a_message_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr("ahrsd.offline.replay.GARBAGE_BYTES", 2**18)
+    (tmp_path / "zeros.vnraw").write_bytes(bytes(2**20))
+    with pytest.raises(RecordingError, match=r"no VN-100 message in 2\d{5} bytes"):
+        calibrate(tmp_path / "zeros.vnraw", Config())
+
+
+@pytest.mark.slow
+def test_a_bomb_without_a_message_is_given_up(tmp_path):
     bomb = zeros(tmp_path / "bomb.vnraw.gz")
     refused(limited("calibrate", bomb, gigabytes=1.5), "no VN-100 message in 16", "bytes")
 

@@ -36,6 +36,7 @@ def test_a_gyro_that_is_off_for_a_while_is_no_object_outside(seed: int, ask: Ask
     assert end_s == pytest.approx(190.0, abs=6.0)
 
 
+@pytest.mark.slow
 def test_a_scale_that_differs_between_the_senses_of_rotation_has_no_name(
     track: Track, ask: Ask
 ) -> None:

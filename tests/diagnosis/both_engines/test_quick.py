@@ -64,6 +64,7 @@ def test_a_short_recording_holds_no_train() -> None:
     assert trains(np.zeros((200, 3)), np.arange(200) / RATE_HZ, 1 / RATE_HZ) == ()
 
 
+@pytest.mark.slow
 def test_a_line_above_the_working_rate_is_named_at_its_frequency(quiet: Track, ask) -> None:
     phase = 2 * np.pi * 13.217 * quiet.time_s[:, None]
     added = 0.8e-3 * np.cos(phase) * np.array([0.48, 0.6, -0.64])

@@ -53,13 +53,20 @@ def test_a_step_is_a_step(ask) -> None:
     assert not stepped.unexplained.detected
 
 
-def test_a_sensor_that_warms_drifts_and_iron_that_remembers_does_not(ask) -> None:
+FADING = {
+    name: EFFECTS[name] for name in ("viscous_magnetisation", "hard_iron_step", "hard_iron_drift")
+}
+
+
+def test_a_sensor_that_warms_drifts(ask) -> None:
     """What iron had not settled of when the recording began fades alike; a drift is likelier."""
-    names = ("viscous_magnetisation", "hard_iron_step", "hard_iron_drift")
-    library = {name: EFFECTS[name] for name in names}
-    (warm,) = ask(with_field(warming), library=library).findings
+    (warm,) = ask(with_field(warming), library=FADING).findings
     assert (warm.effect, warm.setting["shape"]) == ("hard_iron_drift", "settling")
     assert warm.setting["time_constant_s"] == pytest.approx(250.0, rel=0.2)
-    iron = ask(made(Trial(4, (("viscous_magnetisation", 1.0),))).track, library=library)
+
+
+@pytest.mark.slow
+def test_iron_that_remembers_does_not(ask) -> None:
+    iron = ask(made(Trial(4, (("viscous_magnetisation", 1.0),))).track, library=FADING)
     assert [one.effect for one in iron.findings] == ["viscous_magnetisation"]
     assert not iron.unexplained.detected

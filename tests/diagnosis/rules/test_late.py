@@ -35,7 +35,9 @@ def test_the_current_is_moved_to_its_time_and_only_then(late_s: float):
     assert found.evidence > 50.0
 
 
-@pytest.mark.parametrize(("memory_s", "mean_s"), [(0.5, 0.4), (6.0, 0.2)])
+@pytest.mark.parametrize(
+    ("memory_s", "mean_s"), [(0.5, 0.4), pytest.param(6.0, 0.2, marks=pytest.mark.slow)]
+)
 def test_a_current_that_is_logged_as_a_mean_has_its_field_and_no_field_of_its_change(
     memory_s: float, mean_s: float
 ):

@@ -91,7 +91,7 @@ def test_alone_less_is_asked_of_it_than_beside_a_name(gauss, alone, beside) -> N
         assert seen.strongest.evidence > LIMITS.alone_nats
 
 
-def test_an_ordinary_walk_of_the_gyro_is_nothing_and_a_large_one_is() -> None:
+def test_an_ordinary_walk_of_the_gyro_is_nothing() -> None:
     state, left = left_of(drifting(1.2e-5))
     assert left.strongest.frame == "gyro"
     assert left.strongest.evidence > LIMITS.alone_nats
@@ -99,6 +99,10 @@ def test_an_ordinary_walk_of_the_gyro_is_nothing_and_a_large_one_is() -> None:
     assert walking.walk > 0.0
     assert seen is None
     assert not unknown.detected(rest, LIMITS.alone())
+
+
+@pytest.mark.slow
+def test_a_large_walk_of_the_gyro_is_something() -> None:
     state, left = left_of(drifting(1e-4))
     assert left_alone(state.fit, state, left)[2] is not None
 
