@@ -192,6 +192,7 @@ def test_through_replugs_resets_and_damage(tmp_path):
     assert [name for _, name in run.states].count("RECONCILING") >= 2
 
 
+@pytest.mark.slow
 def test_a_kill_in_the_trial_leaves_a_capture_and_a_journal_that_is_followed(tmp_path):
     config, port = config_for(tmp_path, mode="stage"), tmp_path / "vn100"
     second = tmp_path / "second"

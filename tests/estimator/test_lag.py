@@ -78,6 +78,7 @@ def test_times_or_units_that_are_wrong_are_no_answer(bench, factor):
     assert right.converged and right.gyro_misscaled == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 def test_a_rate_that_lost_messages_made_wrong_is_no_answer():
     assert calibrate(WALK, Config(), rate_hz=40.0).estimate.gyro_misscaled == 0.0

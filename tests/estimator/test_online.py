@@ -208,6 +208,7 @@ def test_rest_leaves_everything_where_the_device_has_it():
     assert sigma > 0.04
 
 
+@pytest.mark.slow
 def test_moving_after_a_long_rest_is_as_good_as_moving_at_once():
     run = bench.simulate("wam", "rov", 3)
     rng = np.random.default_rng(0)

@@ -68,6 +68,7 @@ def test_an_interrupted_run_says_so_and_leaves_nothing(tmp_path):
     assert len(rows_of(tmp_path / "out")) == 5
 
 
+@pytest.mark.slow
 def test_on_a_cluster_a_scheduler_and_a_worker_may_die(tmp_path):
     pytest.importorskip("distributed", reason="distributed (the extra cluster) is not installed")
     write_quick_archive(tmp_path / "archive", 24, milliseconds=500)

@@ -317,7 +317,7 @@ def test_a_driver_in_a_loop_of_resets_keeps_nothing_set_aside_for_ever():
 @pytest.mark.parametrize(
     ("what", "at"),
     [
-        pytest.param(what, at, marks=[] if at - k in (6, 36 + 30 * (k % 2)) else SLOW)
+        pytest.param(what, at, marks=[] if at - k == 6 + 30 * (k % 3) else SLOW)
         for k, what in enumerate(TROUBLE)
         for at in range(1 + k, 75, 5)
     ],

@@ -35,6 +35,7 @@ def test_circles_calibrate_and_the_drive_judges(bench, recordings):
     assert lines["magyc"].after_deg < 9.0
 
 
+@pytest.mark.slow
 @pytest.mark.benchmark
 def test_optical_attitude_judges_and_nobody_beats_who_knows_it(bench, recordings):
     """This sensor is nearly calibrated: what is left is the room's field, and ours adds nothing."""

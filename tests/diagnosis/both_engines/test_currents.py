@@ -90,6 +90,7 @@ def test_what_rides_with_the_sensor_is_averaged_as_it_is() -> None:
     assert told.covariates == {}
 
 
+@pytest.mark.slow
 def test_a_rover_s_field_by_its_speed_is_named(ask) -> None:
     """50 mG per m/s over drive motors without a logged current."""
     track = track_of(experiment("wam", seed=6, samples=2500))

@@ -79,6 +79,7 @@ def _pulsed() -> tuple[Track, Setting]:
     return pulsed, setting
 
 
+@pytest.mark.slow
 def test_a_field_that_falls_off_by_e_in_metres_of_height_is_one_name(ask) -> None:
     track, readings = _quiet(6)
     passed = (track.time_s - track.time_s[0]) / np.ptp(track.time_s)

@@ -83,6 +83,7 @@ def test_a_sharp_step_is_named_beside_a_room_and_a_change_like_the_others_is_not
             assert one.setting["onset_s"] == pytest.approx(83.0, abs=0.5)
 
 
+@pytest.mark.slow
 def test_a_room_alone_gets_no_name():
     track = room()
     found = diagnose(replace(track, covariates={"lamp_on": switched(track)}))

@@ -186,7 +186,9 @@ def test_a_field_alone_of_whatever_course(slow, quick, gyro, frame) -> None:
         assert told.strongest.p_value == pytest.approx(np.exp(-max(slow, quick)))
 
 
-@pytest.mark.parametrize(("times", "named"), [(5.0, True), (50.0, False)])
+@pytest.mark.parametrize(
+    ("times", "named"), [(5.0, True), pytest.param(50.0, False, marks=pytest.mark.slow)]
+)
 def test_a_name_that_few_blocks_show_is_told_where_it_explains_all(times, named) -> None:
     assert unknown.detected(left_of_step()[1], LIMITS)
     strict = replace(LIMITS, robust_family_p=robust_p_of_step() / times)

@@ -25,6 +25,7 @@ def play(values, radius):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius_gauss", [0.0007, pytest.param(0.003, marks=pytest.mark.slow)])
 def test_a_small_play_is_named_once_with_its_width(radius_gauss):
     noisy = made(Trial(6, samples=8_000, rate_hz=25.0)).track

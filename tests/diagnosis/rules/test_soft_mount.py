@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis.rules.engine import diagnose
 
 
+@pytest.mark.slow
 def test_a_mount_that_bends_is_as_soft_as_it_is_beside_a_noisy_accelerometer() -> None:
     """From the readings as they are it is not told at all."""
     one = made(Trial(7, (("flexible_mount", 2.0),), samples=9000, sigma_gyro=2e-3))
