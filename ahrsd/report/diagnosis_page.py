@@ -22,6 +22,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Validation,
 )
 from ahrsd.diagnosis.answer.ordinary_text import in_one_sentence, ordinary_left, size_lines
+from ahrsd.diagnosis.answer.setting_text import setting_text
 from ahrsd.diagnosis.answer.spoken import assumed, headline, place, sensitivity, value_text, verdict
 from ahrsd.diagnosis.columns.shown import shown
 from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN, legend_above
@@ -330,7 +331,7 @@ def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
 
 def _finding(found: Diagnosis, one: Finding) -> dict[str, object]:
     held, cost = one.heldout, one.cost_if_left_out
-    rows = []
+    rows = [("read as", read)] if (read := setting_text(one.setting)) else []
     if cost is not None:
         off = (
             f"hard iron off by {number(cost.hard_iron_shift_gauss * _MG, 'mG')}, heading by "

@@ -54,6 +54,7 @@ def diagnosis(**changes):
         separate_from="pulse the motor at rest on one heading",
         words="the field of a motor current",
         equation="m += k I(t)",
+        setting={"covariate": "motor_<1>_a", "reference": 0.1, "late_s": 0.25, "mean_s": 0.4},
         term=0,
     )
     left = Unexplained(
@@ -105,13 +106,14 @@ def diagnosis(**changes):
 
 
 def test_the_words_of_a_diagnosis():
-    assert lines(diagnosis())[:12] == [
+    assert lines(diagnosis())[:13] == [
         "dive <7>.csv: MISMATCH: 1 effect left out and something that the library has no name for "
         "(p = 1e-09)",
         "",
         "1. the field of a motor current (motor_current_field), 97.0% sure",
         "   where      120.0-260.5 s; axes y z; turns with the vehicle; motor_current_a > 6",
         "   size       field_per_ampere_y = 0.0013 +- 4e-05 gauss/A",
+        "   read as    by the column motor_<1>_a; logged 0.25 s late; each value the mean of 0.4 s",
         "   left out   m += k I(t)",
         "   without it hard iron off by 1.40 mG, heading by 0.35 deg",
         "   held out   +0.0520 nats/sample (moved in time: at most +0.0006)",
@@ -139,6 +141,11 @@ def test_one_line_where_before_and_after_are_the_same():
 def page_of(found, folder):
     write_diagnosis_report(folder / "report.html", found, "ahrsd diagnose x")
     return (folder / "report.html").read_text()
+
+
+def test_the_page_tells_how_an_effect_was_read(tmp_path):
+    text = page_of(diagnosis(), tmp_path)
+    assert "by the column motor_&lt;1&gt;_a; logged 0.25 s late; each value the mean of" in text
 
 
 def test_a_spectrum_that_is_worse_after_says_so(tmp_path):

@@ -14,6 +14,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Where,
 )
 from ahrsd.diagnosis.answer.ordinary_text import in_one_sentence, ordinary_left, size_lines
+from ahrsd.diagnosis.answer.setting_text import setting_text
 from ahrsd.diagnosis.columns.shown import shown
 
 _FRAMES = {
@@ -105,6 +106,7 @@ def _finding_lines(finding: Finding) -> list[str]:
             f"   {'size' if k == 0 else '':<10} {value_text(v)}"
             for k, v in enumerate(finding.parameters)
         ),
+        f"   read as    {read}" if (read := setting_text(finding.setting)) else "",
         f"   left out   {finding.equation}" if finding.equation else "",
     ]
     if cost is not None:
