@@ -197,11 +197,13 @@ def _borne_out(
         own = [key for key in sorted(best.names) if key not in all_sets.remainder]
         own = [key for key in own if best.names.isdisjoint(form_keys(key))]
         asked = {key: asked_odds(all_sets, best, key) for key in own}
-        rivals = {key: all_sets.judge(all_sets.without(best.names, key), best) for key in own}
-        if all(best.score - rivals[key].score >= asked[key] for key in own):
+        without = {key: all_sets.without(best.names, key) for key in own}
+        near = {key: all_sets.compared(without[key], best, best.score - asked[key]) for key in own}
+        rivals = {key: one for key, one in near.items() if one is not None}
+        if all(best.score - one.score >= asked[key] for key, one in rivals.items()):
             rivals = {key: _without(all_sets, space, best, key) for key in own}
         odds = {key: best.score - rival.score for key, rival in rivals.items()}
-        unsure = [key for key in own if odds[key] < asked[key]]
+        unsure = [key for key in odds if odds[key] < asked[key]]
         if not unsure:
             fewer = _without_one_moment(all_sets, best, asked)
             if fewer is best:
@@ -219,10 +221,12 @@ def _come_and_gone(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypo
     """
     asked = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.NAME_ODDS
     while True:
-        fewer = [
-            all_sets.judge(names, best) for names in come_and_gone(all_sets, space, best.names)
-        ]
-        likeliest = max((best, *fewer), key=lambda one: one.score - asked * len(one.names))
+        likeliest = best
+        for names in come_and_gone(all_sets, space, best.names):
+            least = likeliest.score - asked * (len(likeliest.names) - len(names))
+            found = all_sets.compared(names, best, least)
+            if found is not None and found.score > least:
+                likeliest = found
         if likeliest is best:
             return best
         best = likeliest
@@ -241,8 +245,9 @@ def _without_one_moment(
         apart_s = np.abs(np.subtract.outer(moments[first], moments[last]))
         if np.min(apart_s) > priors.APPROACH_S:
             continue
-        fewer = all_sets.judge(best.names - {first, last}, best)
-        if best.score - fewer.score < asked[first] + asked[last]:
+        least = best.score - asked[first] - asked[last]
+        fewer = all_sets.compared(best.names - {first, last}, best, least)
+        if fewer is not None and fewer.score > least:
             return fewer
     return best
 
@@ -258,8 +263,7 @@ def _with_one_part(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypo
     found = lone_parts(all_sets.component(key) for key in all_sets.remainder)
     all_sets.made.add(found)
     bare = best.names - rest
-    judged = [all_sets.judge(bare | {one.key}) for one in found]
-    return max((best, *judged), key=lambda one: one.score)
+    return all_sets.likeliest(best, [bare | {one.key} for one in found])
 
 
 def _with_heading(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
@@ -272,7 +276,7 @@ def _with_heading(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypot
         return best
     heading = by_heading(all_sets.made.context)
     all_sets.made.add([heading])
-    return max((best, all_sets.judge(best.names | {heading.key}, best)), key=lambda one: one.score)
+    return all_sets.likeliest(best, [best.names | {heading.key}])
 
 
 def _names(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
@@ -296,9 +300,7 @@ def _beside_others(
     wide, rest = best, frozenset(all_sets.remainder)
     for one in (*others, *parts):
         more = wide.names | {one.key}
-        tried = {more - rest} if one in parts else {more, more - rest}
-        found = [all_sets.judge(names, wide) for names in tried]
-        wide = max((wide, *found), key=lambda each: each.score)
+        wide = all_sets.likeliest(wide, [more - rest] if one in parts else [more, more - rest])
     if wide is best:
         return best, rivals
     held, others_rivals = _borne_out(all_sets, space, wide)
@@ -327,9 +329,11 @@ def _held_to_form(
             forms = varying(one, added_by(all_sets, best, key)[0], made.context)
             made.add(forms)
             for form in forms:
-                free = all_sets.judge(best.names | {form.key}, best)
-                varies = float(np.exp(all_sets.psi_of(free)[form.key][0])) > priors.VARIES
-                if varies and free.score > max(best.score + asked, found.score):
+                least = max(best.score + asked, found.score)
+                free = all_sets.compared(best.names | {form.key}, best, least)
+                if free is None or free.score <= least:
+                    continue
+                if float(np.exp(all_sets.psi_of(free)[form.key][0])) > priors.VARIES:
                     found = free
         if found is best:
             return best, rivals
@@ -386,11 +390,9 @@ def _is_place(all_sets: Hypotheses, key: str) -> bool:
 def _without(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> Hypothesis:
     """The likeliest set without a member: with nothing or a course in its place."""
     fewer = all_sets.without(best.names, key)
-    tried = [fewer]
-    if all_sets.component(key).effect is not None:
-        tried += [fewer | {course} for course in space.courses if course not in fewer]
-    judged = [all_sets.judge(names, best) for names in tried]
-    return max(judged, key=lambda one: one.score)
+    courses = [] if all_sets.component(key).effect is None else space.courses
+    tried = [fewer | {course} for course in courses if course not in fewer]
+    return all_sets.likeliest(all_sets.judge(fewer, best), tried, near=best)
 
 
 def _told(

@@ -192,9 +192,13 @@ class Linearised:
     def products(self, keys: Sequence[str], step: float) -> Products:
         """All that the data say of these components; step: prior of the noise's spectrum."""
         self._apart(keys)
-        G = np.concatenate(
-            [np.concatenate([self.pair(a, b) for b in keys], axis=2) for a in keys], axis=1
-        )
+        ends = np.cumsum([0, *(self.seen[key].component.width for key in keys)])
+        parts = [(key, slice(a, b)) for key, (a, b) in zip(keys, itertools.pairwise(ends))]
+        G = np.empty((len(self.edges) - 1, ends[-1], ends[-1]))
+        for (one, mine), (other, its) in itertools.combinations_with_replacement(parts, 2):
+            found = self.pair(one, other)
+            G[:, mine, its] = found
+            G[:, its, mine] = np.swapaxes(found, 1, 2)
         s = self._crossed(keys)
         square = np.array([float(self.y[a:b] @ self.y[a:b]) for a, b in self._bands()])
         used = float(np.count_nonzero(self.point.filtered.used)) / int(self.edges[-1])

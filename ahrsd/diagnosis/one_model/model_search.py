@@ -117,6 +117,20 @@ class Hypotheses:
             self.judged[members] = Hypothesis(members, keys, at, at.nats + odds)
         return self.judged[members]
 
+    def likeliest(
+        self, best: Hypothesis, tried: Iterable[Names], near: Hypothesis | None = None
+    ) -> Hypothesis:
+        """The likeliest of a hypothesis and others, which are climbed to from near it, or another.
+
+        A climb that will surely not reach the likeliest so far is given up.
+        """
+        near = near or best
+        for names in tried:
+            found = self.compared(names, near, best.score)
+            if found is not None and found.score > best.score:
+                best = found
+        return best
+
     def without(self, members: Names, key: str) -> Names:
         """The set without a member: without the delay what contains one is whole."""
         whole = {other: key for key, other in self.holding.items()} if key == LAG else {}
@@ -324,8 +338,7 @@ def exchanged(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
             for base in bases
             for key in asked(all_sets, space, base, best)
         ]
-        judged = [all_sets.judge(one, best) for one in found]
-        likelier = max((best, *judged), key=lambda one: one.score)
+        likelier = all_sets.likeliest(best, found)
         if likelier is best:
             break
         best = likelier
@@ -342,13 +355,13 @@ def sharpened(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
     for key in sorted(best.names):
         if key == LAG or key in all_sets.forms or all_sets.component(key).row is None:
             continue
-        tried = [best]
+        tried = []
         for rest in dict.fromkeys((best.names, best.names - set(space.courses))):
             fewer = all_sets.judge(rest - {key}, best)
             scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
             new = sought(all_sets, space, scan, key, range(FINER, SHARPEST))
-            tried.append(all_sets.judge(rest - {key} | {new}, best))
-        best = max(tried, key=lambda one: one.score)
+            tried.append(rest - {key} | {new})
+        best = all_sets.likeliest(best, tried)
     return best
 
 
