@@ -175,7 +175,7 @@ class GeomagneticDrift(Linear):
     size = "0.2 to 1 mG a day when quiet, several mG within minutes in storms"
     source = "dossier W3"
     # north is where the field points: what turns it about the vertical turns the world as well, is
-    # seen by nothing, and would run away in the joint fit (from 2 mG to 25, dfc55efa of `ring600f`)
+    # seen by nothing, and would run away in the joint fit (from 2 mG to 25)
     loose = 3.0
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:

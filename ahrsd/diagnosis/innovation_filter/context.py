@@ -15,7 +15,7 @@ a second, the columns of a lag were the gyro's own noise: a lag of 15 nats in no
 
 Fields in regressors: one that is smoothed both ways has a part of the reading's own noise in it,
 more of it the poorer the gyro is.  A soft iron of 1.6 made of that explained a quarter of white
-innovations (e1e7b859 of `ring600c`).  What is foretold from the readings before has none.
+innovations.  What is foretold from the readings before has none.
 
 Changes of the field in regressors (a lag's, a low-pass's) are of a field that is smooth in the
 frame that the smoothed rates carry along, over as much time as these.  In the frame of a loud gyro

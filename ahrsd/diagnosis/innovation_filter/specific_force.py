@@ -2,7 +2,7 @@
 
 What bends with a force, or errs with it, follows the force and not the noise of the sensor that
 measured it.  A regressor with noise in it is told too small, by the noise's share of its power
-(errors in variables): a mount that bends by 22 mrad/g was 12 (d3ffb7ea of the sealed `ring300c`),
+(errors in variables): a mount that bends by 22 mrad/g was 12,
 and the rest had other names.  What the force is expected to be, given the readings, is Wiener's
 filter of them.  What shakes all frequencies alike counts as noise: nothing that follows it can be
 seen in it.

@@ -26,7 +26,7 @@ from ahrsd.diagnosis.where_and_when import locate
 APART_S = 1.0
 #: correlation along the field, that far apart, of what is no noise of the magnetometer:
 #: five trials in rooms have 0.45 to 0.74, errors of the gyro 0.03; red noise mostly 0.3 at most,
-#: but a null of `ring600j` has 0.44 (18a2391a), so where only noise is the rival more is asked
+#: but one null has 0.44, so where only noise is the rival more is asked
 #: (`refined.STEADY`)
 MOSTLY_SLOW = 0.4
 

@@ -5,11 +5,11 @@ place to place: what nobody logged is roughly a bump, a step or iron that takes 
 parallel legs a position is a function of the headings before it: a field that differs from place to
 place was iron that takes its time, the earth's turn and hysteresis, 99 % sure each.  A course that
 is free in time has to pay for every one of its coefficients; where it is likelier all the same than
-such names and what they leave, it is the answer (a speed as a bump: 04e11e10 of `ring600k`).
+such names and what they leave, it is the answer (a speed as a bump).
 
 A slow course is smooth as well, which costs it less: a field that differs from place to place on
-parallel legs was iron that remembers, of 430 nats, and the smooth course had 24 more (cdf34bf2 of
-`withheld240b`).  A name whose form was sought must be likelier than that by odds of its own.
+parallel legs was iron that remembers, of 430 nats, and the smooth course had 24 more.
+A name whose form was sought must be likelier than that by odds of its own.
 
 What changes within seconds counts where noise cannot be such a course: where noise is white beside
 the names, or where with and without them it is one source.
@@ -132,7 +132,7 @@ def _likelier(
 ) -> bool:
     """Whether the source is likelier than the names that are asked and what they leave.
 
-    In the same noise: of 6400 nats two hundredths more of it cost 130 (956e7e02 of `ring600n`, a
+    In the same noise: of 6400 nats two hundredths more of it cost 130 (a
     slow drift of the outside field that was unknown).  A source needs no lead before names that
     leave nothing: none that was true in three opened rings is less than nine nats ahead of one.
     """

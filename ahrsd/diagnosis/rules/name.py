@@ -31,7 +31,7 @@ LONELY_BLOCKS, LONELY_NATS = 5.0, 20.0
 #: deviations beyond which a reading says no more: three axes of it are 13 nats, a place costs them
 OUTLIER = 3.0
 #: a play of this many deviations of a reading or less follows the noise as well; what it explains
-#: of that is as wide as the filter's errors: a quarter of a deviation in red noise (`ring600j`)
+#: of that is as wide as the filter's errors: a quarter of a deviation in red noise
 NARROW, LEAST_WIDTH = 5.0, 0.5
 #: the check that needs many blocks
 ROBUST = "block-robust probability"

@@ -91,7 +91,7 @@ def _may_wander(best: Judged, seen: Survey, limits: Limits) -> bool:
     """Whether a name may be a gyro's bias that wanders: one of that, or as likely.
 
     A slow drift of the outside field turns it as the bias does: of 24.6 nats for one, where a bias
-    that drifts has 22.4, half a nat is left beside an ordinary walk (2bc1bb11 of `ring600l`).
+    that drifts has 22.4, half a nat is left beside an ordinary walk.
     """
     if best.candidate.name in WANDERING:
         return True

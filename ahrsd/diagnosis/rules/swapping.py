@@ -1,8 +1,8 @@
 """Names held against every other name for what they explain, and the surveys without each.
 
 What turns the field by degrees is not linear: a gyro whose axes are askew by two degrees had 216
-nats by its columns at the null, a mount that gives 236, and by the joint fits 29 more than that
-(c8900e32 of `ring600o`).  So the joint fit is asked of names that are nearly as likely, too.
+nats by its columns at the null, a mount that gives 236, and by the joint fits 29 more than that.
+So the joint fit is asked of names that are nearly as likely, too.
 """
 
 from __future__ import annotations

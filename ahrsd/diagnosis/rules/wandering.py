@@ -6,7 +6,7 @@ likely a random walk than values that have nothing to do with each other, and a 
 as much in the filter leaves nothing, it is that: a bias that wanders.
 
 What it leaves hides what is beside it: iron that remembers was no more than the rest, and what then
-was left showed in the sensor (e215aba9 of `ring600n`, a name of 324 nats).  So where the walk was
+was left showed in the sensor (a name of 324 nats).  So where the walk was
 among the first names, both are asked together, whatever frame is left, and must be likelier than
 the course that is.
 """
