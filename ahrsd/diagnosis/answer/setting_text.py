@@ -17,8 +17,8 @@ from ahrsd.diagnosis.columns.shown import shown
 class Told:
     """Words of one part of a setting.
 
-    words: with {} for the value;  times: the value in the words' unit, per its own
-    negative: where the value is below zero, of its size
+    words: with {} for the value, times `times`
+    negative: the words where the value is below zero, with {} for its size
     """
 
     words: str
@@ -34,6 +34,7 @@ TOLD: Mapping[str, Told] = {
     "harmonic": Told("{} times a turn of the shaft"),
     "off_hz": Told("{} Hz faster than the column", negative="{} Hz slower than the column"),
     "frequency_hz": Told("seen at {} Hz"),
+    "mains_hz": Told("as mains of {} Hz would be"),
     "period_s": Told("every {} s"),
     "width_s": Told("for {} s"),
     "hold_samples": Told("each reading held for {} samples"),
@@ -42,10 +43,10 @@ TOLD: Mapping[str, Told] = {
     "shape": Told("course: {}"),
     "length_s": Told("lasts {} s"),
     "length_m": Told("falls off within {} m"),
-    "distance_m": Told("its size as {} m away"),
+    "distance_m": Told("its size is that of its field {} m away"),
 }
 
-#: what is where else in the answer, or of no use to a reader: why
+#: what is not told, and why: it stands elsewhere in the answer, or nobody can act on it
 UNTOLD: Mapping[str, str] = {
     "onset_s": "the finding's place says when",
     "end_s": "the finding's place says when",
@@ -59,16 +60,15 @@ UNTOLD: Mapping[str, str] = {
     "place_m": "of an object: in the recording's own metres",
     "searched": "how many settings it was chosen of",
     "memory": "what iron had from before the recording",
-    "mains_hz": "which mains would be seen at this frequency",
     "relaxation_s": "one value for all",
     "window_s": "one value for all",
     "mean": "the ordinary shaking",
     "straight_g": "the mean force, at which a mount was aligned",
     "unit": "the column's value at which the coefficient counts",
     "power": "in the equation",
-    "form": "in the equation",
-    "of": "in the equation",
-    "products": "in the equation",
+    "form": "which of the equation's forms",
+    "of": "which of the equation's forms",
+    "products": "which of the equation's forms",
     "axes": "what the repaired model turns",
     "signs": "what the repaired model turns",
     "seed": "of a simulation",
@@ -80,10 +80,14 @@ def setting_text(setting: Mapping[str, Any]) -> str:
     parts = []
     for key, told in TOLD.items():
         value = setting.get(key)
+        if not value:
+            continue
         if isinstance(value, str):
             parts.append(told.words.format(shown(value)))
-        elif value:
-            words = told.negative if value < 0 and told.negative else told.words
-            size = abs(value) if words is told.negative else value
-            parts.append(words.format(f"{size * told.times:.3g}"))
+        elif isinstance(value, (list, tuple)):
+            parts.append(told.words.format(" or ".join(f"{one:.3g}" for one in value)))
+        elif value < 0 and told.negative:
+            parts.append(told.negative.format(f"{-value * told.times:.3g}"))
+        else:
+            parts.append(told.words.format(f"{value * told.times:.3g}"))
     return "; ".join(parts)

@@ -38,7 +38,11 @@ def test_each_part_of_a_setting_is_told_or_left_out_for_a_reason(name):
         ),
         ({"radius_gauss": 0.0063, "memory": (0.0, 0.5, 0.0)}, "half width of the loop 6.3 mG"),
         ({"time_constant_s": 1.2096}, "time constant 1.21 s"),
-        ({"frequency_hz": 10.0031, "mains_hz": [50.0]}, "seen at 10 Hz"),
+        ({"frequency_hz": 10.0031, "mains_hz": []}, "seen at 10 Hz"),
+        (
+            {"frequency_hz": 10.0031, "mains_hz": [50.0, 60.0]},
+            "seen at 10 Hz; as mains of 50 or 60 Hz would be",
+        ),
         ({"covariate": "rpm", "harmonic": 2, "off_hz": -0.012},
          "by the column rpm; 2 times a turn of the shaft; 0.012 Hz slower than the column"),
         ({"hold_samples": 4, "phase": 3}, "each reading held for 4 samples"),
