@@ -20,9 +20,8 @@ def track() -> Track:
     return made(Trial(seed=11, samples=7500, rate_hz=25.0, scenario="wam", noise="white")).track
 
 
-@pytest.mark.parametrize(
-    "seed", [pytest.param(4, marks=pytest.mark.slow), pytest.param(8, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [4, 8])
 def test_a_gyro_that_is_off_for_a_while_is_no_object_outside(seed: int, ask: Ask) -> None:
     """It was a field that the vehicle passed, or a jump of the field, and something else beside."""
     quiet = made(Trial(seed=seed, samples=7500, rate_hz=25.0, scenario="mam", noise="white")).track

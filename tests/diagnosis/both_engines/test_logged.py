@@ -121,7 +121,7 @@ def test_columns_with_holes(driven) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("own", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("own", [True, False])
 def test_a_current_is_named_at_rest_if_the_field_follows_it(own: bool, ask_logged) -> None:
     """The manoeuvre that tells a current from what the turning does: pulses at rest."""
     rng = np.random.default_rng(5)
