@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
-from ahrsd.diagnosis.columns.logged import with_columns_as_logged
+from ahrsd.diagnosis.columns.logged import with_holes
 from ahrsd.diagnosis.rules.logged import diagnose_logged
 from ahrsd.diagnosis.track import Spec, Track
 
@@ -21,5 +21,5 @@ def diagnosed(
         from ahrsd.diagnosis.one_model.diagnose import diagnose  # whom it serves waits for it
 
         ask = partial(diagnose, recording=recording, simulated=simulated)
-        return with_columns_as_logged(track, spec, ask)
+        return with_holes(track, spec, ask)
     return diagnose_logged(track, spec, recording=recording, simulated=simulated)

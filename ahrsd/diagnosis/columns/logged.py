@@ -26,10 +26,19 @@ LEFT = 0.5
 
 
 def with_columns_as_logged(track: Track, spec: Spec | None, ask: Ask) -> Diagnosis:
-    """An engine's answer, with what columns with holes and wrong clocks can still say.
+    """An engine's answer, with what columns with holes, held or noisy ones can still say.
 
-    With columns that have holes where an effect is named by one.
+    For an engine that takes columns as they are: it is asked again for each way to read them.
     """
+
+    def straight(each: Track, known: Spec | None) -> Diagnosis:
+        return _straight(each, known, ask)
+
+    return with_holes(track, spec, straight)
+
+
+def with_holes(track: Track, spec: Spec | None, ask: Ask) -> Diagnosis:
+    """An engine's answer, with columns that have holes where an effect is named by one."""
     holed = roles.holed(track)
     if holed:
         filled = track.with_columns(
@@ -38,12 +47,12 @@ def with_columns_as_logged(track: Track, spec: Spec | None, ask: Ask) -> Diagnos
         missing = np.zeros(len(track), dtype=bool)
         for one in holed.values():
             missing |= one.missing
-        found = _straight(_blind(filled, missing), spec, ask)
+        found = ask(_blind(filled, missing), spec)
         used = [name for name in holed if name in causes(found)]
         if used:
             notes = tuple(holed[name].words for name in used)
             return replace(found, notes=(*notes, *found.notes))
-    return _straight(track, spec, ask)
+    return ask(track, spec)
 
 
 def _straight(track: Track, spec: Spec | None, ask: Ask) -> Diagnosis:

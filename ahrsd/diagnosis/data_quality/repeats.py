@@ -29,6 +29,8 @@ _MOVING_SHARE = 0.7  # of the share that repeats in all: where the sensor turns,
 #: s; magnetometers have rates of their own: 202 a second in all recordings of BROAD, rows at 286
 _ORDINARY_PERIOD_S = 0.01
 _CLOCKWORK = 0.3  # variance of the time from one new reading to the next, in that of chance
+#: sums by which that is told, where there are as many, and at least;  variances that one counts
+_SUMS, _FEWEST_SUMS, _FAR = 20, 15, 4.0
 _DOUBLED_SHARE = 2e-3
 #: times as many as if each sensor repeated for itself: a slow turn makes it nearly two
 _BEYOND_CHANCE = 5.0
@@ -141,8 +143,8 @@ def _held(track: Track, again: NDArray[np.bool], expected: Array) -> list[Fact]:
         return []
     step = track.step_s
     words = (
-        f"the magnetometer has a new reading only every {usual:.3g} samples "
-        f"({1 / (usual * step):.3g} Hz)"
+        f"the magnetometer has a new reading only every {usual:.4g} samples "
+        f"({1 / (usual * step):.4g} Hz)"
     )
     return [
         Fact(
@@ -159,16 +161,18 @@ def _held(track: Track, again: NDArray[np.bool], expected: Array) -> list[Fact]:
 
 def _irregularity(rows: Array) -> float:
     """How the rows from one new reading to the next vary, in what they vary by where each row
-    repeats by chance (variances of sums over as many as have a variance of ten then)."""
+    repeats by chance (variances of sums over as many as have a variance of ten then, or of fewer
+    where that left too few sums to tell a clock from chance)."""
     mean = float(np.mean(rows))
     chance = mean * (mean - 1.0)
     together = max(1, int(np.ceil(10.0 / chance)))
+    together = min(together, max(int(np.ceil(1.0 / chance)), len(rows) // _SUMS))
     sums = np.add.reduceat(rows, np.arange(0, len(rows) - together + 1, together))[:-1]
-    if len(sums) < 3:
+    if len(sums) < _FEWEST_SUMS:
         return 1.0
-    middle = np.median(sums)  # a gap, or a span without a new reading, is one sum
-    spread = 1.4826 * float(np.median(np.abs(sums - middle)))
-    return max(spread, 0.3) ** 2 / (together * chance)
+    variance = together * chance
+    off = (sums - np.median(sums)) ** 2  # a gap, or a span without a new reading, is one sum
+    return float(np.mean(np.minimum(off, _FAR * variance))) / variance
 
 
 def _doubled(track: Track, again: NDArray[np.bool]) -> list[Fact]:

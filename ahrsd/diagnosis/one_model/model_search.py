@@ -76,7 +76,8 @@ class Hypotheses:
 
     def judge(self, names: Iterable[str], near: Hypothesis | None = None) -> Hypothesis:
         """The set with these members beside the calibration."""
-        found = self.compared(names, near, -np.inf)
+        members = frozenset(names)
+        found = self._climbed(members, self._keys(members), near, -np.inf)
         if found is None:
             raise ValueError("a set that is asked for has a score")
         return found
@@ -84,17 +85,32 @@ class Hypotheses:
     def compared(
         self, names: Iterable[str], near: Hypothesis | None, asked: float
     ) -> Hypothesis | None:
-        """The same; None where its score will surely not be so large.
+        """The same; None where its score will surely not be so large, or the set is too wide."""
+        members = frozenset(names)
+        keys = self._keys(members)
+        if sum(self.component(key).width for key in keys) > priors.WIDEST:
+            return None
+        return self._climbed(members, keys, near, asked)
+
+    def _keys(self, members: Names) -> tuple[str, ...]:
+        """What a set is made of: the calibration, its members, what they leave of their forms."""
+        ordered = sorted(members)
+        return (
+            CALIBRATION,
+            *ordered,
+            *sorted(self.forms[key] for key in ordered if key in self.forms),
+        )
+
+    def _climbed(
+        self, members: Names, keys: tuple[str, ...], near: Hypothesis | None, asked: float
+    ) -> Hypothesis | None:
+        """A set at its likeliest; None where its score will surely not be so large.
 
         near: a set of the same class from whose noise and sizes the climb begins, which is short;
         else it begins where the richest model is; where either is loud, in quiet noise: from loud
         noise what a member explains is noise still.  What has only lost members begins in near's
         """
-        members = frozenset(names)
-        ordered = sorted(members)
         if members not in self.judged:
-            forms = [self.forms[key] for key in ordered if key in self.forms]
-            keys = (CALIBRATION, *ordered, *sorted(forms))
             real = self.is_real(members)
             step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN
             products = self.made.products(keys, step)
@@ -107,8 +123,9 @@ class Hypotheses:
             fewer = near is not None and members < near.names
             if not fewer and np.max(noise) > noise[-1] + priors.LOUD:
                 noise = np.minimum(noise, noise[-1])
-            odds = sum(self.component(key).prior for key in ordered)
+            odds = sum(self.component(key).prior for key in sorted(members))
             odds += self._again(members) + self._of_class(members)
+            forms = {self.forms[key] for key in members if key in self.forms}
             small = [k for k, key in enumerate(keys) if key in forms and key not in known]
             at = reached(products, laws, (noise, start), asked - odds, small=small)
             if at is None:

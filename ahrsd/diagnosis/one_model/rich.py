@@ -16,6 +16,7 @@ import numpy as np
 
 from ahrsd.diagnosis.calibration_fit.delay import of_magnetometer, usual_step
 from ahrsd.diagnosis.calibration_fit.problem import Problem
+from ahrsd.diagnosis.columns.held_columns import drawn_between, held_columns
 from ahrsd.diagnosis.columns.logger_noise import cleaned
 from ahrsd.diagnosis.columns.shown import shown
 from ahrsd.diagnosis.effects.base import Effect
@@ -130,7 +131,7 @@ def richest(problem: Problem, filtered: Filtered, library: Mapping[str, Effect])
     First the delay and the logged causes alone, beside noise of any spectrum: a delay of a tenth of
     a second, or a motor's current, bend everything else that is fitted beside them.
     """
-    problem = _without_logger_noise(problem, filtered, library)
+    problem = _as_logged(problem, filtered, library)
     small = _settled(_likeliest_delay(problem, filtered, library), library, (), whole=False)
     for lag_s in _delays_of_instants(small.base.made.point.problem):
         early = _delayed(replace(problem, instants=True), filtered, library, lag_s)
@@ -151,28 +152,44 @@ def _delays_of_instants(problem: Problem) -> tuple[float, ...]:
     return (step_s / 2, problem.lag_s) if more else (step_s / 2,)
 
 
-def _without_logger_noise(
-    problem: Problem, filtered: Filtered, library: Mapping[str, Effect]
-) -> Problem:
-    """The problem with columns without their loggers' noise, each where that is likelier.
+def _as_logged(problem: Problem, filtered: Filtered, library: Mapping[str, Effect]) -> Problem:
+    """The problem with each column read as its logger wrote it, where that is likelier.
 
-    Noise in a cause is told too small; what averages it, as a delay does, is likelier for that; and
-    itself is left as a source that nobody knows.
+    What is logged more seldom than the sensor is late where it is held, and is drawn straight
+    between its values.  A logger's noise is taken out: noise in a cause is told too small; what
+    averages it, as a delay does, is likelier for that; and itself is left as a source that nobody
+    knows.
     """
     best: Judged | None = None
-    for name in sorted(problem.recorded.covariates):
-        clean = cleaned(problem.recorded, (name,))
-        if clean is None:
-            continue
-        if best is None:
-            best = _delayed(problem, filtered, library, 0.0)
-        said = f"column {shown(name)} has noise of its own: what follows it is judged without it"
-        quiet = replace(problem, recorded=clean, notes=(*problem.notes, said))
-        quiet = quiet.lagging(problem.lag_s)
-        found = _delayed(quiet, filtered, library, 0.0)
-        if found.nats > best.nats + priors.ODDS_REAL:
-            problem, best = quiet, found
+    for read in (_drawn, _without_noise):
+        for name in sorted(problem.recorded.covariates):
+            other = read(problem, name)
+            if other is None:
+                continue
+            if best is None:
+                best = _delayed(problem, filtered, library, 0.0)
+            other = other.lagging(problem.lag_s)
+            found = _delayed(other, filtered, library, 0.0)
+            if found.nats > best.nats + priors.ODDS_REAL:
+                problem, best = other, found
     return problem
+
+
+def _drawn(problem: Problem, name: str) -> Problem | None:
+    """With a column drawn straight between its values, where these come seldom."""
+    seldom = [one for one in held_columns(problem.recorded) if one.name == name]
+    if not seldom:
+        return None
+    said = f"column {shown(name)} comes {seldom[0].often}: drawn straight between its values"
+    drawn = drawn_between(problem.recorded, tuple(seldom))
+    return replace(problem, recorded=drawn, notes=(*problem.notes, said))
+
+
+def _without_noise(problem: Problem, name: str) -> Problem | None:
+    """With a column without its logger's noise, where that can be told from its course."""
+    clean = cleaned(problem.recorded, (name,))
+    said = f"column {shown(name)} has noise of its own: what follows it is judged without it"
+    return None if clean is None else replace(problem, recorded=clean, notes=(*problem.notes, said))
 
 
 def _delayed(

@@ -263,7 +263,7 @@ def test_a_magnetometer_that_is_read_a_little_more_often_than_it_measures(
     fact = _only(hygiene(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
     assert fact.effect == "mag_sample_hold"
     assert abs(fact.setting["hold"] - rows) < 0.01
-    assert f"only every {rows:.3g} samples" in fact.words
+    assert f"only every {fact.setting['hold']:.4g} samples" in fact.words
     assert fact.bad is not None
     assert abs(np.mean(fact.bad) - (1.0 - 1.0 / rows)) < 0.01
 
@@ -273,6 +273,26 @@ def test_numbers_that_repeat_by_chance_are_not_held(track: Track) -> None:
     again = np.random.default_rng(3).random(len(track)) < 0.25
     at = np.maximum.accumulate(np.where(again, 0, np.arange(len(track))))
     assert not hygiene(replace(track, mag_b_gauss=track.mag_b_gauss[at]))
+
+
+@pytest.mark.parametrize("share", [0.005, 0.01, 0.02, 0.05])
+def test_the_few_that_repeat_by_chance_are_no_clock(track: Track, share: float) -> None:
+    """Some tens of repeated readings, of many draws: a drive of 26,857 rows has 46."""
+    told = []
+    for seed in range(25):
+        again = np.random.default_rng(seed).random(len(track)) < share
+        at = np.maximum.accumulate(np.where(again, 0, np.arange(len(track))))
+        told += hygiene(replace(track, mag_b_gauss=track.mag_b_gauss[at]))
+    assert [fact.words for fact in told] == []
+
+
+def test_a_clock_that_repeats_seldom_is_told(track: Track) -> None:
+    """39.2 readings a second in 40 rows."""
+    count = np.arange(len(track))
+    at = np.ceil(np.floor(count / 1.02 + 1e-9) * 1.02 - 1e-9).astype(int)
+    fact = _only(hygiene(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
+    assert fact.effect == "mag_sample_hold"
+    assert "only every 1.02 samples" in fact.words
 
 
 def test_a_rate_of_its_own_above_100_hz_is_ordinary(track: Track) -> None:
