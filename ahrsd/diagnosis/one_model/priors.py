@@ -166,8 +166,8 @@ SAME_FORM = 0.5
 #: part of the evidence of what is unknown that a name beside it must have;  source: stand-ins .25
 #: and .46 there, the one that is there .75
 BESIDE_UNKNOWN = 0.5
-#: coefficients of a set that is asked, at most: the magnets and currents of the recordings with known
-#: truth are in sets of up to 621, and the time that a set takes goes by the cube
+#: coefficients of a set that is asked, at most: the time that it takes goes by the cube;  source:
+#: a flight with its current and magnets put on are told with sets of up to 770
 WIDEST = 800
 #: nats that a move of the search must gain
 MOVE = 2.0
