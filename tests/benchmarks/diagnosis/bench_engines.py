@@ -98,9 +98,9 @@ def real_cases(words: Sequence[str]) -> Iterator[Case]:
         kept = {k: v for k, v in track.covariates.items() if k not in one.hidden}
         yield Case("known", name, replace(track, covariates=kept), Spec(), one)
     for name, path in untouched([""]):
-        if any(word in f"untouched: {name}" for word in words):
-            if not any(one.file == name for one in KNOWN.values()):
-                yield Case("untouched", name, load_track(path)[0], Spec())
+        known = any(one.file == name for one in KNOWN.values())
+        if not known and any(word in f"untouched: {name}" for word in words):
+            yield Case("untouched", name, load_track(path)[0], Spec())
 
 
 def blind_cases(seed: int, drawn: Sequence[str]) -> Iterator[Case]:

@@ -117,7 +117,7 @@ def of_magnitude(mag: Array, current_a: Array) -> tuple[Array, float]:
 
 
 def current_in_flight(t: Array, mag: Array, logged_a: Array) -> None:
-    """MAG's current by its magnitude, by how late it is logged, and beside currents moved in time."""
+    """MAG's current by its magnitude: by how late it is logged, beside currents that are moved."""
     flies = (t > FLIGHT_S[0]) & (t < FLIGHT_S[1])
     m, at_s = mag[flies], t[flies]
     found = [of_magnitude(m, np.interp(at_s + late_s, t, logged_a)) for late_s in LATER_S]
