@@ -58,6 +58,7 @@ class Hypotheses:
     holding: key of what contains a delay, and of the same beside one, without it
     real: whether all sets are of a recording that leaves what real ones do, whatever is in them
     unknown_nats: evidence of a source that switches and was taken out: a rest of it is left
+    too_wide: sets that were not compared, having too many coefficients
     """
 
     made: Linearised
@@ -69,6 +70,7 @@ class Hypotheses:
     judged: dict[Names, Hypothesis] = field(default_factory=dict)
     real: bool = False
     unknown_nats: float = 0.0
+    too_wide: int = 0
 
     def component(self, key: str) -> Component:
         """By its key."""
@@ -89,6 +91,7 @@ class Hypotheses:
         members = frozenset(names)
         keys = self._keys(members)
         if sum(self.component(key).width for key in keys) > priors.WIDEST:
+            self.too_wide += 1
             return None
         return self._climbed(members, keys, near, asked)
 

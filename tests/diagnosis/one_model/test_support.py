@@ -86,6 +86,19 @@ def gains(found: tuple[Hypotheses, Space], name: str) -> tuple[float, float]:
     return told.nll_gain_per_sample * held.samples, told.placebo_gain * held.samples
 
 
+def test_a_set_with_too_many_coefficients_is_no_candidate_and_its_neighbours_are(idle, monkeypatch):
+    all_sets, space = idle
+    key = key_of(space, "motor_current_field")
+    bare, course = all_sets.judge(()), space.courses[0]
+    width = all_sets.component(course).width
+    monkeypatch.setattr(priors, "WIDEST", width)  # beside the calibration there is less room
+    before = all_sets.too_wide
+    assert all_sets.compared({course}, bare, -np.inf) is None
+    assert all_sets.too_wide == before + 1
+    assert all_sets.compared({key}, bare, -np.inf) is not None
+    assert all_sets.judge({course}).names == {course}  # what is asked for by itself has a score
+
+
 def test_what_is_not_there_foretells_nothing(idle):
     """Over the library nothing on the mean, and none more than chance.
 

@@ -40,6 +40,13 @@ from ahrsd.diagnosis.where_and_when import locate
 NOTE = "by the engine one-model, which is experimental"
 
 
+#: where what is unknown may be more sources than are asked together
+TOO_MANY = (
+    f"models of more than {priors.WIDEST} coefficients were not asked: what is unknown may be "
+    "several sources, of which a shorter part of the recording tells more"
+)
+
+
 def whole_answer(
     asked: Prepared,
     start: NullFit,
@@ -150,6 +157,8 @@ def _notes(
     if problem.unread_s:
         when = ", ".join(f"{begin:.1f}-{end:.1f}" for begin, end in problem.unread_s)
         how = (*how, f"readings at {when} s were left out: something was moved there")
+    if found.all_sets.too_wide and found.answer.unknown:
+        how = (*how, TOO_MANY)
     return (*how, *said, *asked.lesser, *seen, NOTE)
 
 
