@@ -3,9 +3,10 @@
     python tests/benchmarks/diagnosis/bench_diagnose_real.py [--only WORD ...] [--out FILE.md]
 
 Per recording: findings with confidence, values and times, what no name explains, seconds of CPU.
-What is known of them independently: the current of MAG2 (-2.95, -5.18, 3.20) mG/A, none on MAG; the
-magnets of broad/32, 34, 36 put on and taken off; the lag of 11.5 ms in every trial of BROAD; the
-gyro bias of F00379 with its temperature.  It reads the recordings beside the project.
+What is known of them independently: the current of MAG2 (-2.95, -5.18, 3.20) mG/A, about a tenth
+of it on MAG; the magnets of broad/32, 34, 36 put on and taken off; the lag of 11.5 ms in every
+trial of BROAD; the gyro bias of F00379 with its temperature.  It reads the recordings beside the
+project.
 """
 
 from __future__ import annotations

@@ -64,9 +64,10 @@ def test_the_motor_current_is_named_on_the_inner_compass() -> None:
 
 
 @pytest.mark.slow
-def test_the_motor_current_is_not_named_on_the_outer_compass() -> None:
+def test_what_is_told_of_the_current_on_the_outer_compass_is_small() -> None:
+    """By the field's magnitude .6 +- .2 mG/A, a tenth of what the inner compass has."""
     found = diagnosed("arducopter/log171_MAG_10hz.csv.gz")
-    assert named(found, "motor_current_field") == []
+    assert all(np.linalg.norm(values(x)) < 1e-3 for x in named(found, "motor_current_field"))
     (lag,) = named(found, "mag_time_lag")
     assert 0.05 < values(lag)[0] < 0.12
 
