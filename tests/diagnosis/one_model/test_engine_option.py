@@ -20,9 +20,9 @@ from ahrsd.recording.table import write_table
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """A simulated recording with a step of the hard iron at 50 s."""
-    made = experiment("wam", seed=8, samples=2500).samples
-    step = (made.time_s >= 50.0)[:, None] * np.array([0.0, 9e-3, -4e-3])
+    """A simulated recording with a step of the hard iron at 70 s."""
+    made = experiment("wam", seed=8, samples=3500).samples
+    step = (made.time_s >= 70.0)[:, None] * np.array([0.0, 9e-3, -4e-3])
     columns = {"time_s": made.time_s}
     for k, axis in enumerate("xyz"):
         columns[f"mag_{axis}_gauss"] = (made.raw_b_gauss + step)[:, k]
@@ -65,7 +65,7 @@ def test_the_step_is_named_in_the_same_form(reported):
     assert body["schema"] == "ahrsd.diagnosis/1"
     assert [one["effect"] for one in body["findings"]] == ["hard_iron_step"]
     (one,) = body["findings"]
-    assert one["where"]["intervals_s"][0][0] == pytest.approx(50.0, abs=0.5)
+    assert one["where"]["intervals_s"][0][0] == pytest.approx(70.0, abs=0.5)
     found = [p["value"] for p in one["parameters"]]
     np.testing.assert_allclose(found, [0.0, 9e-3, -4e-3], atol=8e-4)
     assert any("experimental" in note for note in body["notes"])
