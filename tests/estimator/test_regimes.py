@@ -28,7 +28,7 @@ REGIMES = {
     "rest-circles-pitch": (("rest", 60.0), ("circles", 60.0), ("pitch", 40.0)),
 }
 LAG_S = 0.025
-LONG = (("eight-roll", 40.0), ("roll-circles", 40.0))
+LONG = (("eight-roll", 40.0), ("roll-circles", 40.0), ("rest-circles-pitch", 40.0))
 
 
 def part(block: SampleBlock, a: int, b: int) -> SampleBlock:
@@ -80,9 +80,9 @@ def test_motions_put_together_from_pieces(monkeypatch):
     """Numbers of the iron: hardly one below 0.9 times its bound, and rarely one above 1.5."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     bench = importlib.import_module("bench_regimes")
-    runs = [bench.run(seed, at_once=32) for seed in range(200, 230)]
+    runs = [bench.run(seed, at_once=32) for seed in range(200, 215)]
     sure = [r for r in runs if r.converged and r.told]
-    assert len(sure) >= 20
+    assert len(sure) >= 10
     ratio = np.concatenate([r.iron for r in sure])
     assert np.mean(ratio < 0.9) < 0.04 and ratio.min() > 0.7
     assert np.mean(ratio > 1.5) < 0.04 and ratio.max() < 3.0

@@ -24,8 +24,8 @@ def levels(time_s: Array, seed: int) -> Array:
 
 @pytest.fixture(scope="module")
 def driven() -> tuple[Track, Array]:
-    """300 s at 12.5 Hz beside a motor, and the motor's current."""
-    track = track_of(experiment("wam", motion="rov", seed=4, samples=3750, rate_hz=12.5))
+    """200 s at 12.5 Hz beside a motor, and the motor's current."""
+    track = track_of(experiment("wam", motion="rov", seed=4, samples=2500, rate_hz=12.5))
     current = levels(track.time_s - track.time_s[0], 7)
     mag = track.mag_b_gauss + current[:, None] * FIELD_PER_AMPERE
     return replace(track, mag_b_gauss=mag), current

@@ -22,7 +22,7 @@ from ahrsd.diagnosis.track import NothingToFit
 from ahrsd.simulation import ScenarioSettings, simulate
 
 
-@pytest.mark.parametrize("scenario", ["wam", "mam"])
+@pytest.mark.parametrize("scenario", ["wam", pytest.param("mam", marks=pytest.mark.slow)])
 def test_a_null_has_no_name_and_no_unknown(scenario):
     found = diagnose(track_of(experiment(scenario, seed=3, samples=4000)))
     assert found.findings == ()
@@ -170,7 +170,10 @@ def test_half_a_step_of_delay_is_told_with_what_would_tell_it_from_a_lag():
     assert "two rates" in one.separate_from
 
 
-@pytest.mark.parametrize(("name", "strength"), [("mag_low_pass", 3.0), pytest.param("gyro_time_lag", 2.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("name", "strength"),
+    [("mag_low_pass", 3.0), pytest.param("gyro_time_lag", 2.0, marks=pytest.mark.slow)],
+)
 def test_a_delay_of_any_kind_is_in_the_repaired_model_as_it_was(name, strength):
     one = made(Trial(seed=34, effects=((name, strength),), samples=2500, rate_hz=12.5))
     found = diagnose(one.track)
