@@ -10,7 +10,7 @@ from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis.rules.engine import diagnose
 
-SAMPLES, RATE_HZ = 5_000, 25.0
+SAMPLES, RATE_HZ = 8_000, 25.0
 
 
 def answer(*effects, seed=3, **more):
