@@ -159,7 +159,7 @@ def test_a_recording_with_facts_that_stop_is_told_them_and_nothing_else():
 
 
 def test_half_a_step_of_delay_is_told_with_what_would_tell_it_from_a_lag():
-    size = {"samples": 2000, "rate_hz": 12.5}
+    size = {"samples": 1400, "rate_hz": 12.5}
     made_one = made(Trial(seed=31, effects=(("gyro_integration", 1.0),), **size))
     (one,) = diagnose(made_one.track).findings
     assert one.effect == "gyro_integration"
