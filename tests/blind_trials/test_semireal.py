@@ -48,7 +48,7 @@ class Simulated:
         self.world = scene
 
 
-@pytest.fixture(scope="module", params=["drone", "wam_rov"])
+@pytest.fixture(scope="module", params=["drone", pytest.param("wam_rov", marks=pytest.mark.slow)])
 def simulated(request):
     return Simulated(request.param)
 

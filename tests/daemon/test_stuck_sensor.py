@@ -95,7 +95,7 @@ def until(condition):
         (constant, "the magnetometer gives the same value on all axes"),
         pytest.param(saturated_axis, "saturated", marks=pytest.mark.slow),
         pytest.param(OneInFifty(1e30), "% of the newest", marks=pytest.mark.slow),
-        (OneInFifty(float("nan")), "% of the newest"),
+        pytest.param(OneInFifty(float("nan")), "% of the newest", marks=pytest.mark.slow),
         pytest.param(OneInFifty(float("inf")), "% of the newest", marks=pytest.mark.slow),
     ],
     ids=["constant", "saturated", "1e30", "nan", "inf"],

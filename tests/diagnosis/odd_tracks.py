@@ -14,20 +14,22 @@ SIGMA_MAG, SIGMA_GYRO = 6e-4, 1e-3
 
 
 def standing(bias: np.ndarray, warmth: np.ndarray | None = None, seed: int = 4) -> Track:
-    """Ten minutes at rest; bias (N, 3) rad/s."""
+    """At rest for as long as bias (N, 3) rad/s has rows."""
     rng = np.random.default_rng(seed)
-    time_s = np.arange(COUNT) / RATE_HZ
-    dt_s = np.full(COUNT, 1 / RATE_HZ)
+    count = len(bias)
+    time_s = np.arange(count) / RATE_HZ
+    dt_s = np.full(count, 1 / RATE_HZ)
     dt_s[0] = np.nan
-    mag = np.array([0.2, 0.05, 0.4]) + rng.normal(0.0, 1e-3, (COUNT, 3))
-    gyro = bias + rng.normal(0.0, 1.5e-4, (COUNT, 3))
-    accel = np.array([0.0, 0.0, -9.81]) + rng.normal(0.0, 0.01, (COUNT, 3))
+    mag = np.array([0.2, 0.05, 0.4]) + rng.normal(0.0, 1e-3, (count, 3))
+    gyro = bias + rng.normal(0.0, 1.5e-4, (count, 3))
+    accel = np.array([0.0, 0.0, -9.81]) + rng.normal(0.0, 0.01, (count, 3))
     covariates = {} if warmth is None else {"temperature_c": warmth}
-    return Track(time_s, dt_s, mag, gyro, accel, covariates, (slice(0, COUNT),))
+    return Track(time_s, dt_s, mag, gyro, accel, covariates, (slice(0, count),))
 
 
-def warming() -> np.ndarray:
-    passed = np.arange(COUNT) / RATE_HZ
+def warming(count: int = COUNT) -> np.ndarray:
+    """Degrees; ten minutes unless said otherwise."""
+    passed = np.arange(count) / RATE_HZ
     return 8.0 + 7.0 * (1 - np.exp(-passed / 200.0)) + 1.5 * np.sin(passed / 60.0)
 
 

@@ -141,7 +141,7 @@ def test_a_gyro_bias_step_is_told_as_one():
 
 
 @pytest.mark.parametrize("scenario", ["wam", "mam", "lam"])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_an_hour_without_a_change_is_silent(scenario, seed):
     made = experiment(scenario, samples=45000, rate_hz=12.5, seed=seed)
     detector = StepDetector()

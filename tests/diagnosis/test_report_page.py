@@ -143,8 +143,16 @@ def page_of(found, folder):
     return (folder / "report.html").read_text()
 
 
-def test_the_page_tells_how_an_effect_was_read(tmp_path):
-    text = page_of(diagnosis(), tmp_path)
+@pytest.fixture(scope="module")
+def usual(tmp_path_factory):
+    """The page of `diagnosis()`, made once: its pictures take seconds."""
+    folder = tmp_path_factory.mktemp("usual")
+    page_of(diagnosis(), folder)
+    return folder / "report.html"
+
+
+def test_the_page_tells_how_an_effect_was_read(usual):
+    text = usual.read_text()
     assert "by the column motor_&lt;1&gt;_a; logged 0.25 s late; each value the mean of" in text
 
 
@@ -164,9 +172,9 @@ def test_a_spectrum_that_is_worse_after_says_so(tmp_path):
     assert "farther from 1" not in page_of(replace(found, drawn=better), tmp_path)
 
 
-def test_a_longer_grey_bar_is_explained(tmp_path):
+def test_a_longer_grey_bar_is_explained(tmp_path, usual):
     found = diagnosis()
-    assert "A longer grey bar" not in page_of(found, tmp_path)
+    assert "A longer grey bar" not in usual.read_text()
     longer = replace(found.drawn, evidence={"motor_current_field": 80.0, "hysteresis": 300.0})
     assert "A longer grey bar is no contradiction" in page_of(
         replace(found, drawn=longer), tmp_path
@@ -189,8 +197,8 @@ def test_what_stays_in_its_own_band_is_not_called_real(tmp_path, size, real):
     assert ("at no moment does it leave the band" in text) is not real
 
 
-def test_statistics_are_named_in_words(tmp_path):
-    text = page_of(diagnosis(), tmp_path)
+def test_statistics_are_named_in_words(usual):
+    text = usual.read_text()
     assert "how much innovations remember of those before them" in text
     assert "mean square of the innovations, 1: as the noise says" in text
     assert ">autocorrelation<" not in text
@@ -259,10 +267,8 @@ def test_nothing_found_says_what_would_have_been_seen():
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
 @pytest.mark.parametrize("width_px", [360, 1000])
-def test_the_page_in_a_browser(tmp_path, width_px):
-    page = tmp_path / "report.html"
-    write_diagnosis_report(page, diagnosis(), "ahrsd diagnose dive")
-    seen = look_at(page, width_px, tmp_path)
+def test_the_page_in_a_browser(tmp_path, usual, width_px):
+    seen = look_at(usual, width_px, tmp_path)
     assert seen["errors"] == []
     assert len(seen["pictures"]) == 6
     assert all(complete and width > 0 for _, width, complete in seen["pictures"])
@@ -270,7 +276,7 @@ def test_the_page_in_a_browser(tmp_path, width_px):
     assert seen["width"] <= width_px
     assert seen["cut"] == []  # no table that has to be pushed aside to be read
     assert "Unknown, here" in seen["headings"]
-    assert "<b>throttle" not in page.read_text()
+    assert "<b>throttle" not in usual.read_text()
 
 
 def test_the_rerun_recording_is_written(tmp_path):

@@ -107,7 +107,12 @@ def test_a_reading_that_stays_for_long_counts_again():
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "hold"), [(100.0, 10), pytest.param(100.0, 20, marks=pytest.mark.slow), (50.0, 2)]
+    ("rate_hz", "hold"),
+    [
+        (100.0, 10),
+        pytest.param(100.0, 20, marks=pytest.mark.slow),
+        pytest.param(50.0, 2, marks=pytest.mark.slow),
+    ],
 )
 def test_held_readings_are_no_magnet_and_the_answer_is_right(rate_hz, hold):
     estimator = Estimator()

@@ -305,7 +305,9 @@ def test_the_manoeuvre_that_is_asked_for_tells_what_is_not_known(unknown, asked)
     assert asked in advice.manoeuvre(covariance)
 
 
-@pytest.mark.parametrize("motion", [RICH, LEVEL], ids=["rich", "level"])
+@pytest.mark.parametrize(
+    "motion", [pytest.param(RICH, marks=pytest.mark.slow), LEVEL], ids=["rich", "level"]
+)
 def test_a_gyro_that_warms_up_is_followed_to_the_end(motion):
     """Its bias goes by a tenth of a degree per second; the answer is that of the end.
 

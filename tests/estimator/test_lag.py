@@ -42,7 +42,10 @@ def answer(bench, run):
     return estimator.finish()
 
 
-@pytest.mark.parametrize(("kind", "lag_s"), [("wam", 0.03), ("mam", 0.012), ("wam", -0.02)])
+@pytest.mark.parametrize(
+    ("kind", "lag_s"),
+    [("wam", 0.03), pytest.param("mam", 0.012, marks=pytest.mark.slow), ("wam", -0.02)],
+)
 def test_a_lag_is_found_and_taken_out(bench, kind, lag_s):
     run = bench.simulate(kind, "rov", 5, samples=6000)
     found = answer(bench, late(run, lag_s))

@@ -86,7 +86,9 @@ def test_a_little_that_follows_the_attitude_holds_the_gate_for_flash(motion):
         assert beyond(made, found) < 3.5
 
 
-@pytest.mark.parametrize("motion", [RICH, LEVEL], ids=["rich", "level"])
+@pytest.mark.parametrize(
+    "motion", [pytest.param(RICH, marks=pytest.mark.slow), LEVEL], ids=["rich", "level"]
+)
 def test_nothing_is_named_where_nothing_is_left(motion):
     for seed in SEEDS:
         found = answer(pieces.drive(motion, seed))

@@ -34,7 +34,9 @@ def answer(bench, run):
     return estimator, estimator.finish()
 
 
-@pytest.mark.parametrize(("kind", "seed"), [("mam", 3), ("lam", 4)])
+@pytest.mark.parametrize(
+    ("kind", "seed"), [pytest.param("mam", 3, marks=pytest.mark.slow), ("lam", 4)]
+)
 def test_a_magnet_put_on_early(bench, kind, seed):
     run = bench.simulate(kind, "rov", seed, samples=5000)
     field = run.block.raw_b_gauss + STEP_GAUSS * (run.block.time_s > 50.0)[:, None]

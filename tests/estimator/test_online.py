@@ -389,7 +389,8 @@ def test_a_magnet_that_stays_starts_the_calibration_anew(step_gauss, at_once):
 # -- cost ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["wam", pytest.param("planar", marks=pytest.mark.slow)])
+@pytest.mark.slow  # the cost alone: test_long; what a daemon keeps: benchmarks/daemon/test_soak
+@pytest.mark.parametrize("kind", ["wam", "planar"])
 def test_cost_and_memory_do_not_grow_with_the_run(kind):
     """Calls and memory: the last 4,500 samples of 10,500 cost what the 4,500 before do.
 

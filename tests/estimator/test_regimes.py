@@ -28,7 +28,7 @@ REGIMES = {
     "rest-circles-pitch": (("rest", 60.0), ("circles", 60.0), ("pitch", 40.0)),
 }
 LAG_S = 0.025
-LONG = (("eight-roll", 40.0), ("roll-circles", 40.0))
+LONG = (("eight-roll", 40.0), ("roll-circles", 40.0), ("rest-circles-pitch", 40.0))
 
 
 def part(block: SampleBlock, a: int, b: int) -> SampleBlock:

@@ -162,8 +162,8 @@ def test_a_message_without_a_magnetometer_is_one_line_and_exit_2(run, recordings
         pytest.param("vn100/punch_2024_satish.csv.gz", marks=pytest.mark.slow),
         "vn100/circles_2024_liu.csv.gz",
         "vn100_distorters/clearIMU.csv.gz",
-        "arducopter/log171_MAG_10hz.csv.gz",
-        "repoimu/TStick_Test11_Trial1.csv.gz",
+        pytest.param("arducopter/log171_MAG_10hz.csv.gz", marks=pytest.mark.slow),
+        pytest.param("repoimu/TStick_Test11_Trial1.csv.gz", marks=pytest.mark.slow),
         "simulated/wam_0.csv.gz",
     ],
 )

@@ -63,7 +63,12 @@ def sensor(count: int = COUNT, rate_hz: float = RATE_HZ, seed: int = 1) -> dict[
             "the magnetometer is left-handed: its right x y z are its y x z",
             marks=pytest.mark.slow,
         ),
-        ((0, 1, 2), (1, -1, -1), "the magnetometer is turned against the gyro: negate its y and z"),
+        pytest.param(
+            (0, 1, 2),
+            (1, -1, -1),
+            "the magnetometer is turned against the gyro: negate its y and z",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_wrong_axes_are_why_it_has_not_converged(tmp_path, axes, signs, words):

@@ -153,7 +153,17 @@ def test_an_axis_is_turned_by_the_option(tmp_path):
     np.testing.assert_allclose(rows.raw_b_gauss, wanted, rtol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["text", "bytes"])
+@pytest.mark.parametrize(
+    ("container", "kind"),
+    [
+        ("bag", "text"),
+        ("db3", "text"),
+        ("mcap", "bytes"),
+        pytest.param("bag", "bytes", marks=pytest.mark.slow),
+        pytest.param("db3", "bytes", marks=pytest.mark.slow),
+        pytest.param("mcap", "text", marks=pytest.mark.slow),
+    ],
+)
 def test_what_the_device_sent_calibrates_as_its_byte_stream(tmp_path, container, kind):
     stream = stream_of(kind)
     own = tmp_path / ("own.vnraw" if kind == "text" else "own.vnbin")

@@ -58,6 +58,7 @@ FADING = {
 }
 
 
+@pytest.mark.slow
 def test_a_sensor_that_warms_drifts(ask) -> None:
     """What iron had not settled of when the recording began fades alike; a drift is likelier."""
     (warm,) = ask(with_field(warming), library=FADING).findings

@@ -19,7 +19,9 @@ def told(track: Track):
     return resting(fit_null(track, walk=False).context(), EFFECTS, LIMITS)
 
 
-@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.slow), 6])
+@pytest.mark.parametrize(
+    "seed", [4, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (5, 6))]
+)
 def test_nothing_is_said_of_a_bias_that_stays_or_wanders_as_an_ordinary_one(seed: int):
     steps = np.random.default_rng(seed).normal(0.0, 4e-6 / np.sqrt(RATE_HZ), (COUNT, 3))
     assert told(standing(1e-3 + np.cumsum(steps, axis=0), warming(), seed)) == ()

@@ -21,8 +21,8 @@ def _with_magnet(track: Track, begin_s: float, end_s: float) -> Track:
 
 
 def test_a_magnet_that_is_put_on_and_taken_off_is_one_step_with_its_end():
-    track = track_of(experiment("wam", seed=14, samples=4000))
-    begin_s, end_s = float(track.time_s[1200]), float(track.time_s[2600])
+    track = track_of(experiment("wam", seed=14, samples=2000))
+    begin_s, end_s = float(track.time_s[600]), float(track.time_s[1300])
     found = diagnose(_with_magnet(track, begin_s, end_s))
     (magnet,) = found.findings
     assert magnet.effect == "hard_iron_step"
@@ -54,6 +54,7 @@ def test_a_magnet_that_a_hand_brings_from_the_side_is_one_step_with_its_end():
     assert lag.value == pytest.approx(0.012, abs=max(4 * lag.std, 3e-4))
 
 
+@pytest.mark.slow
 def test_a_magnet_that_stays_has_no_end():
     track = track_of(experiment("wam", seed=15, samples=4000))
     begin_s = float(track.time_s[1200])

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import json
+import logging
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from tracks import experiment
 
+from ahrsd.__main__ import main
 from ahrsd.diagnosis.repaired_model.model_file import from_text
 from ahrsd.recording.table import write_table
 
@@ -26,11 +32,36 @@ def recording(tmp_path_factory):
     return path
 
 
-def test_the_step_is_named_in_the_same_form(run, recording, tmp_path, capsys):
-    answer = tmp_path / "answer.json"
-    words = ["diagnose", str(recording), "--engine", "one-model", "--json", str(answer)]
-    assert run(*words) == 0
-    body = json.loads(answer.read_text())
+class Reported(NamedTuple):
+    """What `ahrsd diagnose --engine ENGINE --report FOLDER` says and writes."""
+
+    code: int | str | None
+    words: str
+    folder: Path
+
+    @property
+    def body(self):
+        return json.loads((self.folder / "diagnosis.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def reported(recording, tmp_path_factory):
+    """Both engines' reports of the recording, each made once."""
+    found, root = {}, logging.getLogger()
+    handlers = root.handlers[:]
+    for engine in ("rules", "one-model"):
+        folder, said = tmp_path_factory.mktemp("reports") / engine, StringIO()
+        words = ["diagnose", str(recording), "--engine", engine, "--report", str(folder)]
+        with redirect_stdout(said), pytest.raises(SystemExit) as ended:
+            main(words)
+        found[engine] = Reported(ended.value.code, said.getvalue(), folder)
+    root.handlers[:] = handlers
+    return found
+
+
+def test_the_step_is_named_in_the_same_form(reported):
+    assert [one.code for one in reported.values()] == [0, 0]
+    body = reported["one-model"].body
     assert body["schema"] == "ahrsd.diagnosis/1"
     assert [one["effect"] for one in body["findings"]] == ["hard_iron_step"]
     (one,) = body["findings"]
@@ -38,7 +69,7 @@ def test_the_step_is_named_in_the_same_form(run, recording, tmp_path, capsys):
     found = [p["value"] for p in one["parameters"]]
     np.testing.assert_allclose(found, [0.0, 9e-3, -4e-3], atol=8e-4)
     assert any("experimental" in note for note in body["notes"])
-    assert "hard_iron_step" in capsys.readouterr().out
+    assert "hard_iron_step" in reported["one-model"].words
 
 
 def keys_of(body, prefix=""):
@@ -51,13 +82,11 @@ def keys_of(body, prefix=""):
         yield from keys_of(body[0], f"{prefix}[]")
 
 
-def test_nothing_that_the_rules_tell_is_missing(run, recording, tmp_path, capsys):
+def test_nothing_that_the_rules_tell_is_missing(reported):
     bodies, words = {}, {}
-    for engine in ("rules", "one-model"):
-        folder = tmp_path / engine
-        assert run("diagnose", str(recording), "--engine", engine, "--report", str(folder)) == 0
-        bodies[engine] = json.loads((folder / "diagnosis.json").read_text())
-        words[engine] = capsys.readouterr().out
+    for engine, (_, said, folder) in reported.items():
+        bodies[engine] = reported[engine].body
+        words[engine] = said
         page = (folder / "report.html").read_text()
         words[engine, "pictures"] = page.count("<figure") + page.count("<svg")
         assert (folder / "diagnosis.rrd").stat().st_size > 100_000

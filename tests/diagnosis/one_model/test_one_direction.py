@@ -44,7 +44,7 @@ def test_noise_that_is_louder_along_the_field_has_no_direction():
 
 
 def test_iron_on_a_joint_that_nobody_logged_is_unknown_on_the_sensor():
-    track = track_of(experiment("wam", seed=14, samples=6000, sigma_mag=5e-4))
+    track = track_of(experiment("wam", seed=14, samples=3500, sigma_mag=5e-4))
     rng, rate_hz = np.random.default_rng(5), 25.0
     angle = np.fft.rfft(rng.normal(size=len(track)))
     hertz = np.fft.rfftfreq(len(track), 1 / rate_hz)

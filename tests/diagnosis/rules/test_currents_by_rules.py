@@ -27,7 +27,7 @@ SHAPES = {
 }
 
 #: those that a test takes which is not slow
-QUICK = ("square", "pulses")
+QUICK = ("pulses",)
 
 
 def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:

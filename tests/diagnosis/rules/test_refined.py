@@ -125,7 +125,7 @@ def wobbling(gauss: float, noise: str, turn_s: float) -> Track:
         pytest.param(1.2e-4, "white", 8.5, False, marks=pytest.mark.slow),
         # and where it is slow; but nothing that forgets within two seconds is as slow as this
         pytest.param(8e-4, "white", 8.5, False, marks=pytest.mark.slow),
-        (8e-4, "red", 8.5, False),
+        pytest.param(8e-4, "red", 8.5, False, marks=pytest.mark.slow),
         pytest.param(1.2e-3, "white", 8.5, True, marks=pytest.mark.slow),
     ],
 )
