@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -41,6 +41,7 @@ class Problem:
               is read more seldom than the gyro
     notes:    what a person should know of how the rates were read
     unread_s: spans, from and to, whose readings are left out: something was moved there
+    logged:   of columns that are not as they were recorded, how they were: settings by column
     """
 
     track: Track
@@ -56,6 +57,7 @@ class Problem:
     riding: Array | None = None
     instants: bool = False
     unread_s: tuple[tuple[float, float], ...] = ()
+    logged: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def rate_hz(self) -> float:

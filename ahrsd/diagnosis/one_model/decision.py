@@ -28,6 +28,7 @@ from ahrsd.diagnosis.one_model.alternatives import (
     other_courses,
     varying,
 )
+from ahrsd.diagnosis.one_model.candidates import beside
 from ahrsd.diagnosis.one_model.component import Sized
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
@@ -37,13 +38,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
     plain_delay,
 )
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
-from ahrsd.diagnosis.one_model.model_search import (
-    Hypotheses,
-    Hypothesis,
-    Space,
-    beside,
-    come_and_gone,
-)
+from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, come_and_gone
 from ahrsd.diagnosis.one_model.near_settings import changed, opened
 from ahrsd.diagnosis.one_model.remainder import still_spells
 from ahrsd.diagnosis.values import Term

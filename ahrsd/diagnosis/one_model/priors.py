@@ -108,6 +108,9 @@ EFFECT_GRID = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
 #: s by which a logged cause may come late into the log, or early;  source: averages of loggers; the
 #: motor's current of a flight came 0.32 s late
 LOGGED_LATE_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
+#: s over which a logger may take its means;  source: battery monitors and autopilots' logs at 1 to
+#: 10 Hz
+LOGGED_MEANS_S = (0.2, 0.4, 0.8)
 #: s by which a column's clock is off from which on it is sought: nearer, its setting is
 ON_TIME_S = 1.0
 #: s over which a logger ordinarily takes its mean: a battery's monitor filters over a tenth

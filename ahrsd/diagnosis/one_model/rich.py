@@ -16,9 +16,6 @@ import numpy as np
 
 from ahrsd.diagnosis.calibration_fit.delay import of_magnetometer, usual_step
 from ahrsd.diagnosis.calibration_fit.problem import Problem
-from ahrsd.diagnosis.columns.held_columns import drawn_between, held_columns
-from ahrsd.diagnosis.columns.logger_noise import cleaned
-from ahrsd.diagnosis.columns.shown import shown
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered
 from ahrsd.diagnosis.one_model import priors
@@ -45,6 +42,7 @@ from ahrsd.diagnosis.one_model.linearised import (
     relevelled,
     step_of,
 )
+from ahrsd.diagnosis.one_model.logged_columns import as_logged, in_time, read_as
 from ahrsd.diagnosis.one_model.remainder import ordinary_remainder
 from ahrsd.diagnosis.where_and_when.locate import FRAMES
 
@@ -153,43 +151,21 @@ def _delays_of_instants(problem: Problem) -> tuple[float, ...]:
 
 
 def _as_logged(problem: Problem, filtered: Filtered, library: Mapping[str, Effect]) -> Problem:
-    """The problem with each column read as its logger wrote it, where that is likelier.
+    """The problem with each column read as its logger wrote it, where that is likelier."""
 
-    What is logged more seldom than the sensor is late where it is held, and is drawn straight
-    between its values.  A logger's noise is taken out: noise in a cause is told too small; what
-    averages it, as a delay does, is likelier for that; and itself is left as a source that nobody
-    knows.
-    """
-    best: Judged | None = None
-    for read in (_drawn, _without_noise):
-        for name in sorted(problem.recorded.covariates):
-            other = read(problem, name)
-            if other is None:
-                continue
-            if best is None:
-                best = _delayed(problem, filtered, library, 0.0)
-            other = other.lagging(problem.lag_s)
-            found = _delayed(other, filtered, library, 0.0)
-            if found.nats > best.nats + priors.ODDS_REAL:
-                problem, best = other, found
+    def likely(one: Problem) -> float:
+        return _delayed(one, filtered, library, 0.0).nats
+
+    problem = as_logged(problem, likely).lagging(problem.lag_s)
+    if not problem.recorded.covariates:
+        return problem
+    here = _delayed(problem, filtered, library, 0.0)
+    for reading in in_time(here.base.made, here.base.whole, here.at, library):
+        other = read_as(problem, reading).lagging(problem.lag_s)
+        found = _delayed(other, filtered, library, 0.0)
+        if found.nats > here.nats + priors.ODDS_REAL:
+            problem, here = other, found
     return problem
-
-
-def _drawn(problem: Problem, name: str) -> Problem | None:
-    """With a column drawn straight between its values, where these come seldom."""
-    seldom = [one for one in held_columns(problem.recorded) if one.name == name]
-    if not seldom:
-        return None
-    said = f"column {shown(name)} comes {seldom[0].often}: drawn straight between its values"
-    drawn = drawn_between(problem.recorded, tuple(seldom))
-    return replace(problem, recorded=drawn, notes=(*problem.notes, said))
-
-
-def _without_noise(problem: Problem, name: str) -> Problem | None:
-    """With a column without its logger's noise, where that can be told from its course."""
-    clean = cleaned(problem.recorded, (name,))
-    said = f"column {shown(name)} has noise of its own: what follows it is judged without it"
-    return None if clean is None else replace(problem, recorded=clean, notes=(*problem.notes, said))
 
 
 def _delayed(

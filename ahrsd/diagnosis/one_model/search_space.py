@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from ahrsd.diagnosis.effects.base import Effect, Setting
+from ahrsd.diagnosis.one_model.candidates import Beside
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
@@ -19,14 +20,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
     while_there,
 )
 from ahrsd.diagnosis.one_model.linearised import Linearised
-from ahrsd.diagnosis.one_model.model_search import (
-    Beside,
-    Hypotheses,
-    Hypothesis,
-    Names,
-    Space,
-    searched,
-)
+from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, Space, searched
 from ahrsd.diagnosis.one_model.one_direction import one_direction
 from ahrsd.diagnosis.one_model.remembered import remembered
 from ahrsd.diagnosis.one_model.rich import Judged, psi_by_key

@@ -16,6 +16,7 @@ from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.one_model import priors, rich
+from ahrsd.diagnosis.one_model.candidates import beside
 from ahrsd.diagnosis.one_model.component import Component, Fixed
 from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
@@ -27,7 +28,6 @@ from ahrsd.diagnosis.one_model.effect_components import (
 from ahrsd.diagnosis.one_model.evidence import evaluated
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, by_key, first_point, moved, unread
 from ahrsd.diagnosis.one_model.linearised import added as added_by
-from ahrsd.diagnosis.one_model.model_search import beside
 from ahrsd.diagnosis.one_model.remainder import ordinary_remainder, still_spells
 from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
 from ahrsd.diagnosis.track import Spec, Track

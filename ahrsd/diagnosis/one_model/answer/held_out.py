@@ -24,8 +24,9 @@ from scipy import linalg
 from ahrsd.diagnosis.answer.diagnosis import Heldout
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.answer.white_rows import WhiteRows, root_of, white_rows
+from ahrsd.diagnosis.one_model.candidates import averaged
 from ahrsd.diagnosis.one_model.component import MadeAnew
-from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names, averaged
+from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names
 from ahrsd.diagnosis.values import Columns
 from ahrsd.samples import Array
 

@@ -23,9 +23,10 @@ from ahrsd.diagnosis.answer.diagnosis import Component, Ordinary, Unexplained
 from ahrsd.diagnosis.answer.ordinary_text import SIMULATED
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.alternatives import BY_RATE, QUICK, form_keys
+from ahrsd.diagnosis.one_model.candidates import beside
 from ahrsd.diagnosis.one_model.component import Fixed
 from ahrsd.diagnosis.one_model.decision import Answer, added_by, coefficients, size_of
-from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, beside
+from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis
 from ahrsd.samples import Array
 
 _WORDS = {

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -33,13 +34,17 @@ from ahrsd.diagnosis.one_model.answer.held_out import HeldOut
 from ahrsd.diagnosis.one_model.answer.left_sizes import told_sizes
 from ahrsd.diagnosis.one_model.answer.repaired_noise import repaired_noise
 from ahrsd.diagnosis.one_model.decision import Answer
+from ahrsd.diagnosis.one_model.logged_columns import as_recorded
 from ahrsd.diagnosis.one_model.recorded_rate import Quick
 from ahrsd.diagnosis.one_model.search_rounds import Searched
+from ahrsd.diagnosis.values import Term
 from ahrsd.diagnosis.where_and_when import locate
 
 NOTE = "by the engine one-model, which is experimental"
 
 
+#: what has a setting
+Told = TypeVar("Told", Finding, Term)
 #: where what is unknown may be more sources than are asked together
 TOO_MANY = (
     f"models of more than {priors.WIDEST} coefficients were not asked: what is unknown may be "
@@ -94,19 +99,25 @@ def whole_answer(
         baseline=baseline(start),
         mismatch=something,
         p_value=0.0 if counted else float(np.exp(-max(odds))),
-        findings=named,
+        findings=_as_recorded(named, found),
         unexplained=left,
         posterior_predictive=_checked(residuals, maps, fast.answer, quickly),
         sensitivity=() if something else visibility.limits([*alone, *_seen_quickly(fast)]),
         notes=_notes(asked, found, said, still=at_rest(start), something=something),
         model=fast.left.filtered.model,
         noise=repaired_noise(found, fast, library, asked.facts, _spans(loud)),
-        terms=(*answer.terms, *fast.answer.terms, *rounding(asked.facts)),
+        terms=(*_as_recorded((*answer.terms, *fast.answer.terms), found), *rounding(asked.facts)),
         drawn=pictures.drawn(start, found, residuals.whitened, contributions, courses, alone),
         omnibus=residual_checks.whiteness(start, residuals),
         validation=support.validation((answer, held), (fast.answer, quickly), told, left),
         regime_map=maps,
     )
+
+
+def _as_recorded(told: Sequence[Told], found: Searched) -> tuple[Told, ...]:
+    """What was told by columns as they are read, with settings by the columns as they came."""
+    problem = found.all_sets.made.point.problem
+    return tuple(replace(one, setting=as_recorded(one.setting, problem)) for one in told)
 
 
 def _checked(
