@@ -1,9 +1,9 @@
 """How each logged column is read: as its logger wrote it.
 
-A logger holds a value until the next, adds noise of its own, takes means, and stamps late.  What a
-column is then is no longer what flowed: held it is late, noise makes what follows it too small, and
-a mean lacks what is quick, which a delay or a field by the column's change explains as well.  Each
-column has one reading, for all names by it, and it is chosen before anything is searched: where the
+A logger holds a value until the next, adds noise of its own, and takes means.  What a column is
+then is no longer what flowed: held it is late, noise makes what follows it too small, and a mean
+lacks what is quick, which a delay or a field by the column's change explains as well.  Each column
+has one reading, for all names by it, and it is chosen before anything is searched: where the
 readings of the sensor are likelier so, beside calibration, delay and all causes that are logged.
 """
 
@@ -71,9 +71,7 @@ class Reading:
         """Readings that are a little earlier and later, and of means of less and more."""
         step_s, factor = LATE_STEP_S / 2 ** (1 + round_), 2.0 ** (0.5 ** (1 + round_))
         around = [replace(self, late_s=round(self.late_s + way * step_s, 4)) for way in (-1, 1)]
-        if self.mean_s > 0.0:
-            around += [replace(self, mean_s=self.mean_s * by) for by in (1 / factor, factor)]
-        return around
+        return around + [replace(self, mean_s=self.mean_s * by) for by in (1 / factor, factor)]
 
 
 def as_logged(problem: Problem, likely: Likely) -> Problem:
@@ -110,11 +108,12 @@ def _without_noise(problem: Problem, name: str) -> Problem | None:
     return None if clean is None else _with(problem, clean, said)
 
 
-def in_time(made: Linearised, keys: Sequence[str], at: At, library: Library) -> Iterator[Reading]:
-    """Other readings of columns by which one effect alone is likelier, each the likeliest.
+def of_means(made: Linearised, keys: Sequence[str], at: At, library: Library) -> Iterator[Reading]:
+    """Columns that are likelier means, by what one effect by each is then worth.
 
     made, keys, at: a model with calibration, delay and all causes as they are logged.  A mean over
-    the time before comes late by half of it; one about the moment does not.
+    the time before comes late by half of it; one about the moment does not.  It has to be likelier
+    than any other time of the column: when a name is late, is a setting of its own.
     One effect alone: a late field and one by the current's change together are a mean as well.
     """
     made = made.copied()
@@ -123,17 +122,22 @@ def in_time(made: Linearised, keys: Sequence[str], at: At, library: Library) -> 
         if not asked:
             continue
         scan = _without(made, keys, at, name)
-        best = Reading(name)
-        nats = none = _worth(scan, asked, [best])[best]
-        readings = [Reading(name, 0.0, late_s) for late_s in priors.LOGGED_LATE_S]
-        for mean_s in priors.LOGGED_MEANS_S:
-            readings += [Reading(name, mean_s, late_s) for late_s in (mean_s / 2, 0.0)]
+        late = [Reading(name, 0.0, late_s) for late_s in (0.0, *priors.LOGGED_LATE_S)]
+        least = max(_worth(scan, asked, late).values()) + priors.ODDS_REAL
+        best, nats = late[0], least
+        readings = [
+            Reading(name, mean_s, late_s)
+            for mean_s in priors.LOGGED_MEANS_S
+            for late_s in (mean_s / 2, 0.0)
+        ]
         for round_ in range(1 + _FINER):
             for one, worth in _worth(scan, asked, readings).items():
                 if worth > nats:
                     best, nats = one, worth
+            if best.mean_s == 0.0:
+                break
             readings = best.neighbours(round_)
-        if nats > none + priors.ODDS_REAL:
+        if best.mean_s > 0.0:
             yield best
 
 

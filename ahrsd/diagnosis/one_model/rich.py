@@ -42,7 +42,7 @@ from ahrsd.diagnosis.one_model.linearised import (
     relevelled,
     step_of,
 )
-from ahrsd.diagnosis.one_model.logged_columns import as_logged, in_time, read_as
+from ahrsd.diagnosis.one_model.logged_columns import as_logged, of_means, read_as
 from ahrsd.diagnosis.one_model.remainder import ordinary_remainder
 from ahrsd.diagnosis.where_and_when.locate import FRAMES
 
@@ -160,7 +160,7 @@ def _as_logged(problem: Problem, filtered: Filtered, library: Mapping[str, Effec
     if not problem.recorded.covariates:
         return problem
     here = _delayed(problem, filtered, library, 0.0)
-    for reading in in_time(here.base.made, here.base.whole, here.at, library):
+    for reading in of_means(here.base.made, here.base.whole, here.at, library):
         other = read_as(problem, reading).lagging(problem.lag_s)
         found = _delayed(other, filtered, library, 0.0)
         if found.nats > here.nats + priors.ODDS_REAL:
