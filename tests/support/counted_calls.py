@@ -1,7 +1,8 @@
-"""How much a piece of work asks of the interpreter: calls, which are the same on every machine.
+"""How much a piece of work asks of the interpreter: calls, the same on every machine.
 
-Processor time depends on who else is on the cores, also as a ratio: a small piece keeps its caches
-where a large one loses them. The figures in seconds are in `tests/benchmarks`.
+One version of Python makes the same calls however busy the machine is. Processor time depends on
+who else is on the cores, also as a ratio: a small piece keeps its caches where a large one loses
+them. The figures in seconds are in `tests/benchmarks`.
 """
 
 from __future__ import annotations

@@ -29,10 +29,8 @@ from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.values import Context
 from ahrsd.samples import Array
 
-#: how often the time over which a mean is taken, and by how much the column is late, are halved in
+#: rounds in which the likeliest mean is sought more finely
 _FINER = 2
-#: part of a column's power that is taken for lost where a mean leaves nothing
-_LOST = 0.02
 #: nats of a problem beside calibration, delay and logged causes
 Likely = Callable[[Problem], float]
 Library = Mapping[str, Effect]
@@ -205,10 +203,10 @@ def before_the_mean(time_s: Array, values: Array, mean_s: float) -> Array:
     Each frequency is put back by what a mean leaves of it, as Wiener has it: where that is next to
     nothing, it stays away.
     """
-    count = len(values)
+    count, lost = len(values), priors.LOGGED_LOST
     even_s = np.linspace(time_s[0], time_s[-1], count)
-    hertz = np.arange(count) / (2.0 * (time_s[-1] - time_s[0]) * count / max(count - 1, 1))
+    hertz = np.arange(count) / (2.0 * count * (even_s[1] - even_s[0]))
     left = np.sinc(hertz * mean_s)
     cosines = dct(np.interp(even_s, time_s, values), norm="ortho")
-    before = idct(cosines * left * (1.0 + _LOST) / (left**2 + _LOST), norm="ortho")
+    before = idct(cosines * left * (1.0 + lost) / (left**2 + lost), norm="ortho")
     return np.asarray(np.interp(time_s, even_s, before))

@@ -128,7 +128,7 @@ class Hypotheses:
                 noise = np.minimum(noise, noise[-1])
             odds = sum(self.component(key).prior for key in sorted(members))
             odds += self._again(members) + self._of_class(members)
-            forms = {self.forms[key] for key in members if key in self.forms}
+            forms = set(keys) - members - {CALIBRATION}
             small = [k for k, key in enumerate(keys) if key in forms and key not in known]
             at = reached(products, laws, (noise, start), asked - odds, small=small)
             if at is None:

@@ -108,9 +108,9 @@ EFFECT_GRID = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
 #: s by which a logged cause may come late into the log, or early;  source: averages of loggers; the
 #: motor's current of a flight came 0.32 s late
 LOGGED_LATE_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
-#: s over which a logger may take its means;  source: battery monitors and autopilots' logs at 1 to
-#: 10 Hz
-LOGGED_MEANS_S = (0.2, 0.4, 0.8)
+#: s over which a logger may take its means, sought on from there: a row of a log at 1 to 5 Hz;  and
+#: the part of a column's power that is lost where a mean leaves nothing.  Chosen, not measured
+LOGGED_MEANS_S, LOGGED_LOST = (0.2, 0.4, 0.8), 0.02
 #: s by which a column's clock is off from which on it is sought: nearer, its setting is
 ON_TIME_S = 1.0
 #: s over which a logger ordinarily takes its mean: a battery's monitor filters over a tenth
@@ -170,7 +170,7 @@ SAME_FORM = 0.5
 #: and .46 there, the one that is there .75
 BESIDE_UNKNOWN = 0.5
 #: coefficients of a set that is asked, at most: the time that it takes goes by the cube;  source:
-#: a flight with its current and magnets put on are told with sets of up to 770
+#: a flight with its current and magnets put on were told with sets of up to 770, counted once
 WIDEST = 800
 #: nats that a move of the search must gain
 MOVE = 2.0

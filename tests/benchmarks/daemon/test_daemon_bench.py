@@ -32,7 +32,6 @@ def test_no_sample_is_lost_at_the_devices_rates(rate_hz, seconds, tmp_path):
     print(figures)
     assert figures.lost == 0
     assert figures.taken > (seconds - 1.0) * rate_hz
-    assert figures.peer_ratio > 0.0  # how large depends on what else the machine does
     assert figures.exit_code == 0
     assert figures.stop_s < 3.0
 
