@@ -4,6 +4,6 @@
 at the recording itself and `columns` at what was logged beside it; `innovation_filter` filters it,
 `calibration_fit` fits the calibration; `effects` is the library, one table row per effect;
 `where_and_when` says what is left, where; `answer` is the contract's form and its words, and
-`repaired_model` what a model is worth as a file and forward.  Two engines answer from them,
-`rules` and `one_model`; `engines` chooses.
+`repaired_model` what a model is worth as a file and forward.  `one_model` answers from them: one
+generative model of all that may be in a recording.
 """

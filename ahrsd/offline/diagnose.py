@@ -16,7 +16,7 @@ import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
 from ahrsd.diagnosis.data_quality.aligned import align, differing
-from ahrsd.diagnosis.engines import RULES, diagnosed
+from ahrsd.diagnosis.one_model.diagnose import diagnose_logged
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, from_text
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.errors import AhrsdError, RecordingError
@@ -156,35 +156,33 @@ def diagnose_recording(
     rate_hz: float | None = None,
     progress: Callable[[int], None] | None = None,
     columns: ColumnMap = NO_MAP,
-    engine: str = RULES,
 ) -> Diagnosis:
     """Where REAL and its simulation differ.  Raises RecordingError, AhrsdError.
 
     columns: names and units of REAL, where it is a table of another program
-    engine: one of `engines.ENGINES`
     """
     known, unused = (Spec(), []) if spec is None else load_spec(spec)
     track, notes = load_track(real, rate_hz, progress, spec=known, columns=columns)
     notes = [*unused, *notes]
     if simulation is None:
-        found = _answered(real, track, known, engine)
+        found = _answered(real, track, known)
         return replace(found, notes=(*notes, *found.notes))
     simulated, _ = load_track(simulation, rate_hz, spec=known)
     try:
         overlap = align(track, simulated)
     except ValueError as error:
         raise RecordingError(simulation, str(error), "bring a simulation of this motion") from None
-    found = _answered(real, overlap.real, known, engine)
-    own = _answered(simulation, overlap.simulated, Spec(), engine)
+    found = _answered(real, overlap.real, known)
+    own = _answered(simulation, overlap.simulated, Spec())
     left = differing(found, own)
     return replace(left, notes=(*notes, *overlap.notes, *left.notes))
 
 
-def _answered(path: Path, track: Track, spec: Spec, engine: str) -> Diagnosis:
+def _answered(path: Path, track: Track, spec: Spec) -> Diagnosis:
     simulated = Path(f"{path}.truth.json").exists()  # as `ahrsd simulate` leaves it
     try:
         name = printable(path.name, 200)
-        return diagnosed(engine, track, spec, recording=name, simulated=simulated)
+        return diagnose_logged(track, spec, recording=name, simulated=simulated)
     except np.linalg.LinAlgError:
         raise RecordingError(
             path,

@@ -113,21 +113,12 @@ def test_recordings_that_cannot_be_diagnosed(run, saved, clean, capsys, change, 
     assert err.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("engine", "called"),
-    [
-        ("rules", "ahrsd.diagnosis.engines.diagnose_logged"),
-        ("one-model", "ahrsd.diagnosis.one_model.diagnose.diagnose"),
-    ],
-)
-def test_a_fit_without_an_end_is_one_line_for_a_person(
-    run, saved, clean, capsys, monkeypatch, engine, called
-):
+def test_a_fit_without_an_end_is_one_line_for_a_person(run, saved, clean, capsys, monkeypatch):
     def diverging(*_, **__):
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
-    monkeypatch.setattr(called, diverging)
-    assert run("diagnose", str(saved(clean)), "--engine", engine) == 2
+    monkeypatch.setattr("ahrsd.diagnosis.one_model.diagnose.diagnose", diverging)
+    assert run("diagnose", str(saved(clean))) == 2
     told = capsys.readouterr().err
     assert "Eigenvalues" not in told
     assert "no calibration comes near these readings" in told

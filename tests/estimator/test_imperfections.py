@@ -14,7 +14,7 @@ import pytest
 from scipy.signal import lfilter
 
 from ahrsd import so3
-from ahrsd.diagnosis.rules.ordinary import TABLE
+from ahrsd.diagnosis.one_model.priors import ORDINARY
 from ahrsd.estimator.epoch import with_drift
 from ahrsd.estimator.online import (
     WHOLE,
@@ -456,7 +456,8 @@ def test_the_price_of_places_where_the_motion_is_rich():
 
 def test_places_are_as_large_as_real_recordings_say():
     """Of what differs by place or attitude: the middle is among them, and what is small as well."""
-    for name in ("world", "by_attitude"):
-        row = TABLE.components[name]
-        assert PLACES[1] < 2.0 * row.from_on()
-        assert PLACES[1] < row.median < PLACES[-1]
+    for name in ("world_course", "by_direction"):
+        size = ORDINARY[name]
+        least = size.median / np.exp(1.645 * size.spread)
+        assert PLACES[0] < least < PLACES[1]
+        assert PLACES[1] < size.median < PLACES[-1]

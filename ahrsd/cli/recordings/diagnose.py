@@ -25,13 +25,6 @@ _PATH = click.Path(path_type=Path)
 @click.option("--spec", type=_PATH, help="Known noise, rate and field of the sensor, JSON.")
 @click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
 @columns_option
-@click.option(
-    "--engine",
-    type=click.Choice(["rules", "one-model"]),
-    default="rules",
-    hidden=True,
-    help="Experimental: one-model decides by one generative model (docs/design/engine.md).",
-)
 @click.option("--json", "json_path", help="The answer as JSON into this file, - for stdout.")
 @click.option("--report", "folder", type=_PATH, help="A page with pictures, and more, in here.")
 def command(
@@ -40,7 +33,6 @@ def command(
     spec: Path | None,
     rate_hz: float | None,
     columns: ColumnMap,
-    engine: str,
     json_path: str | None,
     folder: Path | None,
 ) -> None:
@@ -70,7 +62,6 @@ def command(
             rate_hz=rate_hz,
             progress=progress,
             columns=columns,
-            engine=engine,
         )
     if json_path is not None:
         write_json(json_path, found.to_json())

@@ -29,7 +29,7 @@ from ahrsd.diagnosis.innovation_filter.innovation import (
     run_filter,
     sensitivities,
 )
-from ahrsd.diagnosis.innovation_filter.noise import before, colour_of, tails_of
+from ahrsd.diagnosis.innovation_filter.noise import before, colour_of, freedom_of
 from ahrsd.diagnosis.innovation_filter.probabilities import student_quantile
 from ahrsd.diagnosis.repaired_model import forward
 from ahrsd.diagnosis.track import Track
@@ -146,8 +146,9 @@ def noise_law(
         return before_rounding(fit, replace(law, colour=(), level=level), steps[0], simulate)
     law = replace(law, level=level)
     if done.track.lost_turns is None:  # else what is lost makes the tails, and is simulated
-        tails = tails_of(replace(done, whitened=done.whitened / level[:, None]))
-        law = replace(law, freedom=tails.freedom)
+        law = replace(
+            law, freedom=freedom_of(replace(done, whitened=done.whitened / level[:, None]))
+        )
     if not law.colour:
         return law
     tried = int(np.clip(_TRIED_ROWS // len(level), 1, _TRIED))

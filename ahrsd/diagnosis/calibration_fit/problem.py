@@ -18,8 +18,6 @@ from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
 
-BLOCKS = 80
-BLOCK_S = (2.0, 10.0)
 #: samples per working row from which the gyro's noise is taken from the recorded rate
 OVERSAMPLED = 5
 MEAN_RATES = (
@@ -63,11 +61,6 @@ class Problem:
     def rate_hz(self) -> float:
         """Rows per second."""
         return 1.0 / float(np.nanmedian(self.track.dt_s))
-
-    @property
-    def block_s(self) -> float:
-        """Length of the Gram's blocks: about 80, longer than correlated noise where possible."""
-        return float(np.clip(self.track.duration_s / BLOCKS, *BLOCK_S))
 
     def lagging(self, lag_s: float) -> Problem:
         """The same with a lag of the magnetometer taken out."""

@@ -21,8 +21,7 @@ from ahrsd.diagnosis.answer.diagnosis import Finding, Share, Value, Where
 from ahrsd.diagnosis.calibration_fit.descent import NullFit
 from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.innovation_filter.evidence import log_bayes, posterior
-from ahrsd.diagnosis.innovation_filter.gram import solve
-from ahrsd.diagnosis.innovation_filter.score import total_score
+from ahrsd.diagnosis.innovation_filter.score import solve, total_score
 from ahrsd.diagnosis.limits import Limits
 from ahrsd.diagnosis.values import Context
 from ahrsd.samples import Array

@@ -90,18 +90,14 @@ class ColumnEvidence(Protocol):
     middle_s: float
     duration_s: float
 
-    def quieten(self, clock: tuple[float, float]) -> None:
-        """Take the noise from what the column leaves at (lag, drift)."""
-
     def nats(self, clocks: Sequence[tuple[float, float]]) -> list[float]:
         """What the column explains at each (lag, drift)."""
 
 
 def likeliest_clock(asked: ColumnEvidence, around_s: float) -> Late | None:
-    """The same by the evidence of any model, sought round a lag, s."""
+    """The clock by the evidence of a model, sought round a lag, s."""
     coarse = np.arange(around_s - COARSE_S[0], around_s + COARSE_S[0] + 0.1, COARSE_S[1])
     at, _ = _best(asked, [(float(lag), 0.0) for lag in coarse])
-    asked.quieten(at)
     none, most = asked.nats([(0.0, 0.0), at])
     slopes = [sign * d / asked.duration_s for d in DRIFTS_S for sign in (-1.0, 1.0)]
     near = np.arange(-COARSE_S[0], COARSE_S[0] + 0.1, 2.0)

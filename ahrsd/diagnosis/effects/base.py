@@ -81,7 +81,6 @@ class Effect(ABC):
     rides:       its field stays on the sensor whatever that does, in gauss by what was logged
     unseen:      unit directions (p,) of the parameters that no motion shows: what a fit says of
                  them is the noise of its own columns, and what is known is the prior
-    form_share:  part of its evidence that its columns may leave, where they are not exact
     quick:       only the recorded rate shows it: averaged over some readings it is gone
     course:      whether any slow course in time of its frame is it, whatever the form
     jumps:       one constant vector along the axes of its frame, from its onset on
@@ -95,9 +94,6 @@ class Effect(ABC):
     ordinary_part: of what real recordings ordinarily leave, the part whose form it is
     remembers:   the most of what each axis may have from before the recording (setting `memory`),
                  in that setting's unit; 0 where it remembers nothing
-    stands_for:  effects that look like it, each a further way to it where its column was not logged
-    loose:       prior of its parameters in the joint fit, in their own prior deviations: next to
-                 none, unless the columns themselves follow what is fitted
     """
 
     identifier: str
@@ -119,7 +115,6 @@ class Effect(ABC):
     frame: str | None = None
     rides: bool = False
     unseen: tuple[tuple[float, ...], ...] = ()
-    form_share: float = 0.0
     quick: bool = False
     course: bool = False
     jumps: bool = False
@@ -131,8 +126,6 @@ class Effect(ABC):
     ordinary: float = 0.0
     ordinary_part: str | None = None
     remembers: float = 0.0
-    stands_for: tuple[str, ...] = ()
-    loose: float = 30.0
 
     @property
     def least_information(self) -> float:

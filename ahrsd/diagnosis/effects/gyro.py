@@ -30,7 +30,6 @@ class GyroScale(Linear):
     identifier = "gyro_scale"
     code = "G1"
     family = "gyro"
-    form_share = 1e-4  # its second order
     words = "the gyro's scale factor is off"
     equation = "w_i += s_i w_i"
     parameters = shapes.vector("scale_error", "1", 0.005, 0.2)
@@ -64,7 +63,6 @@ class GyroNonorthogonality(Linear):
     identifier = "gyro_nonorthogonality"
     code = "G2"
     family = "gyro"
-    form_share = 1e-4  # its second order
     words = "the gyro's axes are not at right angles"
     equation = "w += S w, S symmetric with zero diagonal"
     parameters = tuple(Parameter(f"shear_{e}", "rad", 0.003, 0.1) for e in ("xy", "xz", "yz"))

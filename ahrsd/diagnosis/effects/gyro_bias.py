@@ -136,7 +136,6 @@ class GyroStartup(Linear):
     manoeuvre = "switch off for a second and on again while warm"
     size = "0.01 to 0.1 deg/s"
     source = "dossier G14"
-    stands_for = ("gyro_bias_temperature",)
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Time constants a factor of three apart."""

@@ -69,7 +69,6 @@ class HardIronDrift(Linear):
     size = "0.1 to 5 mG/h; more after a shock"
     source = "retentive error of ship's compasses (dossier M2)"
     ordinary = 12.0
-    stands_for = ("mag_bias_temperature",)
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Straight; fast, then slow; settling, with time constants a factor of two apart."""
@@ -129,7 +128,6 @@ class Hysteresis(Linear):
     identifier = "hysteresis"
     code = "M16"
     family = "sensor"
-    form_share = 5e-3  # one play stands for a loop, and sampled play misses its turning points
     words = "hysteresis of iron near the sensor"
     equation = "m_i += k_i (play_r[(A h)_i] - (A h)_i) / r"
     # three times the largest that is known: in a spin the field along the axis has no swing but the

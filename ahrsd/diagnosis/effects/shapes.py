@@ -86,10 +86,6 @@ def per_covariate(readings: Readings, role: str, **more: object) -> tuple[Settin
     )
 
 
-#: of a setting: how a logged cause differs from what flowed
-LOGGED = ("late_s", "mean_s")
-
-
 def course_of(readings: Readings, setting: Setting) -> Array:
     """The setting's covariate minus its reference, (N, 1), as it was before it was logged.
 

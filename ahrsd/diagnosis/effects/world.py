@@ -176,7 +176,6 @@ class GeomagneticDrift(Linear):
     source = "dossier W3"
     # north is where the field points: what turns it about the vertical turns the world as well, is
     # seen by nothing, and would run away in the joint fit (from 2 mG to 25)
-    loose = 3.0
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """There, or there and back, or half a wave or more of any phase: a slow pulsation."""

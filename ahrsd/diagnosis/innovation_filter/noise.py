@@ -56,16 +56,6 @@ class Colour:
         return np.asarray(self.variance / np.abs(np.fft.rfft(taps, _FREQUENCIES)) ** 2)
 
 
-@dataclass(frozen=True, slots=True)
-class Tails:
-    """excess_kurtosis: 0 for Gaussian; freedom: of the likeliest Student-t, inf for none;
-    outliers: share beyond 4 deviations (6e-5 for Gaussian)."""
-
-    excess_kurtosis: float
-    freedom: float
-    outliers: float
-
-
 def colour_of(done: Filtered) -> Colour:
     """Autoregression of the whitened innovations."""
     rows = _centred(done)
@@ -97,17 +87,15 @@ def before(wanted: Colour, found: Colour) -> tuple[Colour, float]:
     return Colour(a, float(r[0] - a @ r[1:])), float(np.sqrt(r[0] / whole))
 
 
-def tails_of(done: Filtered) -> Tails:
-    """Tails of the white part of the innovations, all axes together."""
+def freedom_of(done: Filtered) -> float:
+    """Of the likeliest Student-t of the innovations' white part, all axes; inf for no tails."""
     e = done.whitened[done.used].ravel()
     if len(e) < 30:
-        return Tails(0.0, float("inf"), 0.0)
+        return float("inf")
     z = (e - e.mean()) / max(float(e.std()), 1e-300)
     kurtosis = float(np.mean(z**4) - 3.0)
     deviation = float(np.sqrt(24.0 / len(z)))
-    freedom = _freedom(z) if kurtosis > 3 * deviation else float("inf")
-    middle = 1.4826 * float(np.median(np.abs(e - np.median(e))))
-    return Tails(kurtosis, freedom, float(np.mean(np.abs(e) > 4 * max(middle, 1e-300))))
+    return _freedom(z) if kurtosis > 3 * deviation else float("inf")
 
 
 def _freedom(z: Array) -> float:

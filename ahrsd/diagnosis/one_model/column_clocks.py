@@ -48,7 +48,7 @@ def _course(found: Judged) -> Located:
     waves = np.cos(phase[:, None] * np.arange(1, len(value) + 1))
     deviation = np.sqrt(np.mean(waves**2 @ unsure**2, axis=1))
     flat = np.array([1.0, 0.0, 0.0])
-    return Located("sensor", 0.0, 0.0, value.size, 1.0, cut, waves @ value, deviation, flat, 0.0)
+    return Located("sensor", 0.0, cut, waves @ value, deviation, flat)
 
 
 class _EvidenceBesideModel:
@@ -72,9 +72,6 @@ class _EvidenceBesideModel:
 
     def _follows(self, one: Component) -> bool:
         return one.setting.get("covariate") == self.column
-
-    def quieten(self, clock: tuple[float, float]) -> None:
-        """The richest model's noise is what its course left already."""
 
     def nats(self, clocks: Sequence[tuple[float, float]]) -> list[float]:
         """Log Bayes factors."""

@@ -18,6 +18,7 @@ from ahrsd.diagnosis.calibration_fit.descent import NullFit
 from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import Problem, problem_of
 from ahrsd.diagnosis.calibration_fit.resting import at_rest, resting, told_at_rest
+from ahrsd.diagnosis.columns.logged import with_holes
 from ahrsd.diagnosis.data_quality.missing import differ, lost_turns
 from ahrsd.diagnosis.data_quality.prepared import prepared
 from ahrsd.diagnosis.effects.base import Effect
@@ -37,6 +38,14 @@ def begun(track: Track, spec: Spec, library: Mapping[str, Effect]) -> tuple[Prob
     """A track that hygiene has put right at its working rate, and the fit of a null to it."""
     problem, cold = problem_of(broken_where_unsampled(track), spec, library, LIMITS)
     return problem, fit_null(problem.track, problem.spec, cold, walk=False)
+
+
+def diagnose_logged(
+    track: Track, spec: Spec | None = None, *, recording: str = "", simulated: bool = False
+) -> Diagnosis:
+    """The same of columns with holes, as users have it."""
+    ask = partial(diagnose, recording=recording, simulated=simulated)
+    return with_holes(track, spec, ask)
 
 
 def diagnose(

@@ -117,8 +117,6 @@ ON_TIME_S = 1.0
 LOGGED_BLUR_S = 0.05
 #: that iron has something along an axis from before the recording, and of twenty values this one
 REMEMBERED = 1.0 / 20.0
-#: relative size of what an effect leaves of its form, its second order
-FORM = 0.03
 
 #: deviation of a name's coefficient that is free in time or attitude, relative to itself: from
 #: which on the name stands in for something else, and the largest;  source: in time twelve names

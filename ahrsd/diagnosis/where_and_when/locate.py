@@ -90,22 +90,18 @@ def unit_columns(context: Context, frame: Frame) -> Array:
 class Located:
     """What one frame's segments say.
 
-    evidence: log Bayes factor, nats;  statistic, rank, p_value: the score test
+    evidence: log Bayes factor, nats
     course:   (J, 3) posterior mean of the coefficients, gauss or rad/s, of zero weighted mean
     deviation: (J,) of a coefficient
-    direction: (3,) unit vector of the strongest single source;  single_share: how much it covers
+    direction: (3,) unit vector of the strongest single source
     """
 
     frame: Frame
     evidence: float
-    statistic: float
-    rank: int
-    p_value: float
     cut: Segments
     course: Array
     deviation: Array
     direction: Array
-    single_share: float
 
     @property
     def source(self) -> Array:

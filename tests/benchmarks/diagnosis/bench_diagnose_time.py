@@ -24,7 +24,7 @@ sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.rules import engine
+from ahrsd.diagnosis.one_model import diagnose as engine
 from ahrsd.diagnosis.track import Track
 from ahrsd.offline.diagnose import diagnose_recording
 from ahrsd.recording.table import write_table
@@ -44,9 +44,8 @@ KINDS = {
 }
 #: functions of the engine that are timed, in the order in which they run
 PHASES = (
-    "problem_of", "fit_null", "sought", "wandering", "named_beside", "bursts", "framed",
-    "refined", "left_alone", "explained", "with_free_course", "quick", "checks", "usual_noise",
-    "omnibus",
+    "prepared", "problem_of", "fit_null", "lost_turns", "wrong_clock", "answered", "quick",
+    "lost_beside", "whole_answer", "beyond_chance",
 )  # fmt: skip
 
 

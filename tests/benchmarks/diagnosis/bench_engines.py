@@ -1,10 +1,9 @@
-"""Both engines on the same recordings: real with known truth, real untouched, blind.  One table.
+"""The engine on recordings: real with known truth, real untouched, blind.  One table.
 
     python tests/benchmarks/diagnosis/bench_engines.py --kept ANSWERS.json [--only PART ...]
-        [--seed N --cases RING=N ...] [--world NAME] [--again ENGINE] [--listed]
+        [--seed N --cases RING=N ...] [--world NAME] [--listed]
 
-A case is answered once by each engine and kept in the file; `--again one-model` forgets what that
-engine said (of the cases that `--only` leaves).  The blind cases are drawn anew from the seed and
+A case is answered once and kept in the file.  The blind cases are drawn anew from the seed and
 judged as `ahrsd challenge score` does.
 
 known:     what was put on or flows is named, at its time; a delay of the magnetometer beside it,
@@ -38,7 +37,7 @@ from blind_trials.making import make
 from blind_trials.sealing import read_object
 from generators.truths import KINDS, WORLDS, made
 
-from ahrsd.diagnosis.engines import ENGINES, diagnosed
+from ahrsd.diagnosis.one_model.diagnose import diagnose_logged
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.offline.diagnose import load_spec, load_track
 
@@ -46,6 +45,8 @@ Json = dict[str, Any]
 
 DELAYS = frozenset({"mag_time_lag", "mag_low_pass", "gyro_time_lag", "gyro_integration"})
 CURRENT = ("motor_current_a", "throttle", "battery_v")
+#: verdicts that are no mistakes
+FINE = ("right", "quiet")
 #: how near in time a step must be, s: a hand takes one to three
 NEAR_S = 4.0
 
@@ -133,11 +134,11 @@ def world_cases(world: str, seed: int, drawn: Sequence[str]) -> Iterator[Case]:
             yield Case(f"{world} {kind}", said, track, spec, truth=one.truth)
 
 
-def answered(engine: str, case: Case) -> Json:
-    """What an engine says of a case, and its seconds of CPU."""
+def answered(case: Case) -> Json:
+    """What is said of a case, and its seconds of CPU."""
     begin = time.process_time()
     try:
-        found = diagnosed(engine, case.track, case.spec, recording=case.name, simulated=False)
+        found = diagnose_logged(case.track, case.spec, recording=case.name)
         answer, failure = found.to_json(), None
     except ValueError as why:
         answer, failure = None, str(why)
@@ -190,29 +191,26 @@ def _short(finding: Json) -> str:
     return f"{finding['effect']}{at} ({finding.get('evidence_nats') or 0.0:.0f})"
 
 
-def table(cases: Sequence[tuple[Case, dict[str, Json]]], *, listed: bool) -> None:
-    """Verdicts counted by part and engine; each case where the engines differ, or all."""
-    counted: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
-    spent: dict[tuple[str, str], list[float]] = defaultdict(list)
-    for case, records in cases:
-        words = {engine: verdict(case, records[engine]) for engine in ENGINES}
-        for engine, (word, _) in words.items():
-            counted[case.part, engine][word] += 1
-            spent[case.part, engine].append(records[engine]["cpu_seconds"])
-        both = [word for word, _ in words.values()]
-        if listed or both[0] != both[1]:
+def table(cases: Sequence[tuple[Case, Json]], *, listed: bool) -> None:
+    """Verdicts counted by part; each case that is not right, or all."""
+    counted: dict[str, Counter[str]] = defaultdict(Counter)
+    spent: dict[str, list[float]] = defaultdict(list)
+    for case, record in cases:
+        word, said = verdict(case, record)
+        counted[case.part][word] += 1
+        spent[case.part].append(record["cpu_seconds"])
+        if listed or word not in FINE:
             print(f"{case.part}: {case.name}")
-            for engine, (word, said) in words.items():
-                print(f"    {engine:9s} {word:10s} {said}")
+            print(f"    {word:10s} {said}")
     print()
-    print("| cases | engine | verdicts | CPU s: median, 95 % |")
-    print("|---|---|---|---|")
-    order = ["right", "quiet", *reversed(ORDER)]
-    for (part, engine), words in counted.items():
+    print("| cases | verdicts | CPU s: median, 95 % |")
+    print("|---|---|---|")
+    order = [*FINE, *(word for word in reversed(ORDER) if word not in FINE)]
+    for part, words in counted.items():
         told = sorted(words.items(), key=lambda item: order.index(item[0]))
         verdicts = ", ".join(f"{count} {word}" for word, count in told)
-        cpu = np.quantile(spent[part, engine], [0.5, 0.95])
-        print(f"| {part} | {engine} | {verdicts} | {cpu[0]:.1f}, {cpu[1]:.1f} |")
+        cpu = np.quantile(spent[part], [0.5, 0.95])
+        print(f"| {part} | {verdicts} | {cpu[0]:.1f}, {cpu[1]:.1f} |")
 
 
 def main() -> None:
@@ -222,7 +220,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="of the blind cases")
     parser.add_argument("--cases", nargs="*", default=[], help="blind cases, as singles=22")
     parser.add_argument("--world", choices=sorted(WORLDS), help="whose cases; else the trials' own")
-    parser.add_argument("--again", choices=ENGINES, help="answer anew by this engine")
     parser.add_argument("--listed", action="store_true", help="list every case")
     given = parser.parse_args()
     known: dict[str, Json] = json.loads(given.kept.read_text()) if given.kept.exists() else {}
@@ -237,14 +234,12 @@ def main() -> None:
         title = f"{case.part}: {case.name}"
         if not any(word in title for word in given.only):
             continue
-        for engine in ENGINES:
-            key = f"{engine}: {title}"
-            if key not in known or engine == given.again:
-                known[key] = answered(engine, case)
-                given.kept.write_text(json.dumps(known) + "\n", encoding="utf-8")
-                word, said = verdict(case, known[key])
-                print(f"{key}: {word}: {said} ({known[key]['cpu_seconds']:.1f} s)", flush=True)
-        done.append((case, {engine: known[f"{engine}: {title}"] for engine in ENGINES}))
+        if title not in known:
+            known[title] = answered(case)
+            given.kept.write_text(json.dumps(known) + "\n", encoding="utf-8")
+            word, said = verdict(case, known[title])
+            print(f"{title}: {word}: {said} ({known[title]['cpu_seconds']:.1f} s)", flush=True)
+        done.append((case, known[title]))
     table(done, listed=given.listed)
 
 

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_ordinary import AT_REST, DISTURBED, DOUBTFUL, FOLDERS, RECORDINGS
 from scipy.optimize import minimize
 
 from ahrsd.diagnosis.data_quality.prepared import prepared
@@ -41,6 +40,14 @@ from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import RecordingError
 from ahrsd.offline.diagnose import load_track
 
+RECORDINGS = Path(__file__).parents[3] / ".." / "shared" / "recordings"
+FOLDERS = ("broad", "repoimu", "fiumarg", "arducopter", "vn100", "vn100_distorters")
+#: by the recordings' README, parts of names: something was put on or stands there, a current flows
+DISTURBED = ("_disturbed_", "vn7", "vn30", "log171_MAG2")
+#: of these it says that something changed while they were made, and not what
+DOUBTFUL = ("hand_2023_thumatti", "hand_2023_ashutosh")
+#: stood still: nothing but noise is to be seen
+AT_REST = ("static_2025", "F00379")
 GRID = np.arange(-4.5, 4.6, 0.5)  # of the logarithm of a size about its present median
 LEAST_SPREAD = 0.5
 

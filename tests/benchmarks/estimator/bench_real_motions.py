@@ -28,7 +28,7 @@ from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.base import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.rules.engine import diagnose
+from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.offline.diagnose import load_track
 from ahrsd.samples import Array

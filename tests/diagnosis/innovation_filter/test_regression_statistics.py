@@ -7,8 +7,7 @@ import pytest
 
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation_filter.evidence import posterior
-from ahrsd.diagnosis.innovation_filter.gram import solve
-from ahrsd.diagnosis.innovation_filter.score import total_score
+from ahrsd.diagnosis.innovation_filter.score import solve, total_score
 
 
 def test_a_direction_counts_where_a_coefficient_at_its_bound_would_show():

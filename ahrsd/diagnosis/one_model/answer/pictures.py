@@ -69,17 +69,13 @@ def _course(all_sets: Hypotheses, best: Hypothesis, frame: Frame) -> Located:
     phase = np.pi * (cut.middle_s - track.time_s[0]) / track.duration_s
     waves = np.cos(phase[:, None] * np.arange(1, len(value) + 1))
     course, deviation = waves @ value, np.sqrt(np.mean(waves**2 @ unsure**2, axis=1))
-    direction, share = single_source(course, deviation)
+    direction, _ = single_source(course, deviation)
     nats = max(with_it.at.nats - without.at.nats, 0.0)
     return Located(
         frame=frame,
         evidence=nats,
-        statistic=2.0 * nats,
-        rank=value.size,
-        p_value=float(np.exp(-nats)),
         cut=cut,
         course=course,
         deviation=deviation,
         direction=direction,
-        single_share=share,
     )

@@ -21,7 +21,7 @@ from ahrsd.diagnosis.answer.diagnosis import Check, RegimeMap, Whiteness
 from ahrsd.diagnosis.answer.omnibus import omnibus
 from ahrsd.diagnosis.answer.predictive import COPIES, bands, scene_of, statistics
 from ahrsd.diagnosis.calibration_fit.descent import NullFit
-from ahrsd.diagnosis.innovation_filter.noise import tails_of
+from ahrsd.diagnosis.innovation_filter.noise import freedom_of
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.answer.white_rows import Fit, WhiteRows
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION
@@ -110,7 +110,7 @@ def _compared(
 def _drawn(rng: np.random.Generator, found: Residuals, shape: tuple[int, int]) -> Array:
     """White noise of unit variance, its tails those of what is left."""
     filtered = found.rows.made.point.filtered
-    freedom = tails_of(replace(filtered, whitened=found.whitened)).freedom
+    freedom = freedom_of(replace(filtered, whitened=found.whitened))
     e = rng.standard_normal(shape)
     if np.isfinite(freedom):
         e *= np.sqrt((freedom - 2.0) / rng.chisquare(freedom, shape))

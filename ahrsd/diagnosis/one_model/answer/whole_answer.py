@@ -40,8 +40,6 @@ from ahrsd.diagnosis.one_model.search_rounds import Searched
 from ahrsd.diagnosis.values import Term
 from ahrsd.diagnosis.where_and_when import locate
 
-NOTE = "by the engine one-model, which is experimental"
-
 
 #: what has a setting
 Told = TypeVar("Told", Finding, Term)
@@ -170,7 +168,7 @@ def _notes(
         how = (*how, f"readings at {when} s were left out: something was moved there")
     if found.all_sets.too_wide and found.answer.unknown:
         how = (*how, TOO_MANY)
-    return (*how, *said, *asked.lesser, *seen, NOTE)
+    return (*how, *said, *asked.lesser, *seen)
 
 
 def _with_channels(

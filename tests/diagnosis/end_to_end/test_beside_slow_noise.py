@@ -1,0 +1,37 @@
+"""A source beside noise that forgets within seconds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+from scipy.signal import lfilter
+
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.track import Track
+
+
+def slow(rng: np.random.Generator, count: int, rate_hz: float, time_s: float) -> np.ndarray:
+    """First-order noise (count, 3) of unit deviation."""
+    keep = np.exp(-1.0 / (rate_hz * time_s))
+    white = rng.standard_normal((count, 3)) * np.sqrt(1 - keep**2)
+    return np.asarray(lfilter([1.0], [1.0, -keep], white, axis=0))
+
+
+@pytest.fixture(scope="module")
+def quiet() -> Track:
+    return replace(made(Trial(seed=8)).track, covariates={})
+
+
+@pytest.mark.slow
+def test_a_source_is_told_beside_slow_noise(quiet: Track) -> None:
+    noise = 5e-4 * slow(np.random.default_rng(1), len(quiet), 25.0, 2.0)
+    on = (quiet.time_s % 97.0) < 41.0
+    field = on[:, None] * np.array([1.5e-3, 1e-3, -1.5e-3])
+    answer = diagnose(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + noise + field))
+    assert answer.findings == ()
+    where = answer.unexplained.where
+    assert where is not None
+    assert where.frame == "sensor"

@@ -1,0 +1,68 @@
+"""What iron remembers from before the recording is its own, and no jump in the first seconds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.effects import series
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.repaired_model.forward import contribution
+from ahrsd.diagnosis.values import Term
+
+
+def test_play_begins_where_it_was_left() -> None:
+    values = np.array([[0.0], [0.2], [-0.3], [-0.8], [1.0], [0.9]])
+    middle = series.play(values, 0.5, (1.0,))[:, 0]
+    np.testing.assert_allclose(middle, [0.5, 0.5, 0.2, -0.3, 0.5, 0.5], atol=1e-12)
+    assert series.play(values, 0.5, (0.0,)).tolist() == series.play(values, 0.5).tolist()
+
+
+@pytest.mark.parametrize(
+    "memory", [(1.0, -1.0, 1.0), pytest.param((0.5, -0.75, 1.0), marks=pytest.mark.slow)]
+)
+def test_the_memory_is_found_and_nothing_else_is_named(memory) -> None:
+    track = made(Trial(5, scenario="wam", samples=6000)).track
+    setting = {"radius_gauss": 0.03, "memory": memory}
+    value = np.array([2e-3, 2.5e-3, 3e-3])
+    term = Term("hysteresis", value, np.zeros(3), setting)
+    added, _ = contribution(fit_null(track).context(), [term])
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    assert [one.effect for one in found.findings] == ["hysteresis"]
+    assert not found.unexplained.detected
+    assert found.findings[0].setting["memory"] == pytest.approx(memory, abs=0.26)
+    assert abs(found.findings[0].setting["radius_gauss"] - 0.03) < 1e-3
+
+
+def test_a_low_pass_begins_where_it_was_left() -> None:
+    values = np.array([[1.0], [1.0], [1.0], [2.0], [2.0]])
+    dt_s = np.array([np.nan, 0.5, 0.5, np.nan, 0.5])  # the second run begins settled
+    slow = series.low_pass(values, dt_s, 2.0, (0.3,))[:, 0]
+    expected = [1.3, 1 + 0.3 * np.exp(-0.25), 1 + 0.3 * np.exp(-0.5), 2.0, 2.0]
+    np.testing.assert_allclose(slow, expected, atol=1e-12)
+
+
+def test_iron_that_had_not_settled_is_no_step_and_no_drift() -> None:
+    track = made(Trial(6, scenario="wam", samples=6000)).track
+    setting = {"time_constant_s": 25.0, "memory": (0.3, -0.25, 0.2)}
+    value = np.array([0.02, 0.012, -0.008, 0.004, -0.006, 0.005])
+    term = Term("viscous_magnetisation", value, np.zeros(6), setting)
+    added, _ = contribution(fit_null(track).context(), [term])
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    assert [one.effect for one in found.findings] == ["viscous_magnetisation"]
+    assert not found.unexplained.detected
+    seen = found.findings[0]
+    np.testing.assert_allclose(seen.setting["memory"], setting["memory"], atol=0.05)
+    assert abs(seen.setting["time_constant_s"] / 25.0 - 1) < 0.15
+
+
+@pytest.mark.slow
+def test_iron_that_had_settled_is_given_no_memory() -> None:
+    track = made(Trial(6, (("viscous_magnetisation", 2.0),), scenario="wam", samples=6000)).track
+    (seen,) = diagnose(track).findings
+    assert seen.effect == "viscous_magnetisation"
+    assert "memory" not in seen.setting

@@ -1,0 +1,93 @@
+"""Settings that are a size: sought between the values of their grid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.effects.base import Readings, Setting, readings_of
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.track import Track
+
+
+def _quiet(seed: int) -> tuple[Track, Readings]:
+    track = replace(made(Trial(seed=seed, samples=7000)).track, covariates={})
+    return track, readings_of(fit_null(track, walk=False).context())
+
+
+@pytest.mark.slow
+def test_a_compensation_on_board_is_named_once_with_its_part() -> None:
+    track, readings = _quiet(3)
+    effect = EFFECTS["onboard_calibration_active"]
+    setting = {"onset_s": float(track.time_s[0]), "time_constant_s": 105.0}
+    changed = effect.simulate(readings, np.array([0.3, 0.02]), setting).mag_b_gauss
+    answer = diagnose(
+        replace(track, mag_b_gauss=track.mag_b_gauss + changed - readings.mag_b_gauss)
+    )
+    assert [one.effect for one in answer.findings] == ["onboard_calibration_active"]
+    found = answer.findings[0]
+    assert abs(found.parameters[0].value - 0.3) < 0.02
+    assert abs(found.parameters[1].value - 0.02) < 0.005
+    assert abs(found.setting["time_constant_s"] / 105.0 - 1) < 0.15
+    assert found.where.frame == "sensor"
+
+
+@pytest.mark.parametrize("seed", [pytest.param(3, marks=pytest.mark.slow), 6])
+def test_what_creeps_in_steps_is_known_to_what_its_onset_leaves_open(seed: int) -> None:
+    """A device that updates every eight seconds; of a smooth curve the part is known too well."""
+    track, readings = _quiet(seed)
+    effect = EFFECTS["onboard_calibration_active"]
+    first = float(track.time_s[0])
+    held = replace(readings, time_s=first + 8.0 * np.floor((readings.time_s - first) / 8.0))
+    setting = {"onset_s": first, "time_constant_s": 105.0}
+    changed = effect.simulate(held, np.array([0.08, 0.0]), setting).mag_b_gauss
+    answer = diagnose(
+        replace(track, mag_b_gauss=track.mag_b_gauss + changed - readings.mag_b_gauss)
+    )
+    assert [one.effect for one in answer.findings] == ["onboard_calibration_active"]
+    part = answer.findings[0].parameters[0]
+    assert abs(part.value - 0.08) < 2.5 * part.std
+    assert 4e-4 < part.std < 6e-3  # of an onset that is known, 2.5e-4
+
+
+@pytest.mark.slow
+def test_a_slow_pulsation_of_the_outside_field_is_one_name_where_positions_are_logged() -> None:
+    pulsed, setting = _pulsed()
+    logged = made(Trial(seed=5, samples=7000)).track.covariates
+    placed = {name: values for name, values in logged.items() if name.startswith("position")}
+    answer = diagnose(replace(pulsed, covariates=placed))
+    assert [one.effect for one in answer.findings] == ["geomagnetic_drift"]
+    assert not answer.unexplained.detected
+    assert abs(answer.findings[0].setting["length_s"] / setting["length_s"] - 1) < 0.1
+
+
+def _pulsed() -> tuple[Track, Setting]:
+    """The world's field swings by half a wave in a little more than half of the recording."""
+    track, readings = _quiet(5)
+    effect = EFFECTS["geomagnetic_drift"]
+    span_s = float(np.ptp(track.time_s))
+    wave = {"start_s": float(track.time_s[0]), "span_s": span_s, "shape": "wave"}
+    setting = {**wave, "length_s": 0.55 * span_s, "turn_deg": 67.0}
+    changed = effect.simulate(readings, np.array([2.5e-3, -1e-3, 2e-3]), setting).mag_b_gauss
+    pulsed = replace(track, mag_b_gauss=track.mag_b_gauss + changed - readings.mag_b_gauss)
+    return pulsed, setting
+
+
+@pytest.mark.slow
+def test_a_field_that_falls_off_by_e_in_metres_of_height_is_one_name() -> None:
+    track, readings = _quiet(6)
+    passed = (track.time_s - track.time_s[0]) / np.ptp(track.time_s)
+    height = 7.0 + 5.0 * np.sin(2 * np.pi * 2.3 * passed + 1.0) * np.cos(2 * np.pi * 0.7 * passed)
+    course = np.exp(-height / 3.0)[:, None] * np.array([0.012, -0.01, 0.015])
+    changed = np.einsum("nji,nj->ni", readings.R_nb, course) @ readings.soft_iron.T
+    answer = diagnose(
+        replace(track, mag_b_gauss=track.mag_b_gauss + changed, covariates={"altitude_m": height})
+    )
+    assert [one.effect for one in answer.findings] == ["altitude_field"]
+    assert not answer.unexplained.detected
+    assert abs(answer.findings[0].setting["length_m"] / 3.0 - 1) < 0.2

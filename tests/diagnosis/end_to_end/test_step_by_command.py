@@ -1,0 +1,68 @@
+"""`ahrsd diagnose` of a step of the hard iron: named, in the contract's form, with a report."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from tracks import experiment
+
+from ahrsd.diagnosis.repaired_model.model_file import from_text
+from ahrsd.recording.table import write_table
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A simulated recording with a step of the hard iron at 70 s."""
+    made = experiment("wam", seed=8, samples=3500).samples
+    step = (made.time_s >= 70.0)[:, None] * np.array([0.0, 9e-3, -4e-3])
+    columns = {"time_s": made.time_s}
+    for k, axis in enumerate("xyz"):
+        columns[f"mag_{axis}_gauss"] = (made.raw_b_gauss + step)[:, k]
+        columns[f"gyro_{axis}_rad_s"] = made.gyro_b_rad_s[:, k]
+    path = tmp_path_factory.mktemp("one_model") / "step.csv"
+    write_table(path, columns)
+    return path
+
+
+def test_the_step_is_named_in_the_same_form(run, recording, tmp_path, capsys):
+    answer = tmp_path / "answer.json"
+    words = ["diagnose", str(recording), "--json", str(answer)]
+    assert run(*words) == 0
+    body = json.loads(answer.read_text())
+    assert body["schema"] == "ahrsd.diagnosis/1"
+    assert [one["effect"] for one in body["findings"]] == ["hard_iron_step"]
+    (one,) = body["findings"]
+    assert one["where"]["intervals_s"][0][0] == pytest.approx(70.0, abs=0.5)
+    found = [p["value"] for p in one["parameters"]]
+    np.testing.assert_allclose(found, [0.0, 9e-3, -4e-3], atol=8e-4)
+    assert "hard_iron_step" in capsys.readouterr().out
+
+
+def test_a_report_has_all_that_is_told_of_it(run, recording, tmp_path, capsys):
+    assert run("diagnose", str(recording), "--report", str(tmp_path)) == 0
+    words = capsys.readouterr().out
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("<figure") + page.count("<svg") > 4
+    assert (tmp_path / "diagnosis.rrd").stat().st_size > 100_000
+    model = from_text((tmp_path / "model.json").read_text())
+    (term,) = model.terms
+    assert term.identifier == "hard_iron_step"
+    assert model.noise.mag_gauss == pytest.approx(1e-3, rel=0.1)
+    for line in ("held out", "without it", "checks:", "innovations:"):
+        assert line in words
+    (one,) = json.loads((tmp_path / "diagnosis.json").read_text())["findings"]
+    assert one["term"] == 0
+    assert one["heldout"]["nll_gain_per_sample"] > 10 * max(one["heldout"]["placebo_gain"], 0.001)
+    assert one["priors"]["stays"]
+    assert one["priors"]["log_odds"] == pytest.approx(one["evidence_nats"])
+
+
+@pytest.mark.slow
+def test_what_the_simulation_has_as_well_is_no_difference(run, recording, capsys):
+    words = ["diagnose", str(recording), "--simulation", str(recording)]
+    assert run(*words) == 0
+    told = capsys.readouterr().out
+    assert "hard_iron_step is in the simulation already, to the same size" in told
+    assert "recording and model agree" in told

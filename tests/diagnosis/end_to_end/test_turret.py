@@ -1,0 +1,36 @@
+"""A field that turns with the heading is unknown and on the vehicle; what does not is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.track import Track
+from ahrsd.simulation import simulate
+
+
+def turret(gauss: float) -> Track:
+    """Four waves in a turn, each axis of the turret's own."""
+    trial = made(Trial(4))
+    R_nb = simulate(trial.settings).R_nb
+    phase = 4 * np.arctan2(R_nb[:, 1, 0], R_nb[:, 0, 0])[:, None]
+    field_b = np.cos(phase) * [0.6, 0.0, 0.8] + np.sin(phase) * [0.0, 1.0, 0.0]
+    return replace(trial.track, mag_b_gauss=trial.track.mag_b_gauss + gauss * field_b)
+
+
+@pytest.mark.parametrize("library", [{}, pytest.param(EFFECTS, marks=pytest.mark.slow)])
+def test_a_weak_turret_is_unknown_and_on_the_vehicle(library) -> None:
+    """Of 60 uG, 29 nats: courses in time and forms of the library's own see nothing."""
+    found = diagnose(turret(6e-5), library=library)
+    assert found.findings == ()
+    assert found.unexplained.detected
+    assert found.unexplained.where.frame == "sensor"
+
+
+def test_what_does_not_turn_with_the_heading_is_no_turret() -> None:
+    assert not diagnose(turret(0.0), library={}).unexplained.detected

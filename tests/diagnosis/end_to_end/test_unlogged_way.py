@@ -1,0 +1,28 @@
+"""A field along a way that nobody logged."""
+
+from dataclasses import replace
+
+import numpy as np
+from mismatch_trials import Trial, made
+
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.simulation import simulate
+
+PLACES = ("position_north_m", "position_east_m", "position_down_m")
+
+
+def test_a_field_along_a_way_that_nobody_logged_is_no_set_of_names():
+    """Three gains of an on-board calibration followed it to a quarter of a hundredth."""
+    trial = made(Trial(2, (), PLACES, scenario="lam", samples=6000))
+    R_nb = simulate(trial.settings).R_nb
+    rng, track = np.random.default_rng(2), trial.track
+    phase = np.pi * (track.time_s - track.time_s[0]) / track.duration_s
+    field_n = 1.5e-3 * sum(
+        np.cos(j * phase + rng.uniform(0, 6.28))[:, None] * rng.standard_normal(3) * j**-1.5
+        for j in range(2, 9)
+    )
+    mag = track.mag_b_gauss + np.einsum("nji,nj->ni", R_nb, field_n)
+    found = diagnose(replace(track, mag_b_gauss=mag))
+    assert found.findings == ()
+    assert found.unexplained.detected
+    assert found.unexplained.where.frame == "world"
