@@ -338,7 +338,7 @@ def _agreeing(
         p_value=found.p_value if counted else alone.p_value,
         findings=counted,
         unexplained=Unexplained(False),
-        posterior_predictive=alone.checks or checks(start, start, ()),
+        posterior_predictive=alone.checks or checks(start),
         undecided=None if counted else undecided,
         notes=(*found.notes, said, *more),
         model=model,

@@ -1,8 +1,8 @@
 """Posterior predictive checks: does the recording look like what its model simulates?
 
-The fitted null and the repaired model are simulated along the recording's own motion, covariates
-and gaps, some copies each, and all of them go through the null's filter as the recording did.  Both
-have the repaired model's noise: the null's own would hold what was left out as noise.
+The fitted model is simulated along the recording's own motion, covariates and gaps, some copies,
+and all of them go through its filter as the recording did.  They have the fit's noise, in which
+anything slow that was left out is held as noise.
 Every statistic below is chosen before anything is looked at.  Its band covers a simulation with
 99 % for all statistics together (Bonferroni; normal in the logarithm, the copies' own mean and
 deviation, Student's t).  What looks for the largest of many differences follows Gumbel's law, and
@@ -54,27 +54,19 @@ _QUIETEST = 1e-3  # of an innovation's deviation: the least that the magnetomete
 _BEYOND = 2.0  # times what noise has in means over segments
 
 
-def checks(
-    null: NullFit,
-    repaired: NullFit,
-    terms: Sequence[Term],
-    *,
-    library: Mapping[str, Effect] = EFFECTS,
-    loud: Sequence[tuple[float, float]] = (),
-    seed: int = 0,
-) -> dict[str, Check]:
-    """The statistics of what each model leaves, inside the band of its own simulations or not.
+def checks(null: NullFit) -> dict[str, Check]:
+    """The statistics of what a calibration alone leaves, beside the band of its simulations.
 
-    null: the fit without terms, of the recording;  repaired, terms: the fit with them, and them.
-    loud: where the noise was found to be at another level, seconds.  Value and band are the
-    repaired model's.  Deterministic.
+    Deterministic.
     """
-    noise = noise_law(repaired, loud, terms, library)
-    before = _compared(null, noise, (), library, seed)
-    after = _compared(repaired, noise, terms, library, seed + 1) if terms else before
+    context = null.context()
+    scene, found = scene_of(context), _Fitted.of(null)
+    value = statistics(found.left(null.filtered.whitened), scene)
+    made = _innovations(null, noise_law(null), (), EFFECTS, COPIES, 0)
+    expected = bands([statistics(found.left(e), scene) for e in made])
     return {
-        name: Check(value, band, _inside(*before[name]), _inside(value, band))
-        for name, (value, band) in after.items()
+        name: Check(value[name], band, inside := _inside(value[name], band), inside)
+        for name, band in expected.items()
     }
 
 
@@ -102,8 +94,7 @@ def beside_refitted(null: NullFit, refitted: Sequence[NullFit]) -> tuple[dict[st
 
 def _of_fit(fit: NullFit) -> dict[str, float]:
     """The statistics of what a fit leaves."""
-    context = fit.context()
-    return statistics(_Fitted.of(fit, context).left(fit.filtered.whitened), scene_of(context))
+    return statistics(_Fitted.of(fit).left(fit.filtered.whitened), scene_of(fit.context()))
 
 
 def noise_law(
@@ -212,27 +203,6 @@ def _slow_power(quick: Filtered, segment: NDArray[np.intp]) -> float:
     return 2.0 * density * len(np.unique(segment)) / max(int(np.count_nonzero(quick.used)), 1)
 
 
-def _compared(
-    fit: NullFit,
-    noise: Noise,
-    terms: Sequence[Term],
-    library: Mapping[str, Effect],
-    seed: int,
-) -> dict[str, tuple[float, tuple[float, float]]]:
-    """Each statistic of the recording as a model leaves it, and the band of its simulations.
-
-    Recording and simulations alike have the model's parameters fitted: to first order, by taking
-    its whitened columns out.
-    """
-    context = fit.context()
-    scene = scene_of(context)
-    found = _Fitted.of(fit, context)
-    value = statistics(found.left(fit.filtered.whitened), scene)
-    made = _innovations(fit, noise, terms, library, COPIES, seed)
-    expected = bands([statistics(found.left(e), scene) for e in made])
-    return {name: (value[name], expected[name]) for name in value}
-
-
 def _innovations(
     fit: NullFit,
     noise: Noise,
@@ -277,16 +247,14 @@ def _inside(value: float, band: tuple[float, float]) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fitted:
-    """The whitened columns (3 N, q) of calibration and terms, orthonormal."""
+    """The whitened columns (3 N, 11) of the calibration, orthonormal."""
 
     columns: Array
 
     @staticmethod
-    def of(fit: NullFit, context: Context) -> _Fitted:
+    def of(fit: NullFit) -> _Fitted:
         """Of a fit, whose filter is `sensitive`."""
-        parts = [nuisance_columns(fit.filtered), *(term.columns(context) for term in fit.terms)]
-        seen = [sensitivities(fit.filtered, part) for part in parts]
-        flat = np.concatenate(seen, axis=2).reshape(-1, sum(part.shape[2] for part in seen))
+        flat = sensitivities(fit.filtered, nuisance_columns(fit.filtered)).reshape(-1, 11)
         return _Fitted(np.linalg.svd(flat / np.linalg.norm(flat, axis=0), full_matrices=False)[0])
 
     def left(self, whitened: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The null: calibration and noise that explain a recording best, alone or with named terms.
+"""The null: calibration and noise that explain a recording best.
 
 `descent` finds the lowest cost from where it is set down.  The cold start descends on a thinned
 track (`coarse`) from a sphere, from no iron and from a linear fit with the gyro, with the gyro's
@@ -27,7 +27,7 @@ import numpy as np
 from ahrsd.diagnosis.answer.diagnosis import Baseline
 from ahrsd.diagnosis.calibration_fit import noise_fit
 from ahrsd.diagnosis.calibration_fit.coarse import group_size, thinned
-from ahrsd.diagnosis.calibration_fit.descent import FitProblem, FittedTerm, NullFit, descended
+from ahrsd.diagnosis.calibration_fit.descent import FitProblem, NullFit, descended
 from ahrsd.diagnosis.calibration_fit.prior import (
     TURNED,
     ellipsoid,
@@ -60,12 +60,11 @@ def fit_null(
     track: Track,
     spec: Spec | None = None,
     start: NullModel | None = None,
-    terms: Sequence[FittedTerm] = (),
     *,
     noise: bool = True,
     walk: bool = True,
 ) -> NullFit:
-    """Fit calibration, noise and terms to a track.
+    """Fit calibration and noise to a track.
 
     start: begin there (a fit of nearly the same data) instead of cold
     noise: estimate what the spec leaves open; else keep the noise of `start`
@@ -77,7 +76,7 @@ def fit_null(
     if reason:
         raise NothingToFit(reason)
     known = spec or Spec()
-    problem = FitProblem(track, tuple(terms), prior_of(track))
+    problem = FitProblem(track, prior_of(track))
     if start is None:
         start = noise_fit.estimated(
             run_filter(track, cold_start(track, known), sensitive=False), known, walk=walk
@@ -85,17 +84,17 @@ def fit_null(
     fit = descended(problem, start, _STEPS)
     prior = problem.prior.sharper(repetition_of(fit.filtered))
     if prior is not problem.prior:
-        problem = replace(problem, terms=fit.terms, prior=prior)
+        problem = replace(problem, prior=prior)
         fit = descended(problem, start, _STEPS)
     if not noise:
         return fit
     if abs(np.log(fit.filtered.normalised_innovation)) > _REESTIMATE:
-        again = noise_fit.estimated(fit.filtered, known, fit.terms_mag, fit.terms_gyro, walk=walk)
-        fit = descended(replace(problem, terms=fit.terms), again, _STEPS)
+        again = noise_fit.estimated(fit.filtered, known, walk=walk)
+        fit = descended(problem, again, _STEPS)
     again = noise_fit.rescaled(fit.filtered, known)
     if noise_fit.alike(again, fit.model):
         return fit
-    return descended(replace(problem, terms=fit.terms), again, _STEPS)
+    return descended(problem, again, _STEPS)
 
 
 def unusable(track: Track) -> str | None:
@@ -115,7 +114,7 @@ def cold_start(track: Track, spec: Spec) -> NullModel:
     first = noise_fit.first_guess(track, spec)
     # a row's rate is the mean of its samples': their noise averages
     quiet = first.sigma_gyro_rad_s / np.sqrt(size)
-    problem = FitProblem(coarse, (), prior_of(track))
+    problem = FitProblem(coarse, prior_of(track))
     best: NullFit | None = None
     base = replace(first, gyro_bias_rad_s=problem.prior.mean[8:])
     by_size = _by_size(coarse, replace(base, sigma_gyro_rad_s=quiet))

@@ -9,13 +9,12 @@ averaged over the sizes k of `SIZES`: how large an effect is on a given vehicle 
 The same field may be a hundredth of a usual coefficient per ampere (the motor draws fifty) and a
 third of one per turn of its shaft; the sizes reach far enough down that neither pays for its unit.
 The second sum is the price of a parameter, by which the one-parameter time lag beats nine
-eddy-current coefficients that contain it.  Noise that is not white carries less information: l and
-s are divided by its colour, the power of the innovations at low frequency over the white one.
+eddy-current coefficients that contain it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -25,14 +24,14 @@ from ahrsd.samples import Array
 SIZES = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
 
 
-def log_bayes(what: Score, colour: float = 1.0, sizes: Sequence[float] = SIZES) -> float:
+def log_bayes(what: Score) -> float:
     """Log Bayes factor of the group against its absence, nats."""
     if what.rank == 0:
         return 0.0
-    l, s = what.information / colour, what.score / colour  # noqa: E741
-    k2 = np.square(np.asarray(sizes, float))[:, None]
+    l, s = what.information, what.score  # noqa: E741
+    k2 = np.square(np.asarray(SIZES))[:, None]
     terms = 0.5 * np.sum(s**2 / (l + 1.0 / k2), axis=1) - 0.5 * np.sum(np.log1p(k2 * l), axis=1)
-    return float(np.logaddexp.reduce(terms) - np.log(len(sizes)))
+    return float(np.logaddexp.reduce(terms) - np.log(len(SIZES)))
 
 
 def posterior(

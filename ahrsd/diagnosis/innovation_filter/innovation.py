@@ -45,7 +45,6 @@ from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
 #: of the field's direction where it is not taken from the first reading
-_UNSURE_RAD = 0.1
 #: of the field's size, in all directions, where a run's first row has no reading
 _UNSURE = 0.5
 #: gauss; what is left of the nearest reading where it is many hundred rows away: squares of smaller
@@ -115,13 +114,11 @@ def run_filter(
     *,
     held: Filtered | None = None,
     sensitive: bool = True,
-    strength_known: bool = False,
 ) -> Filtered:
     """Filter a track.  terms_*: (N, 3) contributions of the named terms, subtracted first.
 
     held: take gains and nominal field of this earlier run (same track), not the model's own
     sensitive: false where only innovations are wanted, not what `sensitivities` needs
-    strength_known: the field is as strong as the nominal one, else a run finds it (not with `held`)
     Rows whose reading is not finite are passed over.  ValueError where a run has no rows,
     LinAlgError where the model is so far off that its innovations have no finite size.
     """
@@ -130,12 +127,12 @@ def run_filter(
     blind, orientation = ~_complete(field), _orientation(layout, motion.turn, opens)
     if held is None:
         nominal = _nominal(field, orientation, layout, model, motion.dt_s)
-        linear = _linear(model, motion, nominal, opens, blind, strength_known=strength_known)
+        linear = _linear(model, motion, nominal, opens, blind)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             found = gains(linear, _runs(track))
     else:
         nominal, found = held.nominal_b, held.gains
-    guessed = opens if strength_known else opens & blind
+    guessed = opens & blind
     found.gain[guessed] = 0.0
     field = np.where(guessed[:, None], nominal, field)
     state, used = _transition(motion, nominal, opens, model), ~(opens | blind)
@@ -344,8 +341,6 @@ def _linear(
     nominal: Array,
     opens: NDArray[np.bool],
     blind: NDArray[np.bool],
-    *,
-    strength_known: bool,
 ) -> Linear:
     transition = _transition(motion, nominal, opens, model)
     before = np.einsum("nij,nj->ni", motion.turn, np.roll(nominal, 1, axis=0))
@@ -364,8 +359,6 @@ def _linear(
     process[opens, :3, :3] = model.sigma_mag_gauss**2 * C @ C.T
     lost = opens & blind
     process[lost, :3, :3] = np.eye(3) * (_UNSURE * size[lost, :, None]) ** 2
-    if strength_known:
-        process[opens, :3, :3] = _UNSURE_RAD**2 * tangent[opens]
     return Linear(transition, process, model.soft_iron, model.sigma_mag_gauss**2, opens, blind)
 
 

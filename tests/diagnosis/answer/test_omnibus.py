@@ -26,7 +26,7 @@ def _filtered(seed: int, extra: Array | None = None) -> Filtered:
 
 
 def _context(done: Filtered) -> Context:
-    fit = NullFit(done.model, done, True, np.zeros((11, 11)), np.ones(11, dtype=bool))
+    fit = NullFit(done.model, done, True, np.zeros((11, 11)))
     return build_context(done.track, fit)
 
 

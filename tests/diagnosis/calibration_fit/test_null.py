@@ -11,7 +11,7 @@ from tracks import experiment, recorded, track_of, true_model
 
 from ahrsd import so3
 from ahrsd.diagnosis.calibration_fit.coarse import noise_of, thinned
-from ahrsd.diagnosis.calibration_fit.descent import FittedTerm, NullFit
+from ahrsd.diagnosis.calibration_fit.descent import NullFit
 from ahrsd.diagnosis.calibration_fit.noise_fit import WALK_CAP_RAD_S_SQRT_S
 from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.calibration_fit.prior import rate_at_rest
@@ -19,7 +19,7 @@ from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.track import Spec, Track
-from ahrsd.diagnosis.values import Columns, Context, NullModel
+from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
 from ahrsd.simulation import ScenarioSettings, simulate
 
@@ -126,47 +126,6 @@ def test_a_wandering_gyro_bias_is_in_the_null() -> None:
     off = _difference(fit, true_model(made))[:8]
     chi2 = float(off @ np.linalg.solve(fit.covariance[:8, :8], off))
     assert stats.chi2.sf(chi2, 8) > 1e-3
-
-
-def _misalignment(context: Context) -> Columns:
-    """Gyro turned by a small rotation against the magnetometer: d gyro / d phi."""
-    return Columns(gyro=so3.skew(context.rate_b_rad_s))
-
-
-def _ramp(context: Context) -> Columns:
-    t = context.track.time_s
-    course = (t - t[0]) / (t[-1] - t[0]) - 0.5
-    return Columns(mag=course[:, None, None] * np.eye(3))
-
-
-def test_terms_are_fitted_jointly_and_linearised_again() -> None:
-    """3 degrees is far outside the linear range: the deviation says whether the refit got there."""
-    made = experiment("wam", samples=4000, seed=2)
-    track, truth = track_of(made), true_model(made)
-    phi = np.radians([1.5, -2.0, 1.2])
-    true_rate = track.gyro_b_rad_s - truth.gyro_bias_rad_s
-    turned = true_rate @ so3.exp(-phi).T + truth.gyro_bias_rad_s  # reading = Exp(phi x) ...
-    drift = np.array([2e-3, 0.0, -3e-3])
-    course = (track.time_s - track.time_s[0]) / track.duration_s - 0.5
-    bent = replace(
-        track, gyro_b_rad_s=turned, mag_b_gauss=track.mag_b_gauss + course[:, None] * drift
-    )
-    null = fit_null(bent)
-    terms = (
-        FittedTerm("mag_gyro_misalignment", _misalignment, np.zeros(3), np.full(3, 0.05)),
-        FittedTerm("hard_iron_drift", _ramp, np.zeros(3), np.full(3, 0.01)),
-    )
-    fit = fit_null(bent, start=null.model, terms=terms)
-    # what the null had to call noise is gone
-    assert abs(fit.model.sigma_mag_gauss / 1e-3 - 1) < 0.05 < null.model.sigma_mag_gauss / 1e-3 - 1
-    found, ramp = fit.terms
-    # w_read = w + [w]x phi + ..., to second order of the 2.8 degrees
-    assert np.abs(found.value - phi).max() < 2e-3
-    assert ramp.deviation is not None
-    assert np.max(np.abs(ramp.value - drift) / ramp.deviation) < 4
-    assert fit.terms_mag is not None
-    assert np.abs(fit.terms_mag[-1] - 0.5 * ramp.value).max() < 1e-9
-    assert np.abs(fit.model.hard_iron_gauss - truth.hard_iron_gauss).max() < 3e-4
 
 
 def test_thinning_composes_rotations_exactly() -> None:

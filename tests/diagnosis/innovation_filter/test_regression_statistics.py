@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.innovation_filter.evidence import posterior
+from ahrsd.diagnosis.innovation_filter.evidence import SIZES, log_bayes, posterior
 from ahrsd.diagnosis.innovation_filter.score import solve, total_score
 
 
@@ -32,3 +33,43 @@ def test_posterior_sums_to_one_and_follows_the_odds():
 def test_a_direction_without_information_is_left_at_zero():
     G = np.diag([4.0, 1.0, 0.0]) + 0.0
     np.testing.assert_allclose(solve(G, np.array([[8.0], [3.0], [0.0]]))[:, 0], [2.0, 3.0, 0.0])
+
+
+def scored(X, e, scale):
+    """The score of columns (n, p) in unit noise (n,)."""
+    return total_score(X.T @ X, X.T @ e, np.einsum("ij,ij->j", X, X), np.asarray(scale))
+
+
+def slow(rng, width):
+    """(4800, width) slow columns."""
+    return lfilter([1.0], [1.0, -0.98], rng.standard_normal((4800, width)), axis=0)
+
+
+def test_evidence_is_the_closed_form_of_one_size():
+    rng = np.random.default_rng(6)
+    X = slow(rng, 1)
+    what = scored(X, 0.02 * X[:, 0] + rng.standard_normal(4800), [1.0])
+    information, s = float(what.information[0]), float(what.score[0])
+    sized = [0.5 * s**2 / (information + k**-2) - 0.5 * np.log1p(information * k**2) for k in SIZES]
+    expected = np.logaddexp.reduce(sized) - np.log(len(SIZES))
+    assert log_bayes(what) == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_smaller_family_wins_over_one_that_contains_it():
+    rng = np.random.default_rng(7)
+    X = slow(rng, 4)
+    e = 0.05 * X[:, 0] + rng.standard_normal(4800)
+    one = log_bayes(scored(X[:, :1], e, np.ones(1)))
+    four = log_bayes(scored(X, e, np.ones(4)))
+    assert one > four + 3 > 20
+
+
+def test_a_coefficient_pays_nothing_for_its_unit():
+    """A field per ampere of a motor that draws fifty, and one per thousand turns of its shaft."""
+    rng = np.random.default_rng(9)
+    X = slow(rng, 3)
+    e = X @ np.full(3, 0.03) + rng.standard_normal(4800)
+    small = scored(X, e, np.full(3, 1.0))  # a value of 3 % of the usual one
+    usual = scored(X, e, np.full(3, 0.1))
+    assert small.value == pytest.approx(usual.value)
+    assert log_bayes(small) == pytest.approx(log_bayes(usual), abs=0.6)

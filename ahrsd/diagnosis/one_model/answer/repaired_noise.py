@@ -34,7 +34,7 @@ def repaired_noise(
     if found.all_sets.is_real(answer.best.names):
         point = at_recorded_rate(_with_names_alone(found))
     done = point.filtered
-    fit = NullFit(done.model, done, True, np.zeros((11, 11)), (), point.terms_mag, point.terms_gyro)
+    fit = NullFit(done.model, done, True, np.zeros((11, 11)), point.terms_mag, point.terms_gyro)
     # a delay is out of the track, and what only the recorded rate shows out of the recording
     kept = [term for term in answer.terms if not library[term.identifier].delay]
     return usual_noise(fit, loud, (*kept, *rounding(facts)), library)

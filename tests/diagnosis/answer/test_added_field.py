@@ -1,0 +1,41 @@
+"""What a field that is added does beside a calibration, and to the heading."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tracks import experiment, track_of
+
+from ahrsd.diagnosis.answer.added_field import (
+    calibration_of,
+    deviation,
+    heading_off_deg,
+    less_calibration,
+)
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.values import Context
+
+
+@pytest.fixture(scope="module")
+def context() -> Context:
+    track = track_of(experiment("wam", seed=8, samples=3000))
+    return fit_null(track, walk=False).context()
+
+
+def test_iron_is_calibration_and_no_remainder(context: Context) -> None:
+    take = calibration_of(context)
+    iron = context.field_b @ np.array([[0.1, 0.02, 0], [0.02, -0.1, 0.03], [0, 0.03, 0]]) + 0.05
+    assert deviation(iron) > 0.01
+    assert deviation(less_calibration(iron, take)) < 1e-12
+
+
+def test_a_heading_is_off_by_the_field_across(context: Context) -> None:
+    field = context.field_b @ context.model.soft_iron.T
+    read = np.einsum("nij,nj->ni", context.R_nb, field).mean(axis=0)
+    level = float(np.hypot(*read[:2]))
+    across = np.array([-read[1], read[0], 0.0]) / level
+    sign = np.where(np.arange(len(context.track)) % 2, 1.0, -1.0)[:, None]
+    added = np.einsum("nji,j->ni", context.R_nb, 5e-3 * across) * sign
+    assert heading_off_deg(added, context) == pytest.approx(np.degrees(5e-3 / level), rel=0.02)
+    along = np.einsum("nji,j->ni", context.R_nb, 5e-3 * read / np.linalg.norm(read)) * sign
+    assert heading_off_deg(along, context) < 0.05 * heading_off_deg(added, context)
