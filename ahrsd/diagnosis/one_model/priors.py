@@ -97,7 +97,7 @@ MOST_ON, MOST_WAVES = 0.3, 100
 #: nats by which a residual is unlike along its three axes: twice that is one in 1e6 by chance, of
 #: five degrees of freedom;  and directions that a source of one may have
 UNALIKE, DIRECTIONS = 18.0, 100.0
-#: how often what switches is outside of the vehicle;  source: the rules' three nats
+#: how often what switches is outside of the vehicle;  three nats
 SWITCHES_OUTSIDE = 0.05
 #: square of a jump of the mean, in its deviations, of three axes: one in 1e6 by chance
 JUMPS = 31.0
