@@ -9,6 +9,7 @@ import pytest
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.data_quality.pauses import LEFT_S, without_jumps
+from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 
 
@@ -41,8 +42,8 @@ def test_a_break_that_may_be_one_stays() -> None:
     assert without_jumps(whole) == (whole, ())
 
 
-def test_a_clock_that_is_set_while_it_records_is_diagnosed(ask) -> None:
+def test_a_clock_that_is_set_while_it_records_is_diagnosed() -> None:
     """From 1970 to 2025: once more than a terabyte."""
-    found = ask(_jumping(1.7471e9, samples=2500))
+    found = diagnose(_jumping(1.7471e9, samples=2500))
     assert not found.mismatch
     assert found.notes[0].startswith("the clock jumps by +1.7471e+09 s")

@@ -54,7 +54,8 @@ def test_an_unlogged_current_is_one_source_on_the_vehicle(shape: str) -> None:
 @pytest.mark.xfail(
     reason="a step of the field is likelier beside what the lost turns leave", strict=True
 )
-@pytest.mark.parametrize("seed", [pytest.param(5, marks=pytest.mark.slow), 6])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [5, 6])
 def test_lost_samples_are_told_beside_a_current(seed: int) -> None:
     """Without the current turns are put right where none was lost; of 5, steps are named there."""
     track = track_of(experiment("wam", seed=seed, samples=3000))

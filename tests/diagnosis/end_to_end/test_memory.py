@@ -22,9 +22,8 @@ def test_play_begins_where_it_was_left() -> None:
     assert series.play(values, 0.5, (0.0,)).tolist() == series.play(values, 0.5).tolist()
 
 
-@pytest.mark.parametrize(
-    "memory", [(1.0, -1.0, 1.0), pytest.param((0.5, -0.75, 1.0), marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("memory", [(1.0, -1.0, 1.0), (0.5, -0.75, 1.0)])
 def test_the_memory_is_found_and_nothing_else_is_named(memory) -> None:
     track = made(Trial(5, scenario="wam", samples=6000)).track
     setting = {"radius_gauss": 0.03, "memory": memory}

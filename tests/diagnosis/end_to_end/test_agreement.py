@@ -1,0 +1,137 @@
+"""A recording of our own simulator agrees with it, however it is laid out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tracks import experiment, track_of
+
+from ahrsd.diagnosis.answer.diagnosis import (
+    Diagnosis,
+)
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.track import Track
+from ahrsd.simulation import Experiment
+from ahrsd.simulation.scenarios import columns
+
+#: scenario, motion, seed, gauss, rad/s: the default's noise, and a quiet gyro's
+PLAIN = (
+    ("wam", "slow", 1, 1e-3, 5e-3),
+    ("lam", "slow", 2, 1e-3, 5e-3),
+    ("mam", "rov", 3, 1e-3, 5e-4),
+)
+
+REFERENCE = ("ref_qw", "ref_qx", "ref_qy", "ref_qz")
+
+
+@cache
+def _made(kind: tuple[str, str, int, float, float]) -> Experiment:
+    scenario, motion, seed, mag, gyro = kind
+    return experiment(
+        scenario, motion=motion, seed=seed, samples=3000, sigma_mag=mag, sigma_gyro=gyro
+    )
+
+
+def _with_reference(made: Experiment) -> Track:
+    """As `ahrsd simulate` writes it: with the exact attitude."""
+    return track_of(made).with_columns({name: columns(made)[name] for name in REFERENCE})
+
+
+def _agrees(found: Diagnosis) -> None:
+    assert not found.findings
+    assert not found.unexplained.detected
+    assert not found.mismatch
+    assert found.p_value > 1e-3
+
+
+@pytest.mark.parametrize(
+    "kind", [PLAIN[0], *(pytest.param(kind, marks=pytest.mark.slow) for kind in PLAIN[1:])]
+)
+def test_an_exact_reference_attitude_is_no_mismatch_and_changes_nothing(
+    kind: tuple[str, str, int, float, float],
+) -> None:
+    """World columns that turn by it, a filter by the noisy gyro: that was 470 nats of nothing."""
+    with_it = diagnose(_with_reference(_made(kind)))
+    _agrees(with_it)
+    assert with_it.to_json() == diagnose(track_of(_made(kind))).to_json()
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        ("wam", "slow", 0, 5e-2, 5e-2),
+        pytest.param(("wam", "slow", 3, 5e-2, 5e-2), marks=pytest.mark.slow),
+        pytest.param(("mam", "slow", 0, 5e-2, 5e-2), marks=pytest.mark.slow),
+        pytest.param(("wam", "slow", 0, 0.0, 5e-3), marks=pytest.mark.slow),
+        pytest.param(("mam", "rov", 1, 0.0, 5e-3), marks=pytest.mark.slow),
+        pytest.param(("wam", "slow", 0, 1e-4, 5e-2), marks=pytest.mark.slow),
+        pytest.param(("wam", "slow", 3, 1e-4, 5e-2), marks=pytest.mark.slow),
+        ("mam", "rov", 1, 1e-4, 5e-2),
+        pytest.param(("mam", "rov", 0, 0.0, 5e-3), marks=pytest.mark.slow),
+        pytest.param(("mam", "rov", 0, 1e-4, 5e-2), marks=pytest.mark.slow),
+    ],
+)
+def test_noise_far_from_the_usual_is_no_mismatch(
+    kind: tuple[str, str, int, float, float],
+) -> None:
+    """Fifty times the noise, a magnetometer without any, a gyro ten times as loud as that."""
+    found = diagnose(_with_reference(_made(kind)))
+    _agrees(found)
+    assert found.failed_checks == []
+
+
+def _turned(track: Track) -> Track:
+    """Another sensor frame: axes turned by hand."""
+    R = Rotation.from_euler("zyx", [100.0, 25.0, -140.0], degrees=True).as_matrix()
+    accel = None if track.accel_b_m_s2 is None else track.accel_b_m_s2 @ R.T
+    mag, gyro = track.mag_b_gauss @ R.T, track.gyro_b_rad_s @ R.T
+    return replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro, accel_b_m_s2=accel)
+
+
+def _permuted(track: Track) -> Track:
+    """Axes renamed, and a logged column before the attitude's."""
+    order = [1, 2, 0]
+    logged = {"hdop": np.cos(0.01 * track.time_s)} | dict(reversed(track.covariates.items()))
+    accel = None if track.accel_b_m_s2 is None else track.accel_b_m_s2[:, order]
+    mag, gyro = track.mag_b_gauss[:, order], track.gyro_b_rad_s[:, order]
+    return replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro, accel_b_m_s2=accel, covariates=logged)
+
+
+def _rows(track: Track, rows: slice) -> Track:
+    dt_s = track.dt_s[rows].copy()
+    dt_s[0] = np.nan
+    accel = None if track.accel_b_m_s2 is None else track.accel_b_m_s2[rows]
+    return Track(
+        track.time_s[rows],
+        dt_s,
+        track.mag_b_gauss[rows],
+        track.gyro_b_rad_s[rows],
+        accel,
+        {name: values[rows] for name, values in track.covariates.items()},
+        (slice(0, len(dt_s)),),
+    )
+
+
+def _stronger(track: Track) -> Track:
+    """A field in other units of strength, a clock that began elsewhere."""
+    return replace(track, mag_b_gauss=1.3 * track.mag_b_gauss, time_s=track.time_s + 1.7e9)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        _turned,
+        _permuted,
+        pytest.param(_stronger, marks=pytest.mark.slow),
+        lambda track: _rows(track, slice(0, 1500)),
+        pytest.param(lambda track: _rows(track, slice(1500, 3000)), marks=pytest.mark.slow),
+        pytest.param(lambda track: replace(track, accel_b_m_s2=None), marks=pytest.mark.slow),
+    ],
+    ids=["turned", "permuted", "stronger", "first half", "second half", "no accelerometer"],
+)
+def test_agreement_stays_agreement(change) -> None:
+    _agrees(diagnose(change(_with_reference(_made(PLAIN[0])))))

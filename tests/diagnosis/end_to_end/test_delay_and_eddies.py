@@ -1,0 +1,21 @@
+"""A delay and the eddy currents that contain it."""
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+
+
+@pytest.mark.slow
+def test_a_delay_beside_eddy_currents_that_are_more_is_not_said():
+    """Eddies of 5 ms, as different from axis to axis as they can be, and a step of the iron."""
+    one = made(
+        Trial(5, (("eddy_current", 3.0), ("hard_iron_step", 1.0)), samples=8_000, rate_hz=25.0)
+    )
+    found = diagnose(one.track).findings
+    assert sorted(x.effect for x in found) == ["eddy_current", "hard_iron_step"]
+    eddy = next(x for x in found if x.effect == "eddy_current")
+    _, value, _ = one.truth[0]
+    assert max(p.std for p in eddy.parameters) < 1e-3
+    np.testing.assert_allclose([p.value for p in eddy.parameters], np.ravel(value), atol=2e-3)

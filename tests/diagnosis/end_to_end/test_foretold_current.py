@@ -1,0 +1,16 @@
+"""Names that say nothing of what was held out, and those that are not asked."""
+
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+
+
+@pytest.fixture(scope="module")
+def crossed():
+    return made(Trial(3, (("mag_cross_axis", 2.0),), samples=6000)).track
+
+
+@pytest.mark.slow
+def test_what_is_not_refused_is_named(crossed):
+    assert [one.effect for one in diagnose(crossed).findings] == ["mag_cross_axis"]

@@ -1,0 +1,42 @@
+"""A speed with noise of its logger."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter1d
+from tracks import experiment, track_of
+
+from ahrsd.diagnosis.one_model.diagnose import diagnose_logged
+
+ROWS = 12_000
+
+FIELD_PER_M_S = np.array([9e-3, -6e-3, 4e-3])
+
+
+def course(seed: int, rows: int = ROWS, width: float = 120.0) -> np.ndarray:
+    """A smooth course of deviation 1."""
+    values = gaussian_filter1d(np.random.default_rng(seed).normal(size=rows), width)
+    return values / values.std()
+
+
+def drawn(values: np.ndarray, rows: int) -> np.ndarray:
+    """Every so many rows a value, straight lines between, with four decimals as a file has them."""
+    at = np.arange(0, len(values), rows)
+    return np.round(np.interp(np.arange(len(values)), at, values[at]), 4)
+
+
+@pytest.mark.slow  # half a minute; what it rests on is above
+def test_a_speed_with_noise_has_its_own_field_and_leaves_nothing() -> None:
+    track = track_of(experiment("wam", motion="rov", seed=4, samples=3000, rate_hz=12.5))
+    speed = 1.2 + 0.25 * course(10, 3000)
+    mag = track.mag_b_gauss + speed[:, None] * FIELD_PER_M_S
+    noisy = drawn(speed + np.random.default_rng(11).normal(0.0, 0.05, 3000), 3)
+    found = diagnose_logged(replace(track, mag_b_gauss=mag).with_columns({"speed_m_s": noisy}))
+    assert [one.effect for one in found.findings] == ["speed_field"]
+    assert not found.unexplained.detected
+    assert found.notes[0].startswith("column speed_m_s has noise of its own: ")
+    for value, truth in zip(found.findings[0].parameters, FIELD_PER_M_S, strict=True):
+        assert value.value == pytest.approx(truth, rel=0.05)

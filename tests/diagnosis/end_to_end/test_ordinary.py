@@ -1,0 +1,45 @@
+"""How large what is left is: against fields that were added with a known size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracks import experiment, recorded, track_of
+
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.track import Track
+
+SAMPLES = 3000  # two minutes
+
+
+@pytest.fixture(scope="module")
+def made():
+    return experiment("wam", seed=8, samples=SAMPLES)
+
+
+def with_field(track: Track, added: np.ndarray) -> Track:
+    return replace(track, mag_b_gauss=track.mag_b_gauss + added)
+
+
+@pytest.mark.slow
+def test_a_current_that_nobody_logged_is_unknown_in_a_simulation(made):
+    track = track_of(made)
+    current = np.repeat(np.random.default_rng(3).uniform(0.0, 1.0, 30), SAMPLES // 30)
+    added = current[:, None] * np.array([4e-3, -8e-3, 5e-3])
+    found = diagnose(with_field(track, added))
+    assert found.unexplained.detected
+    assert found.unexplained.where.frame == "sensor"
+    assert not found.unexplained.ordinary.within
+
+
+@pytest.mark.slow
+@pytest.mark.recordings
+def test_a_rotated_board_is_ordinary_and_a_watch_beside_a_sensor_is_not():
+    board = diagnose(recorded("broad/02_undisturbed_slow_rotation_B"))
+    assert not board.unexplained.detected
+    assert board.unexplained.ordinary.field_gauss == pytest.approx(5.0e-3, rel=0.3)
+    watch = diagnose(recorded("vn100_distorters/vn7Hard"))
+    assert watch.unexplained.detected
+    assert "a course in time on the sensor" in watch.unexplained.ordinary.why

@@ -1,0 +1,19 @@
+"""A handful of wild readings is no physics."""
+
+from dataclasses import replace
+
+import numpy as np
+from mismatch_trials import Trial, made
+
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+
+
+def test_wild_readings_are_no_object_and_no_step():
+    track = made(Trial(9, samples=8_000, rate_hz=25.0)).track
+    rng = np.random.default_rng(4)
+    mag = track.mag_b_gauss.copy()
+    rows = rng.choice(len(mag), 24, replace=False)
+    mag[rows] += 12 * 6e-4 * rng.standard_normal((24, 3))
+    found = diagnose(replace(track, mag_b_gauss=mag))
+    assert found.findings == ()
+    assert not found.unexplained.detected

@@ -1,0 +1,68 @@
+"""What is too quick for the working rate: pulses, lines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd import so3
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.resting import at_rest
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.track import Track
+
+RATE_HZ = 40.0
+
+
+@pytest.fixture(scope="module")
+def quiet() -> Track:
+    return made(Trial(seed=5, samples=7000, rate_hz=RATE_HZ)).track
+
+
+def test_unlogged_pulses_are_named(quiet: Track) -> None:
+    since = (quiet.time_s - 0.4) % 1.37
+    hit = np.where(since < 0.06, 1.0, 0.0)[:, None]
+    pulsed = replace(quiet, mag_b_gauss=quiet.mag_b_gauss + 2.5e-3 * hit * np.array([0.8, 0, 0.6]))
+    found = diagnose(pulsed).findings
+    assert [one.effect for one in found] == ["sync_pulses"]
+    assert abs(found[0].setting["period_s"] - 1.37) < 1e-3
+    assert abs(found[0].parameters[0].value - 2e-3) < 5e-4
+
+
+@pytest.mark.slow
+def test_what_the_form_of_pulses_leaves_is_no_line(quiet: Track) -> None:
+    """Pulses that swell and fade, held for a box, leave multiples of their rate."""
+    part = np.minimum(((quiet.time_s - 0.4) % 1.0661) / 0.12, 1.0)
+    swell = np.sin(np.pi * part)[:, None] ** 2
+    pulsed = replace(quiet, mag_b_gauss=quiet.mag_b_gauss + 1e-2 * swell * np.array([0.6, 0, 0.8]))
+    assert [one.effect for one in diagnose(pulsed).findings] == ["sync_pulses"]
+
+
+def test_an_alternating_field_needs_no_turns() -> None:
+    """A vehicle that hardly turns says little of a field, but a line is none of a gyro's doing."""
+    still = _rocking(np.random.default_rng(5))
+    assert at_rest(fit_null(still))
+    wave = np.cos(2 * np.pi * 18.46 * still.time_s)[:, None] * np.array([3e-4, -4e-4, 0.0])
+    found = diagnose(replace(still, mag_b_gauss=still.mag_b_gauss + wave))
+    assert [one.effect for one in found.findings] == ["ac_interference"]
+    assert abs(found.findings[0].setting["frequency_hz"] - 18.46) < 1e-3
+
+
+@pytest.mark.slow
+def test_where_hardly_anything_turns_no_line_is_named_of_none() -> None:
+    assert diagnose(_rocking(np.random.default_rng(5))).findings == ()
+
+
+def _rocking(rng: np.random.Generator) -> Track:
+    """Three minutes of a vehicle that rocks by a degree or so and hardly turns."""
+    time_s = np.arange(7200) / RATE_HZ
+    angles = 0.02 * np.sin(time_s[:, None] * np.array([0.11, 0.17, 0.23]) + [0.0, 1.0, 2.0])
+    R_nb = so3.exp(angles)
+    turned = so3.log(np.swapaxes(R_nb[:-1], 1, 2) @ R_nb[1:]) * RATE_HZ
+    gyro = np.vstack([turned[:1], turned]) + 4e-4 * rng.standard_normal((7200, 3))
+    mag = np.einsum("nji,j->ni", R_nb, [0.2, 0.05, 0.45]) + 1e-3 * rng.standard_normal((7200, 3))
+    dt_s = np.diff(time_s, prepend=np.nan)
+    return Track(time_s, dt_s, mag, gyro, None, {}, (slice(0, 7200),))

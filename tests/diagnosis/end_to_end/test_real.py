@@ -1,0 +1,106 @@
+"""Real recordings with known causes: what is named, where, and how large.
+
+The whole table is printed by `tests/benchmarks/diagnosis/bench_diagnose_real.py`; what is known
+without a diagnosis by `bench_known_values.py` beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.track import Track
+from ahrsd.recording.table import read_table
+
+RECORDINGS = Path(__file__).parents[3] / ".." / "shared" / "recordings"
+
+#: of an independent regression against the external compass, mG/A
+CURRENT = np.array([-2.95, -5.18, 3.20]) * 1e-3
+
+pytestmark = pytest.mark.recordings
+
+
+def track_of(name: str) -> Track:
+    table = read_table(RECORDINGS / name)
+    rows = table.rows
+    ends = (*table.starts[1:], len(rows))
+    runs = tuple(slice(a, b) for a, b in zip(table.starts, ends, strict=True))
+    return Track(
+        rows.time_s, rows.dt_s, rows.raw_b_gauss, rows.gyro_b_rad_s, rows.accel_b_m_s2,
+        rows.covariates, runs,
+    )  # fmt: skip
+
+
+def diagnosed(name: str, *withheld: str) -> Diagnosis:
+    track = track_of(name)
+    kept = {key: column for key, column in track.covariates.items() if key not in withheld}
+    return diagnose(replace(track, covariates=kept))
+
+
+def named(found: Diagnosis, effect: str) -> list[Finding]:
+    return [one for one in found.findings if one.effect == effect]
+
+
+def values(finding: Finding) -> np.ndarray:
+    return np.array([parameter.value for parameter in finding.parameters])
+
+
+def test_the_motor_current_is_named_on_the_inner_compass() -> None:
+    found = diagnosed("arducopter/log171_MAG2_10hz.csv.gz")
+    (current,) = named(found, "motor_current_field")
+    k = values(current)
+    cosine = k @ CURRENT / np.linalg.norm(k) / np.linalg.norm(CURRENT)
+    assert np.degrees(np.arccos(cosine)) < 20.0
+    assert np.linalg.norm(k) == pytest.approx(np.linalg.norm(CURRENT), rel=0.2)
+    assert current.setting["covariate"] == "motor_current_a"
+    assert current.heldout.nll_gain_per_sample > 0.01
+    assert len(named(found, "mag_time_lag")) == 1
+
+
+@pytest.mark.slow
+def test_a_current_that_nobody_logged_is_a_source_fixed_to_the_vehicle() -> None:
+    name, channels = "arducopter/log171_MAG2_10hz.csv.gz", ("motor_current_a", "throttle")
+    found = diagnosed(name, *channels, "battery_v")
+    assert [one.effect for one in found.findings] == ["mag_time_lag"]
+    left = found.unexplained
+    assert left.detected
+    assert left.where is not None
+    assert left.where.direction is not None
+    assert left.where.frame == "sensor"
+    track = track_of(name)
+    current_a = track.covariates["motor_current_a"]
+    middle_s, source = np.array(left.course).T
+    half_s = (middle_s[1] - middle_s[0]) / 2
+    logged = [current_a[np.abs(track.time_s - t) < half_s].mean() for t in middle_s]
+    assert np.corrcoef(logged, source)[0, 1] > 0.9
+    cosine = np.array(left.where.direction) @ CURRENT / np.linalg.norm(CURRENT)
+    assert np.degrees(np.arccos(cosine)) < 30.0
+
+
+@pytest.mark.slow
+def test_an_undisturbed_trial_shows_its_lag_and_no_other_name() -> None:
+    found = diagnosed("broad/21_undisturbed_fast_combined.csv.gz")
+    (lag,) = found.findings
+    assert lag.effect == "mag_time_lag"
+    assert values(lag)[0] == pytest.approx(0.0115, abs=2e-3)
+
+
+@pytest.mark.slow
+def test_one_device_has_one_lag_in_three_recordings() -> None:
+    """A VN-100 at 40 Hz, 0.4 of a sample: what a low-pass does is told beside it."""
+    lags = []
+    for name in ("clearIMU", "vn30Soft", "vn7Hard"):
+        (found,) = named(diagnosed(f"vn100_distorters/{name}.csv.gz"), "mag_time_lag")
+        (lag,) = found.parameters
+        assert "mag_low_pass" in [one.effect for one in found.alternatives]
+        assert found.confidence < 0.8
+        lags.append((lag.value, lag.std))
+    (first, sure), *others = lags
+    assert first == pytest.approx(0.011, abs=1e-3)
+    assert sure < 1e-3
+    assert all(abs(value - first) < 2 * std < 0.01 for value, std in others)

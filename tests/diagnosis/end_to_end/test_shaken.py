@@ -1,0 +1,37 @@
+"""Where the motion itself shakes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from odd_tracks import SIGMA_GYRO, SIGMA_MAG, shaking
+
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.calibration_fit.shaken import shaken
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.limits import LIMITS
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.track import Spec
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_the_noise_is_found_below_what_differences_say(seed: int) -> None:
+    track = shaking(seed)
+    assert shaken(track)
+    problem, start = problem_of(track, Spec(), EFFECTS, LIMITS)
+    assert problem.spec.shaken_gyro_rad_s is not None
+    assert problem.spec.shaken_gyro_rad_s * np.sqrt(problem.thin) > 10 * SIGMA_GYRO
+    assert 0.6 < start.sigma_gyro_rad_s * np.sqrt(problem.thin) / SIGMA_GYRO < 1.6
+    assert 0.95 < start.sigma_mag_gauss * np.sqrt(problem.averaged) / SIGMA_MAG < 1.05
+    assert not diagnose(track).mismatch
+
+
+def test_a_bias_that_jumps_is_seen_through_the_shaking() -> None:
+    track = shaking(3)
+    gyro = track.gyro_b_rad_s.copy()
+    gyro[6000:, 1] += 4e-4
+    found = diagnose(replace(track, gyro_b_rad_s=gyro)).findings
+    assert [one.effect for one in found] == ["gyro_bias_step"]
+    assert abs(found[0].where.intervals_s[0][0] - 150.0) < 10.0

@@ -1,0 +1,45 @@
+"""Noise that forgets within seconds: its law, and no unknown where it is all there is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+from scipy.signal import lfilter
+
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.track import Track
+
+
+def slow(rng: np.random.Generator, count: int, rate_hz: float, time_s: float) -> np.ndarray:
+    """First-order noise (count, 3) of unit deviation."""
+    keep = np.exp(-1.0 / (rate_hz * time_s))
+    white = rng.standard_normal((count, 3)) * np.sqrt(1 - keep**2)
+    return np.asarray(lfilter([1.0], [1.0, -keep], white, axis=0))
+
+
+@pytest.fixture(scope="module")
+def quiet() -> Track:
+    return replace(made(Trial(seed=8)).track, covariates={})
+
+
+@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_noise_that_forgets_in_two_seconds_is_no_unknown(quiet: Track, seed: int) -> None:
+    noise = 5e-4 * slow(np.random.default_rng(seed), len(quiet), 25.0, 2.0)
+    answer = diagnose(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + noise))
+    assert answer.findings == ()
+    assert not answer.unexplained.detected
+
+
+@pytest.mark.slow
+def test_a_name_holds_beside_slow_noise_that_seen_as_white_would_be_a_rest() -> None:
+    """Seen as white, what such noise leaves is a rest that no name of this size stands out of."""
+    one = made(Trial(12, (("gyro_scale", 1.0),), samples=10_000, rate_hz=40.0, noise="red"))
+    answer = diagnose(one.track)
+    assert [found.effect for found in answer.findings] == ["gyro_scale"]
+    assert not answer.unexplained.detected
+    values = answer.findings[0].parameters
+    z = [(v.value - t) / v.std for v, t in zip(values, one.truth[0][1], strict=True)]
+    assert np.abs(z).max() < 3.0

@@ -1,0 +1,105 @@
+"""A gyro's bias that walks more than an ordinary one's has a name; a course that does not, none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+
+
+@pytest.fixture(scope="module")
+def track():
+    return made(Trial(seed=11, samples=7500, rate_hz=25.0, scenario="wam", noise="white")).track
+
+
+@pytest.mark.slow
+def test_a_bias_that_walks_a_lot_is_named_and_leaves_nothing(track):
+    steps = np.random.default_rng(3).normal(size=(len(track), 3)) * np.sqrt(0.04)
+    walked = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + 4e-5 * np.cumsum(steps, axis=0))
+    found = diagnose(walked)
+    assert [one.effect for one in found.findings] == ["gyro_bias_drift"]
+    assert not found.unexplained.detected
+
+
+@pytest.mark.parametrize(
+    ("seed", "size"),
+    [
+        # the few modes of the name explain a tenth of what the filter gains by walking as much
+        (19, 1.2e-5),
+        # where the filter walks as an ordinary bias does, what is left of it looks like no walk
+        pytest.param(21, 2.6e-5, marks=pytest.mark.slow),
+    ],
+)
+def test_a_walk_that_the_names_few_modes_hardly_show_is_named_too(track, seed, size):
+    steps = np.random.default_rng(seed).normal(size=(len(track), 3)) * np.sqrt(0.04)
+    walked = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + size * np.cumsum(steps, axis=0))
+    found = diagnose(walked)
+    assert [one.effect for one in found.findings] == ["gyro_bias_drift"]
+    assert not found.unexplained.detected
+
+
+@pytest.mark.slow
+def test_a_bias_that_swings_is_no_walk(track):
+    swing = 6e-4 * np.sin(2 * np.pi * track.time_s / 37.0)[:, None] * np.array([1.0, -0.5, 0.7])
+    found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + swing))
+    assert "gyro_bias_drift" not in [one.effect for one in found.findings]
+    assert found.unexplained.detected
+    assert found.unexplained.where.frame == "gyro"
+
+
+@pytest.mark.slow
+def test_a_step_and_a_start_up_are_no_walk(track):
+    """Both explain in three numbers what a walk needs all its freedom for."""
+    onset_s = 0.4 * (track.time_s[0] + track.time_s[-1])
+    jump = np.where(track.time_s > onset_s, 1.0, 0.0)[:, None] * np.array([4e-4, -3e-4, 2e-4])
+    found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + jump))
+    assert [one.effect for one in found.findings] == ["gyro_bias_step"]
+    assert found.findings[0].where.intervals_s[0][0] == pytest.approx(onset_s, abs=3.0)
+    warm = np.exp(-(track.time_s - track.time_s[0]) / 30.0)[:, None] * np.array([9e-4, 6e-4, -6e-4])
+    found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + warm))
+    assert [one.effect for one in found.findings] == ["gyro_startup"]
+
+
+def test_a_small_start_up_that_a_walk_follows_less_well_has_its_name(track):
+    """5.7 nats before the modes of a walk, 21 before the filter's own: less was noise once."""
+    warm = np.exp(-(track.time_s - track.time_s[0]) / 120.0)[:, None]
+    cold = 3e-4 * np.array([0.6, 0.5, -0.62])
+    found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + warm * cold))
+    assert [one.effect for one in found.findings] == ["gyro_startup"]
+    assert not found.unexplained.detected
+
+
+def test_an_ordinary_walk_has_no_cause(track):
+    steps = np.random.default_rng(4).normal(size=(len(track), 3)) * np.sqrt(0.04)
+    walked = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + 5e-6 * np.cumsum(steps, axis=0))
+    assert {one.effect for one in diagnose(walked).findings} <= {"gyro_bias_drift"}
+
+
+@pytest.mark.slow
+def test_what_is_small_beside_a_bias_that_walks_is_named_too(track):
+    steps = np.random.default_rng(3).normal(size=(len(track), 3)) * np.sqrt(0.04)
+    scaled = track.gyro_b_rad_s * np.array([1.004, 0.997, 1.005])
+    walked = replace(track, gyro_b_rad_s=scaled + 4e-5 * np.cumsum(steps, axis=0))
+    found = diagnose(walked)
+    assert {one.effect for one in found.findings} == {"gyro_bias_drift", "gyro_scale"}
+    assert all(one.confidence > 0.5 for one in found.findings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 4])
+def test_what_a_large_walk_hides_is_named_beside_it(seed):
+    """Iron that a walk of 1e-4 hides: once nothing but a course, or a height and the earth's turn.
+
+    What is left without the walk shows in the sensor, not in the gyro.
+    """
+    trial = Trial(seed=11, samples=7500, rate_hz=25.0, scenario="wam", noise="white")
+    iron = made(replace(trial, effects=(("soft_iron_step", 1.0),))).track
+    steps = np.random.default_rng(seed).normal(size=(len(iron), 3)) * np.sqrt(0.04)
+    walked = replace(iron, gyro_b_rad_s=iron.gyro_b_rad_s + 1e-4 * np.cumsum(steps, axis=0))
+    found = diagnose(walked)
+    assert {one.effect for one in found.findings} == {"gyro_bias_drift", "soft_iron_step"}
+    assert not found.unexplained.detected

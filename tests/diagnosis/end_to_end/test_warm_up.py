@@ -1,0 +1,24 @@
+"""A hard iron that settles: one course, one name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+
+
+def test_a_warm_up_that_nobody_logged_is_one_drift() -> None:
+    quiet = replace(made(Trial(seed=8)).track, covariates={})
+    passed_s = quiet.time_s - quiet.time_s[0]
+    part = -np.expm1(-passed_s / 90.0) / -np.expm1(-passed_s[-1] / 90.0)
+    field = part[:, None] * np.array([2e-3, -3e-3, 1.5e-3])
+    answer = diagnose(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + field))
+    assert [one.effect for one in answer.findings] == ["hard_iron_drift"]
+    assert not answer.unexplained.detected
+    found = [one.value for one in answer.findings[0].parameters]
+    assert found == pytest.approx([2e-3, -3e-3, 1.5e-3], abs=2e-4)
+    assert answer.findings[0].setting["time_constant_s"] == pytest.approx(90.0, rel=0.2)
