@@ -50,6 +50,7 @@ def values(finding: Finding) -> np.ndarray:
     return np.array([parameter.value for parameter in finding.parameters])
 
 
+@pytest.mark.slow
 def test_the_motor_current_is_named_on_the_inner_compass() -> None:
     found = diagnosed("arducopter/log171_MAG2_10hz.csv.gz")
     (current,) = named(found, "motor_current_field")
