@@ -40,7 +40,6 @@ from ahrsd.diagnosis.one_model.search_rounds import Searched
 from ahrsd.diagnosis.values import Term
 from ahrsd.diagnosis.where_and_when import locate
 
-
 #: what has a setting
 Told = TypeVar("Told", Finding, Term)
 #: where what is unknown may be more sources than are asked together
