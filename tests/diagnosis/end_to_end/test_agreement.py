@@ -63,7 +63,7 @@ def test_an_exact_reference_attitude_is_no_mismatch_and_changes_nothing(
 @pytest.mark.parametrize(
     "kind",
     [
-        ("wam", "slow", 0, 5e-2, 5e-2),
+        pytest.param(("wam", "slow", 0, 5e-2, 5e-2), marks=pytest.mark.slow),
         pytest.param(("wam", "slow", 3, 5e-2, 5e-2), marks=pytest.mark.slow),
         pytest.param(("mam", "slow", 0, 5e-2, 5e-2), marks=pytest.mark.slow),
         pytest.param(("wam", "slow", 0, 0.0, 5e-3), marks=pytest.mark.slow),
@@ -125,7 +125,7 @@ def _stronger(track: Track) -> Track:
     "change",
     [
         _turned,
-        _permuted,
+        pytest.param(_permuted, marks=pytest.mark.slow),
         pytest.param(_stronger, marks=pytest.mark.slow),
         lambda track: _rows(track, slice(0, 1500)),
         pytest.param(lambda track: _rows(track, slice(1500, 3000)), marks=pytest.mark.slow),

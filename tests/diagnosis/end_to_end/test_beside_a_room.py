@@ -7,8 +7,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from tracks import experiment, track_of
+from tracks import experiment, recorded, track_of
 
+from ahrsd import so3
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 
@@ -34,3 +35,56 @@ def test_a_room_alone_gets_no_name():
     found = diagnose(replace(track, covariates={"lamp_on": switched(track)}))
     assert found.findings == ()
     assert found.unexplained.detected
+
+
+@pytest.mark.slow
+def test_a_lamp_is_named_beside_a_room_that_nothing_explains():
+    track = room()
+    value = np.array([5e-3, -3e-3, 4e-3])
+    lit = switched(track)
+    reading = track.mag_b_gauss + lit[:, None] * value
+    found = diagnose(replace(track, mag_b_gauss=reading, covariates={"lamp_on": lit}))
+    lamp = next(one for one in found.findings if one.effect == "switched_device")
+    for parameter, true in zip(lamp.parameters, value, strict=True):
+        assert abs(parameter.value - true) < 4 * parameter.std < 6e-3
+    assert [one.effect for one in found.findings] == ["switched_device"]
+    assert found.unexplained.detected
+
+
+@pytest.mark.slow
+def test_a_misalignment_is_named_beside_a_room_with_its_value():
+    track = room()
+    angle = np.array([0.05, -0.03, 0.04])
+    reading = track.mag_b_gauss @ so3.exp(angle[None])[0].T
+    found = diagnose(replace(track, mag_b_gauss=reading))
+    (mount,) = found.findings
+    assert mount.effect == "mag_gyro_misalignment"
+    values = np.array([parameter.value for parameter in mount.parameters])
+    np.testing.assert_allclose(np.linalg.norm(values), np.linalg.norm(angle), rtol=0.15)
+    assert abs(values @ angle) > 0.97 * np.linalg.norm(values) * np.linalg.norm(angle)
+    assert found.unexplained.detected
+
+
+@pytest.mark.slow
+def test_a_sharp_step_is_named_beside_a_room_and_a_change_like_the_others_is_not():
+    track = room()
+    later = (track.time_s >= 83.0)[:, None]
+    for size, named in ((0.12, ["hard_iron_step"]), (0.006, [])):
+        step = size * np.array([0.6, -0.64, 0.48])
+        found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + later * step))
+        assert [one.effect for one in found.findings] == named
+        for one in found.findings:
+            values = [parameter.value for parameter in one.parameters]
+            np.testing.assert_allclose(values, step, atol=0.15 * size)
+            assert one.setting["onset_s"] == pytest.approx(83.0, abs=0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.recordings
+def test_a_magnet_that_stands_in_the_room_is_an_unknown_of_the_world() -> None:
+    found = diagnose(recorded("broad/28_disturbed_stationary_magnet_A"))
+    assert [one.effect for one in found.findings] == ["mag_time_lag"]
+    where = found.unexplained.where
+    assert where is not None
+    assert where.frame == "world"
+    assert sum(end - begin for begin, end in where.intervals_s) < 30.0

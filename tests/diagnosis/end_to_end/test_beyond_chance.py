@@ -72,3 +72,15 @@ def test_where_the_gyro_is_the_quieter_sensor_nothing_is_simulated() -> None:
     found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + 5 * since * STEP_GAUSS))
     assert found.mismatch
     assert not any("louder than the magnetometer's" in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_a_step_far_beyond_what_simulations_show_is_told() -> None:
+    """2 mG of hard iron beside 0.1 mG and 50 mrad/s."""
+    track = track_of(_made(1e-4, 5e-2))
+    since = (np.arange(len(track)) >= 1500)[:, None]
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS))
+    assert [one.effect for one in found.findings] == ["hard_iron_step"]
+    sizes = [value.value for value in found.findings[0].parameters]
+    assert sizes == pytest.approx(STEP_GAUSS.tolist(), abs=3e-4)
+    assert any("(seeds 0 to 4) show nothing" in note for note in found.notes)

@@ -60,3 +60,13 @@ def test_a_delay_is_drawn_as_it_is_in_the_recording():
     assert lag.parameters[0].value == pytest.approx(0.06, abs=2e-3)
     added = np.linalg.norm(found.drawn.contributions[lag.term].added, axis=1)
     assert added.max() > 5e-3  # half a gauss that turns by half a radian a second: 15 mG
+
+
+@pytest.mark.slow
+def test_all_names_together_gain_what_they_gain_one_by_one_where_they_are_apart():
+    found, _ = answer(("motor_current_field", 0.5), ("gyro_scale", 1.0))
+    alone = [x.heldout.nll_gain_per_sample for x in found.findings]
+    assert len(alone) == 2
+    assert found.validation.named == pytest.approx(sum(alone), rel=0.2)
+    assert found.validation.placebo == max(x.heldout.placebo_gain for x in found.findings)
+    assert found.to_json()["validation"]["named"] == found.validation.named

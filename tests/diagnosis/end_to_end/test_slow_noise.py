@@ -1,4 +1,4 @@
-"""Noise that forgets within seconds: its law, and no unknown where it is all there is."""
+"""Noise that forgets within seconds: alone no unknown, and sources and names beside it."""
 
 from __future__ import annotations
 
@@ -43,3 +43,15 @@ def test_a_name_holds_beside_slow_noise_that_seen_as_white_would_be_a_rest() -> 
     values = answer.findings[0].parameters
     z = [(v.value - t) / v.std for v, t in zip(values, one.truth[0][1], strict=True)]
     assert np.abs(z).max() < 3.0
+
+
+@pytest.mark.slow
+def test_a_source_is_told_beside_slow_noise(quiet: Track) -> None:
+    noise = 5e-4 * slow(np.random.default_rng(1), len(quiet), 25.0, 2.0)
+    on = (quiet.time_s % 97.0) < 41.0
+    field = on[:, None] * np.array([1.5e-3, 1e-3, -1.5e-3])
+    answer = diagnose(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + noise + field))
+    assert answer.findings == ()
+    where = answer.unexplained.where
+    assert where is not None
+    assert where.frame == "sensor"

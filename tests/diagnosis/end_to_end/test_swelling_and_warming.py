@@ -72,3 +72,12 @@ def test_iron_that_remembers_does_not() -> None:
     iron = diagnose(made(Trial(4, (("viscous_magnetisation", 1.0),))).track, library=FADING)
     assert [one.effect for one in iron.findings] == ["viscous_magnetisation"]
     assert not iron.unexplained.detected
+
+
+@pytest.mark.slow
+def test_a_sensor_that_warms_is_no_iron_that_remembers() -> None:
+    """328 nats as that; a smooth course has hardly less, and nobody logged a temperature."""
+    library = {name: EFFECTS[name] for name in ("viscous_magnetisation", "hard_iron_step")}
+    warm = diagnose(with_field(warming), library=library)
+    assert [one.effect for one in warm.findings] == []
+    assert warm.unexplained.detected and warm.unexplained.where.frame == "sensor"

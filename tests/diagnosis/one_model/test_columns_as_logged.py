@@ -12,11 +12,10 @@ from tracks import experiment, track_of
 
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.one_model import rich
-from ahrsd.diagnosis.one_model.diagnose import begun, diagnose
+from ahrsd.diagnosis.one_model.diagnose import begun
 from ahrsd.diagnosis.track import Spec
 
 RATE_HZ = 25.0
-FIELD_PER_M_S = np.array([9e-3, -6e-3, 4e-3])
 
 
 def held(values, rows):
@@ -58,30 +57,3 @@ def test_a_column_that_the_field_does_not_follow_stays_as_it_was_held(driven):
     speed = 1.2 + 0.25 * gaussian_filter1d(np.random.default_rng(3).normal(size=4_000), 40.0)
     track = driven.track.with_columns({"speed_m_s": held(speed, 5)})
     assert not any("speed_m_s" in said for said in notes_at_the_richest_model(track))
-
-
-@pytest.mark.slow
-def test_a_current_that_was_logged_five_times_a_second_is_one_name(driven):
-    current = driven.track.covariates["motor_current_a"]
-    found = diagnose(driven.track.with_columns({"motor_current_a": held(current, 5)}))
-    # as it was held it is late, which a field by its change explains
-    assert [one.effect for one in found.findings] == ["motor_current_field"]
-    assert not found.unexplained.detected
-    _, value, _ = driven.truth[0]
-    np.testing.assert_allclose([p.value for p in found.findings[0].parameters], value, rtol=0.04)
-
-
-@pytest.mark.slow
-def test_a_speed_with_noise_has_its_own_field_and_leaves_nothing():
-    track = track_of(experiment("wam", motion="rov", seed=4, samples=3000, rate_hz=12.5))
-    course = gaussian_filter1d(np.random.default_rng(10).normal(size=3000), 120.0)
-    speed = 1.2 + 0.25 * course / course.std()
-    mag = track.mag_b_gauss + speed[:, None] * FIELD_PER_M_S
-    logged = (speed + np.random.default_rng(11).normal(0.0, 0.05, 3000))[::3]
-    noisy = np.round(np.interp(np.arange(3000), np.arange(0, 3000, 3), logged), 4)
-    found = diagnose(replace(track, mag_b_gauss=mag).with_columns({"speed_m_s": noisy}))
-    assert [one.effect for one in found.findings] == ["speed_field"]
-    assert not found.unexplained.detected
-    assert any(note.startswith("column speed_m_s has noise of its own: ") for note in found.notes)
-    for value, truth in zip(found.findings[0].parameters, FIELD_PER_M_S, strict=True):
-        assert value.value == pytest.approx(truth, rel=0.05)

@@ -1,4 +1,4 @@
-"""A speed with noise of its logger."""
+"""Columns that a logger held, or added noise to: their cause is one name, and nothing is left."""
 
 from __future__ import annotations
 
@@ -6,17 +6,39 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mismatch_trials import Trial, made
 from scipy.ndimage import gaussian_filter1d
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.one_model.diagnose import diagnose_logged
 
-ROWS = 12_000
-
+RATE_HZ = 25.0
 FIELD_PER_M_S = np.array([9e-3, -6e-3, 4e-3])
 
 
-def course(seed: int, rows: int = ROWS, width: float = 120.0) -> np.ndarray:
+def held(values, rows):
+    return values[(np.arange(len(values)) // rows) * rows]
+
+
+@pytest.mark.slow
+def test_a_current_that_was_logged_five_times_a_second_is_one_name():
+    one = made(
+        Trial(seed=11, effects=(("motor_current_field", 1.0),), samples=8_000, rate_hz=RATE_HZ)
+    )
+    current = held(one.track.covariates["motor_current_a"], 5)
+    track = one.track.with_columns({**one.track.covariates, "motor_current_a": current})
+    found = diagnose_logged(track)
+    # as it was held it is late, which a field by its change explains
+    assert [x.effect for x in found.findings] == ["motor_current_field"]
+    assert not found.unexplained.detected
+    assert (
+        "column motor_current_a comes every 0.2 s: drawn straight between its values" in found.notes
+    )
+    _, value, _ = one.truth[0]
+    np.testing.assert_allclose([p.value for p in found.findings[0].parameters], value, rtol=0.02)
+
+
+def course(seed: int, rows: int, width: float = 120.0) -> np.ndarray:
     """A smooth course of deviation 1."""
     values = gaussian_filter1d(np.random.default_rng(seed).normal(size=rows), width)
     return values / values.std()
@@ -28,7 +50,7 @@ def drawn(values: np.ndarray, rows: int) -> np.ndarray:
     return np.round(np.interp(np.arange(len(values)), at, values[at]), 4)
 
 
-@pytest.mark.slow  # half a minute; what it rests on is above
+@pytest.mark.slow
 def test_a_speed_with_noise_has_its_own_field_and_leaves_nothing() -> None:
     track = track_of(experiment("wam", motion="rov", seed=4, samples=3000, rate_hz=12.5))
     speed = 1.2 + 0.25 * course(10, 3000)
@@ -37,6 +59,6 @@ def test_a_speed_with_noise_has_its_own_field_and_leaves_nothing() -> None:
     found = diagnose_logged(replace(track, mag_b_gauss=mag).with_columns({"speed_m_s": noisy}))
     assert [one.effect for one in found.findings] == ["speed_field"]
     assert not found.unexplained.detected
-    assert found.notes[0].startswith("column speed_m_s has noise of its own: ")
+    assert any(note.startswith("column speed_m_s has noise of its own: ") for note in found.notes)
     for value, truth in zip(found.findings[0].parameters, FIELD_PER_M_S, strict=True):
         assert value.value == pytest.approx(truth, rel=0.05)

@@ -1,4 +1,4 @@
-"""Names that say nothing of what was held out, and those that are not asked."""
+"""Axes of the magnetometer that read a part of each other."""
 
 import pytest
 from mismatch_trials import Trial, made
@@ -12,5 +12,5 @@ def crossed():
 
 
 @pytest.mark.slow
-def test_what_is_not_refused_is_named(crossed):
+def test_crossed_axes_are_one_name(crossed):
     assert [one.effect for one in diagnose(crossed).findings] == ["mag_cross_axis"]

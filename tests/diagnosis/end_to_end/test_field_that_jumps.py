@@ -1,0 +1,44 @@
+"""A field that jumps has its name and its time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracks import experiment, track_of, true_model
+
+from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.one_model.diagnose import diagnose
+
+SAMPLES = 5000
+
+
+@pytest.fixture(scope="module")
+def made():
+    return experiment("mam", samples=SAMPLES)
+
+
+@pytest.fixture(scope="module")
+def track(made):
+    return track_of(made)
+
+
+@pytest.fixture(scope="module")
+def jumped(made, track):
+    """The world's field jumps by a milligauss at 90 s."""
+    jump = 1e-3 * np.array([0.6, -0.5, 0.6])
+    turned = np.swapaxes(fit_null(track).context().R_nb, 1, 2) @ jump
+    read = turned @ true_model(made).soft_iron.T
+    later = (track.time_s - track.time_s[0] > 90.0)[:, None]
+    return replace(track, mag_b_gauss=track.mag_b_gauss + later * read)
+
+
+def test_a_field_that_jumps_has_its_name_and_its_time(jumped):
+    """For some seconds it looks like a field of another strength."""
+    found = diagnose(jumped)
+    (step,) = found.findings
+    assert step.effect == "field_step"
+    assert step.setting["onset_s"] == pytest.approx(90.0, abs=0.5)
+    assert step.confidence > 0.9
+    assert not found.unexplained.detected
