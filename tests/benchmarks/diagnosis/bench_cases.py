@@ -1,10 +1,10 @@
-"""The engine on recordings: real with known truth, real untouched, blind.  One table.
+"""The diagnosis of recordings: real with known truth, real untouched, blind.  One table.
 
-    python tests/benchmarks/diagnosis/bench_engines.py --kept ANSWERS.json [--only PART ...]
-        [--seed N --cases RING=N ...] [--world NAME] [--listed]
+    python tests/benchmarks/diagnosis/bench_cases.py --kept ANSWERS.json [--only PART ...]
+        [--seed N --cases RING=N ...] [--world NAME] [--again] [--listed]
 
-A case is answered once and kept in the file.  The blind cases are drawn anew from the seed and
-judged as `ahrsd challenge score` does.
+A case is answered once and kept in the file; `--again` answers those anew that `--only` leaves.
+The blind cases are drawn anew from the seed and judged as `ahrsd challenge score` does.
 
 known:     what was put on or flows is named, at its time; a delay of the magnetometer beside it,
            and an unknown where something stands in the room, are no mistakes
@@ -220,6 +220,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="of the blind cases")
     parser.add_argument("--cases", nargs="*", default=[], help="blind cases, as singles=22")
     parser.add_argument("--world", choices=sorted(WORLDS), help="whose cases; else the trials' own")
+    parser.add_argument("--again", action="store_true", help="answer what is kept once more")
     parser.add_argument("--listed", action="store_true", help="list every case")
     given = parser.parse_args()
     known: dict[str, Json] = json.loads(given.kept.read_text()) if given.kept.exists() else {}
@@ -234,7 +235,7 @@ def main() -> None:
         title = f"{case.part}: {case.name}"
         if not any(word in title for word in given.only):
             continue
-        if title not in known:
+        if given.again or title not in known:
             known[title] = answered(case)
             given.kept.write_text(json.dumps(known) + "\n", encoding="utf-8")
             word, said = verdict(case, known[title])
