@@ -12,8 +12,8 @@ So the law of what is told is measured (a parametric bootstrap): the fitted
 calibration alone is simulated along the recording's own motion, with its stamps, its columns and
 the noise that was fitted.  First the calibration is fitted to each copy as it was to the recording:
 where what it leaves of the recording is like what it leaves of the copies, the two agree, whatever
-else an engine tells.  Where it is not, the same engine is asked about the first copies, and what it
-tells must be far beyond what it tells of these.  Calibration and noise are those of the fit without
+else is told.  Where it is not, the same question is asked of the first copies, and what is told
+must be far beyond what is told of these.  Calibration and noise are those of the fit without
 any name or beside the names, whose magnetometer is the quieter one: what a missing name leaves is
 no noise, and louder copies show more by chance.
 
@@ -24,7 +24,7 @@ times the largest of n such with the chance n! / ((1 + t) ... (n + t)), whatever
 126 for four times the largest of five.  Of what is far beyond the first copies the others need not
 be asked: 1 in 1000 is enough at each of them (43 times the larger of two), and with all of these
 looks about 1 in 94 of what chance makes is told.  A copy of which nothing is told counts with what
-an engine keeps to itself.
+is kept untold of it.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ BENT = "the gyro's noise bends the calibration, which this motion hardly shows"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answered:
-    """An engine's answer, with the calibration that it fitted before any name.
+    """An answer, with the calibration that was fitted before any name.
 
     problem, start: None where nothing was fitted
     """
@@ -116,10 +116,10 @@ def beyond_chance(
 ) -> Diagnosis:
     """The answer about a track; beside a loud gyro only what is clearly beyond chance is told.
 
-    ask: an engine.  Where the gyro is loud, by itself or for this motion, and something is told or
-    a check fails, the calibration is fitted to `limits.chance_fits` copies (seeds 0, 1, 2 and so
-    on); where the recording's fit is not like theirs, the engine is asked again for the first
-    `limits.chance_copies` at most
+    ask: answers about a track.  Where the gyro is loud, by itself or for this motion, and something
+    is told or a check fails, the calibration is fitted to `limits.chance_fits` copies (seeds 0, 1, 2
+    and so on); where the recording's fit is not like theirs, `limits.chance_copies` of these at
+    most are asked about as well
     """
     first = ask(track)
     found, problem, start = first.found, first.problem, first.start
@@ -227,7 +227,7 @@ def _fitted(one: Finding) -> bool:
 def _fit_of(copy: Track, problem: Problem) -> NullFit | None:
     """The calibration alone fitted to a copy, as it was to the recording; None where it cannot."""
     try:
-        made, cold = problem_of(copy, problem.spec, problem.library, problem.limits)
+        made, cold = problem_of(copy, problem.spec)
         return fit_null(made.track, made.spec, cold, walk=False)
     except (np.linalg.LinAlgError, ValueError):
         return None
@@ -288,7 +288,7 @@ def _shown(
 
 
 def _shown_by(copy: Track, ask: Callable[[Track], Answered]) -> float:
-    """What an engine tells of a copy, nats; without end where its fit finds none."""
+    """What is told of a copy, nats; without end where its fit finds none."""
     try:
         return max(_told(ask(copy).found), default=0.0)
     except (np.linalg.LinAlgError, ValueError):

@@ -160,7 +160,6 @@ class Ordinary:
 
     within: whether it is ordinary;  why: in a sentence, if it is not
     field_gauss, heading_deg, gyro_rad_s: everything together, and what ordinary recordings leave
-    beside_gauss, beside_from_gauss: fields but for the largest, and what real recordings leave
     recordings: untouched real recordings that this was measured on
     """
 
@@ -172,8 +171,6 @@ class Ordinary:
     heading_up_to_deg: float
     gyro_rad_s: float
     gyro_up_to_rad_s: float
-    beside_gauss: float
-    beside_from_gauss: float
     recordings: int
     components: tuple[Component, ...]
 

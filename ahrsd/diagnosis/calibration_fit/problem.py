@@ -12,8 +12,6 @@ from ahrsd.diagnosis.calibration_fit.delay import earlier, of_magnetometer, with
 from ahrsd.diagnosis.calibration_fit.null import cold_start
 from ahrsd.diagnosis.calibration_fit.shaken import carrying, quieter
 from ahrsd.diagnosis.calibration_fit.thin import thinned, working_factor
-from ahrsd.diagnosis.effects.base import Effect
-from ahrsd.diagnosis.limits import Limits
 from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
@@ -27,7 +25,7 @@ MEAN_RATES = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """What is asked: the track, what is known of the sensor, the library, the thresholds.
+    """What is asked: the track, and what is known of the sensor.
 
     recorded: the track as it was recorded;  thin, cold: what made the working `track` from it, a
               cold start or a better calibration
@@ -44,8 +42,6 @@ class Problem:
 
     track: Track
     spec: Spec
-    library: Mapping[str, Effect]
-    limits: Limits
     recorded: Track
     thin: int
     cold: NullModel
@@ -90,9 +86,7 @@ class Problem:
         return replace(self, riding=drawn, cold=model).lagging(lag_s)
 
 
-def problem_of(
-    track: Track, spec: Spec, library: Mapping[str, Effect], limits: Limits
-) -> tuple[Problem, NullModel]:
+def problem_of(track: Track, spec: Spec) -> tuple[Problem, NullModel]:
     """The recording at working rate, and a calibration to start from."""
     cold = cold_start(track, spec)
     told = with_delta_angles(track, cold)
@@ -114,7 +108,7 @@ def problem_of(
     elif m >= OVERSAMPLED and spec.sigma_gyro_rad_s is None:
         # the gyro's differences at the working rate would be its motion
         known = replace(known, sigma_gyro_rad_s=start.sigma_gyro_rad_s)
-    made = Problem(work, known, library, limits, track, m, cold, averaged=averaged, notes=notes)
+    made = Problem(work, known, track, m, cold, averaged=averaged, notes=notes)
     return made, start
 
 

@@ -22,7 +22,7 @@ from ahrsd.diagnosis.calibration_fit.descent import NullFit
 from ahrsd.diagnosis.effects.base import Effect, Setting
 from ahrsd.diagnosis.innovation_filter.evidence import log_bayes, posterior
 from ahrsd.diagnosis.innovation_filter.score import solve, total_score
-from ahrsd.diagnosis.limits import Limits
+from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.values import Context
 from ahrsd.samples import Array
 
@@ -86,7 +86,7 @@ def told_at_rest(library: Mapping[str, Effect], still: Sequence[Finding]) -> Map
     return {k: e for k, e in asked.items() if e.family == "gyro" or e.rides or e.quick or e.delay}
 
 
-def resting(context: Context, library: Mapping[str, Effect], limits: Limits) -> tuple[Finding, ...]:
+def resting(context: Context, library: Mapping[str, Effect]) -> tuple[Finding, ...]:
     """The name for what moves the bias of a gyro that stands, with what is as likely; or none."""
     rest = _rest(context)
     if rest is None or _turning(rest, context) > TURNS:
@@ -103,7 +103,7 @@ def resting(context: Context, library: Mapping[str, Effect], limits: Limits) -> 
             )
             best[name] = (best[name][0] - float(np.log(len(options))), best[name][1])
     evidence = {name: nats for name, (nats, _) in best.items()}
-    if not evidence or max(evidence.values()) < limits.evidence_nats:
+    if not evidence or max(evidence.values()) < LIMITS.evidence_nats:
         return ()
     shares = dict(sorted(posterior(evidence, CAUSES).items(), key=lambda item: -item[1]))
     name = next(iter(shares))

@@ -1,4 +1,4 @@
-"""A recording as an engine takes it: columns in their roles, one clock, and what was counted in it.
+"""A recording as it is diagnosed: columns in their roles, one clock, and what was counted in it.
 
 What hygiene finds is told before any fit, and put right before it; what stops a fit is an answer.
 """

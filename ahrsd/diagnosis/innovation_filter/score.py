@@ -40,9 +40,7 @@ class Score:
         return np.asarray(self.basis @ (self.score / self.information))
 
 
-def total_score(
-    G: Array, s: Array, information: Array, scale: Array, minimum_information: float = 1.0
-) -> Score:
+def total_score(G: Array, s: Array, information: Array, scale: Array) -> Score:
     """The score of one group from its projected information (p, p) and score (p,).
 
     information: (p,) before anything was projected out
@@ -50,7 +48,7 @@ def total_score(
     whole = G * scale[:, None] * scale
     values, vectors = np.linalg.eigh((whole + whole.T) / 2)
     before = float(np.sum(information * scale**2))
-    kept = values > max(minimum_information, _RANK_SHARE * before)
+    kept = values > max(1.0, _RANK_SHARE * before)
     V = vectors[:, kept]
     return Score(scale[:, None] * V, values[kept], (s * scale) @ V)
 

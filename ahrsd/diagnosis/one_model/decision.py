@@ -620,7 +620,7 @@ def _course(all_sets: Hypotheses, best: Hypothesis, key: str, odds: float) -> Un
     waves = np.cos(phase[:, None] * order)
     course = waves @ modes
     deviation = np.sqrt(np.mean(waves**2 @ unsure**2, axis=1))
-    away = departures(edges, course, deviation, course)
+    away = departures(edges, course, deviation)
     spans = away or [(float(time_s[0]), float(time_s[-1]))]
     return _described(at, course, one.frame, odds, tuple(spans))
 

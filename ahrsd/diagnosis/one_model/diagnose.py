@@ -23,7 +23,6 @@ from ahrsd.diagnosis.data_quality.missing import differ, lost_turns
 from ahrsd.diagnosis.data_quality.prepared import prepared
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.one_model import rich
 from ahrsd.diagnosis.one_model.answer.whole_answer import whole_answer
 from ahrsd.diagnosis.one_model.column_clocks import wrong_clock
@@ -34,9 +33,9 @@ from ahrsd.diagnosis.one_model.search_rounds import Searched, answered
 from ahrsd.diagnosis.track import Spec, Track
 
 
-def begun(track: Track, spec: Spec, library: Mapping[str, Effect]) -> tuple[Problem, NullFit]:
+def begun(track: Track, spec: Spec) -> tuple[Problem, NullFit]:
     """A track that hygiene has put right at its working rate, and the fit of a null to it."""
-    problem, cold = problem_of(broken_where_unsampled(track), spec, library, LIMITS)
+    problem, cold = problem_of(broken_where_unsampled(track), spec)
     return problem, fit_null(problem.track, problem.spec, cold, walk=False)
 
 
@@ -76,11 +75,11 @@ def _answered(
     asked = prepared(track)
     if (nothing := asked.stopped("", library)) is not None:
         return Answered(nothing)
-    problem, start = begun(asked.put_right(), spec, library)
+    problem, start = begun(asked.put_right(), spec)
     came, counted = problem.recorded, asked
     if lost := lost_turns(came, problem.cold):
         asked = counted.with_facts(lost)
-        problem, start = begun(asked.put_right(), spec, library)
+        problem, start = begun(asked.put_right(), spec)
     richest = rich.richest(problem, start.filtered, library)
     if clocks and (clock := wrong_clock(richest)) is not None:
         at_its_time = _answered(
@@ -90,13 +89,13 @@ def _answered(
         if any(one.setting.get("covariate") == clock.column for one in moved.findings):
             said = f"{clock.words}: its cause is judged at the sensor's time"
             return replace(at_its_time, found=replace(moved, notes=(said, *moved.notes)))
-    still = resting(start.context(), library, LIMITS) if at_rest(start) else ()
+    still = resting(start.context(), library) if at_rest(start) else ()
     searched = told_at_rest(library, still) if at_rest(start) else library
     found, fast = _found(problem, richest, start, searched)
     beside = lost_beside(came, found, fast, lost)
     if differ(lost, beside):
         other = counted.with_facts(beside)
-        otherwise, begin = begun(other.put_right(), spec, library)
+        otherwise, begin = begun(other.put_right(), spec)
         richest = rich.richest(otherwise, begin.filtered, library)
         again, quickly = _found(otherwise, richest, begin, searched)
         if nats(again, beside) > nats(found, lost):

@@ -10,25 +10,25 @@ from numpy.typing import NDArray
 
 from ahrsd.samples import Array
 
+#: of the largest departure: from which on it is one
+AWAY = 0.25
 #: deviations by which a course's beginning and end are still away from its usual level
 STILL = 2.0
 
 
-def departures(
-    edges_s: Array, level: Array, deviation: Array, course: Array, share: float = 0.25
-) -> list[tuple[float, float]]:
-    """Spans in which the level (J, axes) is away from the one in force for longest.
+def departures(edges_s: Array, course: Array, deviation: Array) -> list[tuple[float, float]]:
+    """Spans in which a course (J, axes) is away from the level that is in force for longest.
 
-    Away: by more than `share` of the largest departure and 3 deviations (J,), and on either side as
-    far as the course itself (J, axes) still shows it (`reaching`).  The whole span where the course
+    Away: by more than `AWAY` of the largest departure and 3 deviations (J,), and on either side as
+    far as the course still shows it (`reaching`).  The whole span where the course
     has no usual level: where none is in force for 40 % of the time.
     """
     length = np.diff(edges_s)
-    distance = np.linalg.norm(level[:, None] - level[None], axis=2)
+    distance = np.linalg.norm(course[:, None] - course[None], axis=2)
     largest = float(distance.max(initial=0.0))
     if largest == 0.0:
         return [(float(edges_s[0]), float(edges_s[-1]))]
-    alike = distance <= np.maximum(share * largest, 3.0 * np.minimum.outer(deviation, deviation))
+    alike = distance <= np.maximum(AWAY * largest, 3.0 * np.minimum.outer(deviation, deviation))
     usual = alike @ length
     home = int(np.argmax(usual))
     if usual[home] < 0.4 * length.sum():

@@ -64,7 +64,7 @@ def untouched(words: list[str]) -> Iterator[tuple[str, Path]]:
 def measured(path: Path) -> dict[str, Any]:
     """What a recording leaves: `profiles` of the remainder, `effects` that nobody put there."""
     track = prepared(load_track(path)[0]).put_right()
-    problem, fit = begun(track, Spec(), {})
+    problem, fit = begun(track, Spec())
     found = rich.richest(problem, fit.filtered, EFFECTS)
     return {"profiles": profiles(found), "effects": sizes(found)}
 

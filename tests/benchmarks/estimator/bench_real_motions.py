@@ -27,7 +27,6 @@ from ahrsd.diagnosis.calibration_fit.coarse import noise_of
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.base import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.offline.diagnose import load_track
@@ -113,7 +112,7 @@ def simulated(name: str, seed: int, effects: list[tuple[str, float]]) -> Track:
 
 def noise_over_truth(track: Track) -> tuple[float, float]:
     """The gyro's noise by its differences, and as it is worked with, both over the truth."""
-    problem, start = problem_of(track, Spec(), EFFECTS, LIMITS)
+    problem, start = problem_of(track, Spec())
     worked = start.sigma_gyro_rad_s * float(np.sqrt(problem.thin))
     return noise_of(track)[1] / SIGMA_GYRO, worked / SIGMA_GYRO
 

@@ -38,8 +38,6 @@ def left(attitude: float, *, within: bool = True, there: bool = True) -> Ordinar
         heading_up_to_deg=2.6,
         gyro_rad_s=0.0,
         gyro_up_to_rad_s=0.01,
-        beside_gauss=8e-3,
-        beside_from_gauss=0.0,
         recordings=20,
         components=(
             part("by_direction", "a field by attitude", attitude, there),

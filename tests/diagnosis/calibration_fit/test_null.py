@@ -16,8 +16,6 @@ from ahrsd.diagnosis.calibration_fit.noise_fit import WALK_CAP_RAD_S_SQRT_S
 from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.calibration_fit.prior import rate_at_rest
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
-from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
@@ -57,7 +55,7 @@ def test_a_cold_start_finds_the_truth(scenario: str, motion: str, sigma_gyro: fl
 def test_a_valley_from_which_no_start_comes_is_left() -> None:
     """Of low angular movement: each of three starts ended 0.26 gauss off, 208 nats above this."""
     run = simulate(ScenarioSettings("lam", "slow", 9700, 10_000, 25.0, 1e-3, 5e-3))
-    asked, cold = problem_of(track_of(run), Spec(), EFFECTS, LIMITS)
+    asked, cold = problem_of(track_of(run), Spec())
     fit = fit_null(asked.track, asked.spec, cold, walk=False)
     assert np.linalg.norm(fit.model.hard_iron_gauss - run.truth.hard_iron_gauss) < 0.03
     assert abs(fit.filtered.normalised_innovation - 1) < 0.01

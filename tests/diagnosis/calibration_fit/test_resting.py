@@ -11,12 +11,11 @@ from odd_tracks import COUNT, RATE_HZ, standing, warming
 from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.calibration_fit.resting import resting
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.track import Track
 
 
 def told(track: Track):
-    return resting(fit_null(track, walk=False).context(), EFFECTS, LIMITS)
+    return resting(fit_null(track, walk=False).context(), EFFECTS)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,6 @@ from tracks import experiment, recorded, track_of
 
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.calibration_fit.shaken import shaken
-from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.track import Spec
 
 
@@ -35,5 +33,5 @@ def test_what_else_is_wrong_is_not_taken_for_quiet() -> None:
     track = shaking(4)
     mag = track.mag_b_gauss.copy()
     mag[:, 0] += 0.05 * np.sign(np.sin(2 * np.pi * track.time_s / 17.0))
-    problem, _ = problem_of(replace(track, mag_b_gauss=mag), Spec(), EFFECTS, LIMITS)
+    problem, _ = problem_of(replace(track, mag_b_gauss=mag), Spec())
     assert problem.spec.shaken_gyro_rad_s is None

@@ -10,8 +10,6 @@ from odd_tracks import SIGMA_GYRO, SIGMA_MAG, shaking
 
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.calibration_fit.shaken import shaken
-from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import Spec
 
@@ -20,7 +18,7 @@ from ahrsd.diagnosis.track import Spec
 def test_the_noise_is_found_below_what_differences_say(seed: int) -> None:
     track = shaking(seed)
     assert shaken(track)
-    problem, start = problem_of(track, Spec(), EFFECTS, LIMITS)
+    problem, start = problem_of(track, Spec())
     assert problem.spec.shaken_gyro_rad_s is not None
     assert problem.spec.shaken_gyro_rad_s * np.sqrt(problem.thin) > 10 * SIGMA_GYRO
     assert 0.6 < start.sigma_gyro_rad_s * np.sqrt(problem.thin) / SIGMA_GYRO < 1.6

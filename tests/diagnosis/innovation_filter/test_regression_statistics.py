@@ -11,14 +11,14 @@ from ahrsd.diagnosis.innovation_filter.evidence import SIZES, log_bayes, posteri
 from ahrsd.diagnosis.innovation_filter.score import solve, total_score
 
 
-def test_a_direction_counts_where_a_coefficient_at_its_bound_would_show():
+def test_a_direction_counts_where_one_prior_deviation_would_show():
     effect = EFFECTS["mag_bias_temperature"]
     assert effect.least_information == pytest.approx((3 / 50) ** 2)
     scale = np.array([one.scale for one in effect.parameters])
     G = np.diag([0.1, 0.1, 1e-4]) / np.outer(scale, scale)
     s = np.array([3.0, 0.0, 0.0]) / scale
     assert total_score(G, s, np.diag(G), scale).rank == 0
-    what = total_score(G, s, np.diag(G), scale, effect.least_information)
+    what = total_score(100 * G, 100 * s, np.diag(G), scale)
     assert what.rank == 2
     np.testing.assert_allclose(what.value, [30 * scale[0], 0.0, 0.0], atol=1e-12)
 

@@ -24,7 +24,7 @@ def held(values, rows):
 
 def notes_at_the_richest_model(track):
     """What is said of the columns before anything is searched."""
-    problem, fit = begun(track, Spec(), EFFECTS)
+    problem, fit = begun(track, Spec())
     return rich.richest(problem, fit.filtered, EFFECTS).base.made.point.problem.notes
 
 

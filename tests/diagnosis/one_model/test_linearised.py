@@ -14,7 +14,6 @@ from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
-from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.one_model import priors, rich
 from ahrsd.diagnosis.one_model.candidates import beside
 from ahrsd.diagnosis.one_model.component import Component, Fixed
@@ -35,7 +34,7 @@ from ahrsd.diagnosis.values import Columns
 
 
 def richest(track: Track) -> rich.Judged:
-    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    problem, cold = problem_of(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
     return rich.richest(problem, fit.filtered, EFFECTS)
 
@@ -125,7 +124,7 @@ def test_a_logged_cause_is_the_same_component_at_every_point():
     track = track_of(experiment("wam", seed=4, samples=3000))
     warm = 15.0 + np.cumsum(np.random.default_rng(2).normal(size=len(track))) / 500.0
     track = replace(track, covariates={"temperature_c": warm})
-    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    problem, cold = problem_of(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
     keys = []
     for one in (problem, problem.lagging(0.03)):
@@ -141,7 +140,7 @@ def test_what_a_point_takes_out_of_the_readings_is_what_it_puts_back():
     t = track.time_s - track.time_s[0]
     added = 0.04 * np.sin(2 * np.pi * t / 31.0)[:, None] * np.array([0.6, -0.7, 0.39])
     track = replace(track, mag_b_gauss=track.mag_b_gauss + added)
-    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    problem, cold = problem_of(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
     here = rich.judged(first_point(problem, fit.filtered, (LAG,)), EFFECTS, ())
     there = rich.judged(moved(here.base.made, here.base.whole, here.at, delayed=False), EFFECTS, ())
@@ -165,7 +164,7 @@ def test_a_run_ends_where_a_step_turns_too_far_to_be_told():
 
 def test_a_span_in_which_something_was_moved_is_unread_and_the_gyro_carries_the_field_across():
     track = track_of(experiment("wam", seed=8, samples=3000))
-    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    problem, cold = problem_of(track, Spec())
     point = first_point(problem, fit_null(problem.track, problem.spec, cold).filtered, (LAG,))
     middle_s = float(np.median(track.time_s))
     silent = unread(point, [(middle_s, middle_s + 6.0)])
@@ -181,7 +180,7 @@ def test_a_span_in_which_something_was_moved_is_unread_and_the_gyro_carries_the_
 def test_what_is_made_of_the_field_row_by_row_does_not_follow_that_rows_reading(name):
     """Beside a loud gyro the smooth field is nearly the reading, which then explains itself."""
     loud = track_of(experiment("wam", seed=31, samples=600, rate_hz=10.0, sigma_gyro=0.03))
-    problem, cold = problem_of(loud, Spec(), EFFECTS, LIMITS)
+    problem, cold = problem_of(loud, Spec())
     model = fit_null(problem.track, problem.spec, cold, walk=False).model
     row, off_gauss = 300, 1e-3
 

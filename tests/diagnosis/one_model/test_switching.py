@@ -11,7 +11,6 @@ from tracks import experiment, track_of
 from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.one_model import priors, rich
 from ahrsd.diagnosis.one_model.search_space import space_at
 from ahrsd.diagnosis.one_model.switching import (
@@ -85,7 +84,7 @@ def test_spells_are_found_to_a_second_and_what_was_tried_is_not_kept():
     on = np.any([(since_s >= a) & (since_s < b) for a, b in true], axis=0)
     lamp = on[:, None] * np.array([0.02, -0.015, 0.01])
     track = replace(track, mag_b_gauss=track.mag_b_gauss + lamp)
-    problem, cold = problem_of(track, Spec(), EFFECTS, LIMITS)
+    problem, cold = problem_of(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
     all_sets, _ = space_at(rich.richest(problem, fit.filtered, EFFECTS), EFFECTS, ())
     nothing = all_sets.judge(())

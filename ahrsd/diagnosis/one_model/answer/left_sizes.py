@@ -99,7 +99,6 @@ def left_sizes(
         )
         parts.append(row)
     fields = [one for one in parts if one.unit == "gauss"]
-    sizes = sorted(one.size for one in fields)
     headings = [(one.heading_deg or 0.0) * one.up_to / max(one.size, 1e-300) for one in fields]
     return Ordinary(
         within=why is None,
@@ -110,8 +109,6 @@ def left_sizes(
         heading_up_to_deg=_together(headings),
         gyro_rad_s=deviation(whole["rad/s"]),
         gyro_up_to_rad_s=_together([one.up_to for one in parts if one.unit != "gauss"]),
-        beside_gauss=float(np.linalg.norm(sizes[:-1])),
-        beside_from_gauss=0.0,
         recordings=priors.RECORDINGS,
         components=tuple(parts),
     )
