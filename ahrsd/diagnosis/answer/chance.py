@@ -117,7 +117,7 @@ def beyond_chance(
     """The answer about a track; beside a loud gyro only what is clearly beyond chance is told.
 
     ask: answers about a track.  Where the gyro is loud, by itself or for this motion, and something
-    is told or a check fails, the calibration is fitted to `limits.chance_fits` copies (seeds 0, 1, 2
+    is told or a check fails, the calibration is fitted to `limits.chance_fits` copies (seeds 0, 1
     and so on); where the recording's fit is not like theirs, `limits.chance_copies` of these at
     most are asked about as well
     """
