@@ -16,8 +16,8 @@ Of tests that know no more of a signal than its covariance the best is the likel
 
 l_i the signal's variances in the noise's units, z_i what is seen.  Its bar is what noise alone
 passes once in `1 / FALSE` recordings; told is how often the case's own signal passes, over draws of
-the noise.  The diagnosis knows none of that law, and looks for all kinds of causes at once.  Prints a
-line per case, and means by kind and strength.
+the noise.  The diagnosis knows none of that law, and looks for all kinds of causes at once.  Prints
+a line per case, and means by kind and strength.
 """
 
 from __future__ import annotations
