@@ -8,6 +8,7 @@ from mismatch_trials import Trial, made
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_off_shares_with_a_gyro_whose_axes_are_all_off_alike():
     trial = Trial(3, (("clock_rate", 1.0),), samples=8_000, rate_hz=25.0)
     found = diagnose(made(trial).track)

@@ -28,7 +28,7 @@ SHAPES = {
     "levels": lambda t: np.random.default_rng(7).uniform(0, 10, 100)[(t / 8).astype(int)],
 }
 #: those that a test takes which is not slow
-QUICK = ("square", "pulses")
+QUICK = ("square",)
 
 
 def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:

@@ -30,6 +30,7 @@ def test_a_field_by_place_stands_in_the_map_at_its_places_and_is_gone_after():
     assert told["before"] == list(found.regime_map[0].before)
 
 
+@pytest.mark.slow
 def test_without_names_nothing_is_drawn_twice():
     found, _ = answer()
     assert found.validation.named == found.validation.free == 0.0

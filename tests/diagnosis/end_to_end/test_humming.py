@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from mismatch_trials import Trial, made
 from scipy.signal import lfilter
 
@@ -44,6 +45,7 @@ def test_slow_noise_is_not_heard_again_at_the_rate_of_new_readings() -> None:
     assert loudest_band(seen, 50.0, 25.0 / 3) is None
 
 
+@pytest.mark.slow
 def test_a_propeller_that_nobody_logged_is_located_by_its_frequency() -> None:
     """It was colour of the noise: the recording and the model agreed."""
     quiet = replace(made(Trial(seed=8, samples=6000)).track, covariates={})

@@ -41,6 +41,7 @@ def test_what_the_form_of_pulses_leaves_is_no_line(quiet: Track) -> None:
     assert [one.effect for one in diagnose(pulsed).findings] == ["sync_pulses"]
 
 
+@pytest.mark.slow
 def test_an_alternating_field_needs_no_turns() -> None:
     """A vehicle that hardly turns says little of a field, but a line is none of a gyro's doing."""
     still = _rocking(np.random.default_rng(5))

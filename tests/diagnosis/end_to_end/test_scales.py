@@ -37,7 +37,8 @@ def test_a_compensation_on_board_is_named_once_with_its_part() -> None:
     assert found.where.frame == "sensor"
 
 
-@pytest.mark.parametrize("seed", [pytest.param(3, marks=pytest.mark.slow), 6])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 6])
 def test_what_creeps_in_steps_is_known_to_what_its_onset_leaves_open(seed: int) -> None:
     """A device that updates every eight seconds; of a smooth curve the part is known too well."""
     track, readings = _quiet(seed)

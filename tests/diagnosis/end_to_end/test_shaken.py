@@ -26,6 +26,7 @@ def test_the_noise_is_found_below_what_differences_say(seed: int) -> None:
     assert not diagnose(track).mismatch
 
 
+@pytest.mark.slow
 def test_a_bias_that_jumps_is_seen_through_the_shaking() -> None:
     track = shaking(3)
     gyro = track.gyro_b_rad_s.copy()

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import json
+import logging
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from tracks import experiment
 
+from ahrsd.__main__ import main
 from ahrsd.diagnosis.repaired_model.model_file import from_text
 from ahrsd.recording.table import write_table
 
@@ -21,38 +27,58 @@ def recording(tmp_path_factory):
     for k, axis in enumerate("xyz"):
         columns[f"mag_{axis}_gauss"] = (made.raw_b_gauss + step)[:, k]
         columns[f"gyro_{axis}_rad_s"] = made.gyro_b_rad_s[:, k]
-    path = tmp_path_factory.mktemp("one_model") / "step.csv"
+    path = tmp_path_factory.mktemp("recordings") / "step.csv"
     write_table(path, columns)
     return path
 
 
-def test_the_step_is_named_in_the_same_form(run, recording, tmp_path, capsys):
-    answer = tmp_path / "answer.json"
-    words = ["diagnose", str(recording), "--json", str(answer)]
-    assert run(*words) == 0
-    body = json.loads(answer.read_text())
+class Reported(NamedTuple):
+    """What `ahrsd diagnose --report FOLDER` says and writes."""
+
+    code: int | str | None
+    words: str
+    folder: Path
+
+    @property
+    def body(self):
+        return json.loads((self.folder / "diagnosis.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def reported(recording, tmp_path_factory):
+    """The report of the recording, made once."""
+    root = logging.getLogger()
+    handlers = root.handlers[:]
+    folder, said = tmp_path_factory.mktemp("report"), StringIO()
+    with redirect_stdout(said), pytest.raises(SystemExit) as ended:
+        main(["diagnose", str(recording), "--report", str(folder)])
+    root.handlers[:] = handlers
+    return Reported(ended.value.code, said.getvalue(), folder)
+
+
+def test_the_step_is_named(reported):
+    assert reported.code == 0
+    body = reported.body
     assert body["schema"] == "ahrsd.diagnosis/1"
     assert [one["effect"] for one in body["findings"]] == ["hard_iron_step"]
     (one,) = body["findings"]
     assert one["where"]["intervals_s"][0][0] == pytest.approx(70.0, abs=0.5)
     found = [p["value"] for p in one["parameters"]]
     np.testing.assert_allclose(found, [0.0, 9e-3, -4e-3], atol=8e-4)
-    assert "hard_iron_step" in capsys.readouterr().out
+    assert "hard_iron_step" in reported.words
 
 
-def test_a_report_has_all_that_is_told_of_it(run, recording, tmp_path, capsys):
-    assert run("diagnose", str(recording), "--report", str(tmp_path)) == 0
-    words = capsys.readouterr().out
-    page = (tmp_path / "report.html").read_text()
+def test_a_report_has_all_that_is_told_of_it(reported):
+    page = (reported.folder / "report.html").read_text()
     assert page.count("<figure") + page.count("<svg") > 4
-    assert (tmp_path / "diagnosis.rrd").stat().st_size > 100_000
-    model = from_text((tmp_path / "model.json").read_text())
+    assert (reported.folder / "diagnosis.rrd").stat().st_size > 100_000
+    model = from_text((reported.folder / "model.json").read_text())
     (term,) = model.terms
     assert term.identifier == "hard_iron_step"
     assert model.noise.mag_gauss == pytest.approx(1e-3, rel=0.1)
     for line in ("held out", "without it", "checks:", "innovations:"):
-        assert line in words
-    (one,) = json.loads((tmp_path / "diagnosis.json").read_text())["findings"]
+        assert line in reported.words
+    (one,) = reported.body["findings"]
     assert one["term"] == 0
     assert one["heldout"]["nll_gain_per_sample"] > 10 * max(one["heldout"]["placebo_gain"], 0.001)
     assert one["priors"]["stays"]

@@ -64,6 +64,7 @@ def test_a_step_and_a_start_up_are_no_walk(track):
     assert [one.effect for one in found.findings] == ["gyro_startup"]
 
 
+@pytest.mark.slow
 def test_a_small_start_up_that_a_walk_follows_less_well_has_its_name(track):
     """5.7 nats before the modes of a walk, 21 before the filter's own: less was noise once."""
     warm = np.exp(-(track.time_s - track.time_s[0]) / 120.0)[:, None]
@@ -73,6 +74,7 @@ def test_a_small_start_up_that_a_walk_follows_less_well_has_its_name(track):
     assert not found.unexplained.detected
 
 
+@pytest.mark.slow
 def test_an_ordinary_walk_has_no_cause(track):
     steps = np.random.default_rng(4).normal(size=(len(track), 3)) * np.sqrt(0.04)
     walked = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + 5e-6 * np.cumsum(steps, axis=0))

@@ -28,6 +28,7 @@ def test_nothing_is_said_where_nothing_is_wrong(noise):
     assert lag is not None and 0.0 < lag < 0.01
 
 
+@pytest.mark.slow
 def test_a_lag_is_named_with_its_size_and_told_apart_from_a_low_pass():
     found, _ = answer(("mag_time_lag", 0.7))  # 20 ms would be half a sample
     assert [one.effect for one in found.findings] == ["mag_time_lag"]
