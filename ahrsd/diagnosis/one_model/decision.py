@@ -341,6 +341,7 @@ def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
 
     Beside something unknown a name has to be the larger part: a source that no law here has leaves
     a rest, and names take that, of either sensor: a gyro's error by force for what slides by it.
+    What takes a rest by a logged column takes it by that column at other times as well.
     """
     one = all_sets.component(key)
     if key == LAG:
@@ -357,8 +358,19 @@ def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     ]  # fmt: skip
     if not unknown:
         return asked
+    if "covariate" in one.setting:
+        return asked + _at_other_times(all_sets, best, key)
     nats = best.score - all_sets.judge(best.names - frozenset(unknown), best).score
     return max(asked, priors.BESIDE_UNKNOWN * nats)
+
+
+def _at_other_times(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
+    """Nats that a member would be worth at the best of other times, 0 at least."""
+    one, fewer = all_sets.component(key), all_sets.judge(all_sets.without(best.names, key), best)
+    copies = [one.moved(share) for share in priors.SHIFTS]
+    all_sets.made.add(copies)
+    scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
+    return max(0.0, *scan.worth([copy.key for copy in copies]).values())
 
 
 def _is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
