@@ -142,7 +142,8 @@ def _drifting(
     drift, unsure = nearest @ value, np.sqrt(np.square(nearest) @ np.square(deviation))
     kept = {k: v for k, v in setting.items() if k != "searched"}
     shares = _shares(all_sets, space, best, key)
-    shares = {effect.identifier if k == key else k: share for k, share in shares.items()}
+    whole = shares.pop(key) + shares.pop(effect.identifier, 0.0)  # its own form is one of any
+    shares = {effect.identifier: whole, **shares}
     where = _where(all_sets, best, key, effect.frame or effect.family)
     found = _found(effect, shares, where, drift, unsure, kept, odds, library)
     found = replace(found, cost_if_left_out=_cost(all_sets, best, key))
