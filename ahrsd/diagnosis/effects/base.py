@@ -93,6 +93,7 @@ class Effect(ABC):
                  what such leave; 0 where hardly any has it
                  (`python tests/benchmarks/diagnosis/bench_remainder_priors.py`)
     ordinary_part: of what real recordings ordinarily leave, the part whose form it is
+    turns_sensors: its three parameters are the turn of the magnetometer against the gyro, rad
     remembers:   the most of what each axis may have from before the recording (setting `memory`),
                  in that setting's unit; 0 where it remembers nothing
     stands_for:  effects that look like it, each a further way to it where its column was not logged
@@ -130,6 +131,7 @@ class Effect(ABC):
     of_step: bool = False
     ordinary: float = 0.0
     ordinary_part: str | None = None
+    turns_sensors: bool = False
     remembers: float = 0.0
     stands_for: tuple[str, ...] = ()
     loose: float = 30.0

@@ -214,6 +214,7 @@ class MagGyroMisalignment(Effect):
     code = "G3"
     family = "gyro"
     form_share = 1e-4  # its second order
+    turns_sensors = True
     words = "magnetometer and gyro are not aligned"
     equation = "m = A Exp(phi) h + b; the same as a soft iron that is not symmetric"
     parameters = shapes.vector("angle", "rad", 0.01, 0.35)
