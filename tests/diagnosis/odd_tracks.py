@@ -44,6 +44,24 @@ def shaking(seed: int, *, jitter_rad_s: float = 0.05) -> Track:
     rate = np.column_stack([np.interp(time_s, knots, one) for one in slow.T])
     on = np.repeat(rng.random(count // 240) < 0.75, 240)
     rate += jitter_rad_s * on[:, None] * rng.normal(size=(count, 3))
+    return measured(rate, rate_hz, rng)
+
+
+def wobbling(sigma_gyro: float) -> Track:
+    """Five minutes of slow turns that wobble by .2 rad/s, a little less than once a second."""
+    rng, rate_hz = np.random.default_rng(5), 40.0
+    time_s = np.arange(12_000) / rate_hz
+    phase = 2 * np.pi * np.outer(time_s, [0.73, 0.81, 0.9])
+    rate = 0.2 * np.sin(phase) + 0.1 * np.sin(phase / 19.0)
+    return measured(rate, rate_hz, rng, sigma_gyro=sigma_gyro)
+
+
+def measured(
+    rate: np.ndarray, rate_hz: float, rng: np.random.Generator, sigma_gyro: float = SIGMA_GYRO
+) -> Track:
+    """What a sensor reads that turns by rate (N, 3) rad/s."""
+    count = len(rate)
+    time_s = np.arange(count) / rate_hz
     turn = so3.exp(rate / rate_hz)
     field_b = np.empty((count, 3))
     R_nb = np.eye(3)
@@ -52,6 +70,6 @@ def shaking(seed: int, *, jitter_rad_s: float = 0.05) -> Track:
         field_b[k] = R_nb.T @ [0.2, 0.05, 0.45]
     A = np.array([[1.03, 0.02, -0.01], [0.02, 0.96, 0.01], [-0.01, 0.01, 1.01]])
     mag = field_b @ A + [0.05, -0.08, 0.03] + SIGMA_MAG * rng.normal(size=(count, 3))
-    gyro = rate + [2e-3, -1e-3, 1.5e-3] + SIGMA_GYRO * rng.normal(size=(count, 3))
+    gyro = rate + [2e-3, -1e-3, 1.5e-3] + sigma_gyro * rng.normal(size=(count, 3))
     dt_s = np.r_[np.nan, np.diff(time_s)]
     return Track(time_s, dt_s, mag, gyro, None, {}, (slice(0, count),))

@@ -71,6 +71,8 @@ def _groups(track: Track, size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]
 def noise_of(track: Track) -> tuple[float, float]:
     """White noise of one reading, (gauss, rad/s): third differences, per second, the middle one.
 
+    Of the middle axis: a propeller shakes one.
+
     Third differences of white noise have 20 times its variance and take out what is smooth over
     four samples; what motion is left makes both values too large, never too small.
     """
@@ -90,4 +92,4 @@ def _from_differences(track: Track, values: Array) -> float:
             found.append(square / 20.0)
     if not found:
         return 0.0
-    return float(np.sqrt(np.mean(np.median(np.concatenate(found), axis=0))))
+    return float(np.sqrt(np.median(np.median(np.concatenate(found), axis=0))))

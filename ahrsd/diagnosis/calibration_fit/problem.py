@@ -7,17 +7,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ahrsd.diagnosis.calibration_fit.coarse import noise_of
 from ahrsd.diagnosis.calibration_fit.coning import with_delta_angles
 from ahrsd.diagnosis.calibration_fit.delay import earlier, of_magnetometer, without_lag
 from ahrsd.diagnosis.calibration_fit.null import cold_start
-from ahrsd.diagnosis.calibration_fit.shaken import carrying, quieter
+from ahrsd.diagnosis.calibration_fit.shaken import QUIETER, carrying, quieter
 from ahrsd.diagnosis.calibration_fit.thin import thinned, working_factor
 from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
 
-#: samples per working row from which the gyro's noise is taken from the recorded rate
-OVERSAMPLED = 5
 MEAN_RATES = (
     "the gyro's values are means of the rate: how its axis turned within a step (coning) is put in"
 )
@@ -105,8 +104,8 @@ def problem_of(track: Track, spec: Spec) -> tuple[Problem, NullModel]:
     known = noise_of_thinned(spec, averaged, m)
     if (found := quieter(track, work, known, start)) is not None:
         known, start = found
-    elif m >= OVERSAMPLED and spec.sigma_gyro_rad_s is None:
-        # the gyro's differences at the working rate would be its motion
+    elif spec.sigma_gyro_rad_s is None and start.sigma_gyro_rad_s < QUIETER * noise_of(work)[1]:
+        # the gyro's differences at the working rate are its motion's
         known = replace(known, sigma_gyro_rad_s=start.sigma_gyro_rad_s)
     made = Problem(work, known, track, m, cold, averaged=averaged, notes=notes)
     return made, start

@@ -29,7 +29,7 @@ _STEADY = 0.7  # of the usual level, what the quiet seconds of noise are at leas
 _TURNS = 4  # of noise and calibration, found one after the other
 #: noise of the magnetometer over its differences beyond which something else is wrong, and of the
 #: gyro below which its differences were the motion's
-_WRONG, _QUIETER = 1.5, 0.7
+_WRONG, QUIETER = 1.5, 0.7
 
 
 def quieter(
@@ -51,7 +51,7 @@ def quieter(
         if turn > 0 and again.sigma_mag_gauss > most_gauss:
             return None
         model = fit_null(work, known, again, noise=False).model
-    found = model.sigma_gyro_rad_s < _QUIETER * level
+    found = model.sigma_gyro_rad_s < QUIETER * level
     return (known, model) if found else None
 
 

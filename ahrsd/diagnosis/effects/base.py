@@ -92,6 +92,7 @@ class Effect(ABC):
                  what such leave; 0 where hardly any has it
                  (`python tests/benchmarks/diagnosis/bench_remainder_priors.py`)
     ordinary_part: of what real recordings ordinarily leave, the part whose form it is
+    turns_sensors: its three parameters are the turn of the magnetometer against the gyro, rad
     remembers:   the most of what each axis may have from before the recording (setting `memory`),
                  in that setting's unit; 0 where it remembers nothing
     """
@@ -125,6 +126,7 @@ class Effect(ABC):
     of_step: bool = False
     ordinary: float = 0.0
     ordinary_part: str | None = None
+    turns_sensors: bool = False
     remembers: float = 0.0
 
     @property

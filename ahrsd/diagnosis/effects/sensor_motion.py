@@ -213,6 +213,7 @@ class MagGyroMisalignment(Effect):
     identifier = "mag_gyro_misalignment"
     code = "G3"
     family = "gyro"
+    turns_sensors = True
     words = "magnetometer and gyro are not aligned"
     equation = "m = A Exp(phi) h + b; the same as a soft iron that is not symmetric"
     parameters = shapes.vector("angle", "rad", 0.01, 0.35)

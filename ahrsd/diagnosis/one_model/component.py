@@ -135,6 +135,19 @@ class Component:
         """Number of coefficients."""
         return self.columns.width
 
+    def moved_columns(self, share: float) -> Columns:
+        """Its columns by a share of the recording later, their end at the beginning."""
+        mag, gyro = (
+            None if part is None else np.roll(part, round(share * len(part)), axis=0)
+            for part in (self.columns.mag, self.columns.gyro)
+        )
+        return Columns(mag, gyro)
+
+    def moved(self, share: float) -> Component:
+        """A copy at another time: of the same law, with nothing to do with the readings."""
+        key = f"{self.key}, moved by {share}"
+        return replace(self, key=key, columns=self.moved_columns(share))
+
     def lightly(self, context: Context) -> Component:
         """The same, which makes its columns of the context whenever they are asked for."""
         if self.row is None or self.beside:

@@ -40,7 +40,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
 from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, come_and_gone
 from ahrsd.diagnosis.one_model.near_settings import changed, opened
-from ahrsd.diagnosis.one_model.remainder import still_spells
+from ahrsd.diagnosis.one_model.remainder import GYRO_MATRIX, TURNS, still_spells
 from ahrsd.diagnosis.values import Term
 from ahrsd.diagnosis.where_and_when.address import AXES, where_of
 from ahrsd.diagnosis.where_and_when.intervals import departures
@@ -99,6 +99,13 @@ def decided(
         found.append(finding)
         terms.append(term)
         keys.append(key)
+    if (turned := _beyond_ordinary_turn(all_sets, best, library)) is not None:
+        straight = all_sets.judge(best.names - {GYRO_MATRIX}, best)
+        rivals = {**rivals, GYRO_MATRIX: straight}
+        finding, term = _crooked(all_sets, best, best.score - straight.score, turned, library)
+        found.append(finding)
+        terms.append(term)
+        keys.append(GYRO_MATRIX)
     unknown, left = _left(all_sets, space, best, {k: v for k, v in odds.items() if k not in drifts})
     if switching and not left.detected:
         unknown, left = _jumping(all_sets, best, switching[0], odds)
@@ -142,11 +149,44 @@ def _drifting(
     drift, unsure = nearest @ value, np.sqrt(np.square(nearest) @ np.square(deviation))
     kept = {k: v for k, v in setting.items() if k != "searched"}
     shares = _shares(all_sets, space, best, key)
-    shares = {effect.identifier if k == key else k: share for k, share in shares.items()}
+    whole = shares.pop(key) + shares.pop(effect.identifier, 0.0)  # its own form is one of any
+    shares = {effect.identifier: whole, **shares}
     where = _where(all_sets, best, key, effect.frame or effect.family)
     found = _found(effect, shares, where, drift, unsure, kept, odds, library)
     found = replace(found, cost_if_left_out=_cost(all_sets, best, key))
     return found, Term(effect.identifier, drift, unsure, kept)
+
+
+def _beyond_ordinary_turn(
+    all_sets: Hypotheses, best: Hypothesis, library: Mapping[str, Effect]
+) -> Effect | None:
+    """The library's turn between the sensors, where it is beyond what recordings ordinarily have.
+
+    It stands in the gyro's matrix, which every real recording has.
+    """
+    named = {all_sets.component(key).effect for key in best.names}
+    rows = [one for name, one in library.items() if one.turns_sensors and name not in named]
+    if not rows or GYRO_MATRIX not in best.names:
+        return None
+    turn, unsure = (part[TURNS] for part in coefficients(all_sets, best, GYRO_MATRIX))
+    surely = float(np.linalg.norm(turn)) - 2.0 * float(np.linalg.norm(unsure))
+    return rows[0] if surely > priors.CROOKED * priors.ORDINARY_MISALIGNMENT_RAD else None
+
+
+def _crooked(
+    all_sets: Hypotheses, best: Hypothesis, odds: float, effect: Effect,
+    library: Mapping[str, Effect],
+) -> tuple[Finding, Term]:  # fmt: skip
+    """The turn of the gyro's matrix as a finding.
+
+    A gyro that is turned by minus the angle reads as a magnetometer that is turned by it.
+    """
+    turn, unsure = (part[TURNS] for part in coefficients(all_sets, best, GYRO_MATRIX))
+    where = _where(all_sets, best, GYRO_MATRIX, effect.frame or effect.family)
+    shares = {effect.identifier: 1.0}
+    found = _found(effect, shares, where, -turn, unsure, {}, odds, library)
+    found = replace(found, cost_if_left_out=_cost(all_sets, best, GYRO_MATRIX))
+    return found, Term(effect.identifier, -turn, unsure, {})
 
 
 def _switching(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
@@ -341,6 +381,7 @@ def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
 
     Beside something unknown a name has to be the larger part: a source that no law here has leaves
     a rest, and names take that, of either sensor: a gyro's error by force for what slides by it.
+    What takes a rest by a logged column takes it by that column at other times as well.
     """
     one = all_sets.component(key)
     if key == LAG:
@@ -357,8 +398,19 @@ def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     ]  # fmt: skip
     if not unknown:
         return asked
+    if "covariate" in one.setting:
+        return asked + _at_other_times(all_sets, best, key)
     nats = best.score - all_sets.judge(best.names - frozenset(unknown), best).score
     return max(asked, priors.BESIDE_UNKNOWN * nats)
+
+
+def _at_other_times(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
+    """Nats that a member would be worth at the best of other times, 0 at least."""
+    one, fewer = all_sets.component(key), all_sets.judge(all_sets.without(best.names, key), best)
+    copies = [one.moved(share) for share in priors.SHIFTS]
+    all_sets.made.add(copies)
+    scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
+    return max(0.0, *scan.worth([copy.key for copy in copies]).values())
 
 
 def _is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:

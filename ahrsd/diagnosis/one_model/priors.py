@@ -45,6 +45,8 @@ ORDINARY: Mapping[str, Size] = {
 }
 #: of a gyro's matrix: how crooked it sits (1.2 degrees), scales and shears of its axes
 ORDINARY_MISALIGNMENT_RAD, ORDINARY_SCALE = 0.02, 0.012
+#: deviations by which three turns of it are off together in one recording of twenty
+CROOKED = 2.8
 
 #: of a delay between the sensors, s: BROAD 11 ms, a VN-100 by hand 25 to 40, a flight 50 to 100
 ORDINARY_LAG_S = 0.04

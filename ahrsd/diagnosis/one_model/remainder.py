@@ -18,6 +18,8 @@ from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.estimator.locked import harmonics, of_change, on_each_axis, squares
 from ahrsd.samples import Array
 
+#: a gyro's matrix, and of its coefficients the turns: rates have turn x rate more
+GYRO_MATRIX, TURNS = "gyro_matrix", slice(0, 3)
 _GRAVITY = 9.81
 
 
@@ -93,4 +95,4 @@ def gyro_matrix(context: Context) -> Component:
         columns[:, axis, 3 + axis] = w[:, axis]
         columns[:, i, 6 + axis], columns[:, j, 6 + axis] = w[:, j], w[:, i]
     deviation = np.repeat([priors.ORDINARY_MISALIGNMENT_RAD, priors.ORDINARY_SCALE], [3, 6])
-    return Component("gyro_matrix", "gyro", Columns(gyro=columns), Fixed(deviation**2))
+    return Component(GYRO_MATRIX, "gyro", Columns(gyro=columns), Fixed(deviation**2))

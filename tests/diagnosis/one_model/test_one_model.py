@@ -113,6 +113,7 @@ def test_a_gyro_bias_that_walks_is_a_drift_whatever_its_course():
     assert [one.effect for one in found.findings] == ["gyro_bias_drift"]
     assert not found.unexplained.detected
     (drift,) = found.findings
+    assert drift.confidence > 0.99
     assert drift.where.frame == "gyro"
     modes = np.array([p.value for p in drift.parameters]).reshape(-1, 3)
     t = (track.time_s - track.time_s[0]) / track.duration_s

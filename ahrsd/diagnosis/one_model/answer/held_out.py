@@ -25,9 +25,7 @@ from ahrsd.diagnosis.answer.diagnosis import Heldout
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.answer.white_rows import WhiteRows, root_of, white_rows
 from ahrsd.diagnosis.one_model.candidates import averaged
-from ahrsd.diagnosis.one_model.component import MadeAnew
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Names
-from ahrsd.diagnosis.values import Columns
 from ahrsd.samples import Array
 
 #: readings that a stretch has at least
@@ -134,12 +132,11 @@ class HeldOut:
     def _moved(self, key: str, without: Names) -> float:
         """Nats of the best of a member's copies at other times, beside the set without it."""
         rows, one = self.rows(without), self.all_sets.component(key)
-        count = len(self.all_sets.made.point.loud.amplitude)
-        steps = [round(share * count) for share in priors.SHIFTS]
-        copies = rows.passed([_rolled(one.columns, step) for step in steps])
+        moved = [one.moved_columns(share) for share in priors.SHIFTS]
+        copies = rows.passed(moved)
         parts = _beside(self.parts(without), rows, copies)
         known = rows.X.shape[2]
-        cuts = [slice(k * one.width, (k + 1) * one.width) for k in range(len(steps))]
+        cuts = [slice(k * one.width, (k + 1) * one.width) for k in range(len(moved))]
 
         def worth(number: int) -> Array:
             """Nats of each copy on all parts but one."""
@@ -154,7 +151,7 @@ class HeldOut:
             return np.array([averaged(own[cut, cut], left[cut], one) for cut in cuts])
 
         folds = len(parts.rows)
-        without_one = sum((worth(number) for number in range(folds)), np.zeros(len(steps)))
+        without_one = sum((worth(number) for number in range(folds)), np.zeros(len(moved)))
         return float(np.max(folds * worth(folds) - without_one))
 
     def _elsewhere(self, without: Names) -> float:
@@ -217,12 +214,3 @@ def _foretold(parts: _Parts, rows: WhiteRows) -> Foretold:
         own = parts.square[number] - 2 * parts.s[number] @ w + w @ parts.G[number] @ w
         left += float(own)
     return Foretold(total, float(np.exp(rows.log_power)) * left / float(parts.rows.sum()))
-
-
-def _rolled(columns: Columns | MadeAnew, step: int) -> Columns:
-    """The columns so many rows later, their end at the beginning."""
-    mag, gyro = (
-        None if part is None else np.roll(part, step, axis=0)
-        for part in (columns.mag, columns.gyro)
-    )
-    return Columns(mag, gyro)
