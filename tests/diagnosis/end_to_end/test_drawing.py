@@ -64,10 +64,11 @@ def test_a_delay_is_drawn_as_it_is_in_the_recording():
 
 
 @pytest.mark.slow
-def test_all_names_together_gain_what_they_gain_one_by_one_where_they_are_apart():
+def test_all_names_together_gain_more_than_each_and_less_than_their_sum():
+    """Without one of two names the noise takes a part of it as its own."""
     found, _ = answer(("motor_current_field", 0.5), ("gyro_scale", 1.0))
     alone = [x.heldout.nll_gain_per_sample for x in found.findings]
     assert len(alone) == 2
-    assert found.validation.named == pytest.approx(sum(alone), rel=0.2)
+    assert max(alone) < found.validation.named < sum(alone)
     assert found.validation.placebo == max(x.heldout.placebo_gain for x in found.findings)
     assert found.to_json()["validation"]["named"] == found.validation.named

@@ -12,6 +12,7 @@ from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 
 SAMPLES = 5000
+JUMP_GAUSS = 1e-3 * np.array([0.6, -0.5, 0.6])
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +28,7 @@ def track(made):
 @pytest.fixture(scope="module")
 def jumped(made, track):
     """The world's field jumps by a milligauss at 90 s."""
-    jump = 1e-3 * np.array([0.6, -0.5, 0.6])
-    turned = np.swapaxes(fit_null(track).context().R_nb, 1, 2) @ jump
+    turned = np.swapaxes(fit_null(track).context().R_nb, 1, 2) @ JUMP_GAUSS
     read = turned @ true_model(made).soft_iron.T
     later = (track.time_s - track.time_s[0] > 90.0)[:, None]
     return replace(track, mag_b_gauss=track.mag_b_gauss + later * read)
@@ -39,6 +39,8 @@ def test_a_field_that_jumps_has_its_name_and_its_time(jumped):
     found = diagnose(jumped)
     (step,) = found.findings
     assert step.effect == "field_step"
-    assert step.setting["onset_s"] == pytest.approx(90.0, abs=0.5)
+    assert step.setting["onset_s"] == pytest.approx(90.0, abs=2.0)
+    for found_, true in zip(step.parameters, JUMP_GAUSS, strict=True):
+        assert abs(found_.value - true) < 3 * found_.std < 6e-4
     assert step.confidence > 0.9
     assert not found.unexplained.detected

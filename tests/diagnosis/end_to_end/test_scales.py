@@ -125,9 +125,10 @@ def test_a_way_through_a_gradient_is_unknown_where_no_position_is_logged() -> No
 
 
 @pytest.mark.slow
-def test_a_slow_pulsation_may_be_a_way_where_no_position_is_logged() -> None:
-    """Through a field that differs from place to place."""
-    nowhere = diagnose(_pulsed()[0])
-    assert nowhere.findings == ()
-    assert nowhere.unexplained.detected
-    assert nowhere.unexplained.where.frame == "world"
+def test_a_slow_pulsation_is_told_by_its_form_where_no_position_is_logged() -> None:
+    """A way through a gradient is hardly half a wave to the digit: above, it is unknown."""
+    pulsed, setting = _pulsed()
+    (drift,) = diagnose(pulsed).findings
+    assert drift.effect == "geomagnetic_drift"
+    assert drift.setting["length_s"] == pytest.approx(setting["length_s"], rel=0.02)
+    assert drift.setting["turn_deg"] == pytest.approx(setting["turn_deg"], abs=3.0)
