@@ -405,11 +405,13 @@ def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
 
 
 def _at_other_times(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
-    """Nats that a member would be worth at the best of other times, 0 at least."""
-    one, fewer = all_sets.component(key), all_sets.judge(all_sets.without(best.names, key), best)
-    copies = [one.moved(share) for share in priors.SHIFTS]
+    """Nats that a member would be worth once more at the best of other times, 0 at least.
+
+    Beside the member itself: what comes again and again is like itself at other times.
+    """
+    copies = [all_sets.component(key).moved(share) for share in priors.SHIFTS]
     all_sets.made.add(copies)
-    scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
+    scan = beside(all_sets.made, best.keys, best.at)
     return max(0.0, *scan.worth([copy.key for copy in copies]).values())
 
 
