@@ -42,6 +42,8 @@ HALF_A_STEP = 0.1
 def without_lag(track: Track, lag_s: float, *, instants: bool = False) -> Track:
     """The track with a lag of the magnetometer against all else taken out; negative: the gyro's.
 
+    Where columns are logged, readings of before the first of a run are left out.
+
     instants: the gyro's values are rates at instants and not means, which is part of the lag
     """
     moved = delayed_gyro(track, lag_s, instants=instants)
@@ -50,9 +52,18 @@ def without_lag(track: Track, lag_s: float, *, instants: bool = False) -> Track:
     accel = track.accel_b_m_s2
     return replace(
         moved,
+        mag_b_gauss=_after_its_columns(track, lag_s) if track.covariates else track.mag_b_gauss,
         accel_b_m_s2=None if accel is None else earlier(track, accel, lag_s),
         covariates={name: earlier(track, row, lag_s) for name, row in track.covariates.items()},
     )
+
+
+def _after_its_columns(track: Track, lag_s: float) -> Array:
+    """(N, 3) readings without those of a run that are of a time at which nothing was logged yet."""
+    mag = track.mag_b_gauss.copy()
+    for run in series.runs(track.dt_s):
+        mag[run][track.time_s[run] - track.time_s[run.start] < lag_s] = np.nan
+    return mag
 
 
 def of_magnetometer(track: Track, lag_s: float) -> bool:

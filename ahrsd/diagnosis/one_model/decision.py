@@ -238,7 +238,7 @@ def _borne_out(
         if all(best.score - one.score >= asked[key] for key, one in rivals.items()):
             rivals = {key: _without(all_sets, space, best, key) for key in own}
         odds = {key: best.score - rival.score for key, rival in rivals.items()}
-        unsure = [key for key in odds if odds[key] < asked[key]]
+        unsure = [key for key in odds if odds[key] < asked[key] or _is_form(all_sets, best, key)]
         if not unsure:
             fewer = _without_one_moment(all_sets, best, asked)
             if fewer is best:
@@ -265,6 +265,14 @@ def _come_and_gone(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypo
         if likeliest is best:
             return best
         best = likeliest
+
+
+def _is_form(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
+    """Whether of a member only what it leaves of its form is there: it is no name of anything."""
+    if key not in all_sets.forms:
+        return False
+    value, deviation = coefficients(all_sets, best, key)
+    return bool(np.all(np.abs(value) < deviation))
 
 
 def _without_one_moment(

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from effect_motion import moving
+from tracks import experiment, track_of
 
 from ahrsd import so3
 from ahrsd.diagnosis.calibration_fit.delay import (
@@ -121,7 +122,7 @@ def test_all_that_is_logged_beside_a_late_magnetometer_is_as_late() -> None:
     t = track.time_s - 0.05
     inner = np.r_[5:500, 505 : len(t)]
     np.testing.assert_array_equal(moved.gyro_b_rad_s, delayed_gyro(track, 0.05).gyro_b_rad_s)
-    np.testing.assert_array_equal(moved.mag_b_gauss, track.mag_b_gauss)
+    np.testing.assert_array_equal(moved.mag_b_gauss[inner], track.mag_b_gauss[inner])
     current = moved.covariates["motor_current_a"]
     np.testing.assert_allclose(current[inner], 3 + np.sin(0.8 * t[inner]), atol=1e-4)
     assert moved.accel_b_m_s2 is not None
@@ -156,3 +157,16 @@ def test_rates_at_instants_are_drawn_from_value_to_value_and_are_half_a_step_ear
     expected = np.diff(np.interp(earlier_s, fine, turn)) / 0.1
     moved = without_lag(track, lag_s, instants=True).gyro_b_rad_s[1:, 2]
     np.testing.assert_allclose(moved[2:-2], expected[2:-2], atol=1e-5)
+
+
+def test_readings_of_a_time_at_which_no_column_was_logged_yet_are_left_out():
+    """Late by 100 ms at 25 Hz: the first three of each run are of before it."""
+    track = track_of(experiment(samples=500))
+    dt_s = track.dt_s.copy()
+    dt_s[200] = np.nan
+    runs = (slice(0, 200), slice(200, 500))
+    track = replace(track, dt_s=dt_s, runs=runs)
+    for covariates, left_out in (({}, []), ({"lamp_on": np.ones(500)}, [0, 1, 2, 200, 201, 202])):
+        moved = without_lag(replace(track, covariates=covariates), 0.1)
+        unread = np.flatnonzero(np.isnan(moved.mag_b_gauss).any(axis=1))
+        assert unread.tolist() == left_out
