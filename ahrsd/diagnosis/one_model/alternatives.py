@@ -21,23 +21,35 @@ from ahrsd.diagnosis.where_and_when.by_heading import heading_columns
 from ahrsd.estimator.locked import harmonics, on_each_axis
 from ahrsd.samples import Array
 
-BY_RATE, BY_HEADING, QUICK = "free by_rate", "free by_heading", "free quick"
+BY_RATE, BY_TILT = "free by_rate", "free by_tilt"
+BY_HEADING, QUICK = "free by_heading", "free quick"
 #: half waves of a coefficient that is free in time
 _WAVES = 16
 
 
 def other_courses(context: Context) -> list[Component]:
-    """Fields on the sensor that no name has: by its rate of turn, and quick in time."""
+    """Fields on the sensor that no name has: by its rate of turn, by its tilt, quick in time.
+
+    What hangs, slides or levels itself goes by the tilt, where an accelerometer tells that.
+    """
     rate = context.rowwise_rate_b_rad_s
     rate = rate / max(float(np.sqrt(np.mean(np.sum(rate**2, axis=1)))), 1e-12)
     size = np.linalg.norm(rate, axis=1)
-    flat = on_each_axis(np.column_stack([rate, size, size**2]))
+    laws = {BY_RATE: np.column_stack([rate, size, size**2])}
+    if context.world_levelled:
+        down = context.R_nb[:, 2]
+        laws[BY_TILT] = np.column_stack([down, harmonics(down)[:, :5]])
+    found = [_by_law(key, functions) for key, functions in laws.items()]
+    return [*found, course(context, "sensor", quick=QUICK)]
+
+
+def _by_law(key: str, functions: Array) -> Component:
+    """A field of any size on each axis of the sensor by functions (N, k) of its motion."""
+    flat = on_each_axis(functions)
     unit = priors.COURSE_UNIT["sensor"]
     low, high = (np.array([np.log(unit * one)]) for one in priors.COURSE_SIZES)
     law = Sized(np.ones(flat.shape[2]), low, high, mean=float(np.log(unit)))
-    odds = float(np.log(priors.COURSE))
-    by_rate = Component(BY_RATE, "sensor", Columns(mag=flat), law, odds)
-    return [by_rate, course(context, "sensor", quick=QUICK)]
+    return Component(key, "sensor", Columns(mag=flat), law, float(np.log(priors.COURSE)))
 
 
 def by_heading(context: Context) -> Component:

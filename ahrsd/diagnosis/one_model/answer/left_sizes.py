@@ -22,7 +22,7 @@ from ahrsd.diagnosis.answer.added_field import (
 from ahrsd.diagnosis.answer.diagnosis import Component, Ordinary, Unexplained
 from ahrsd.diagnosis.answer.ordinary_text import SIMULATED
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.alternatives import BY_RATE, QUICK, form_keys
+from ahrsd.diagnosis.one_model.alternatives import BY_RATE, BY_TILT, QUICK, form_keys
 from ahrsd.diagnosis.one_model.candidates import beside
 from ahrsd.diagnosis.one_model.component import Fixed
 from ahrsd.diagnosis.one_model.decision import Answer, added_by, coefficients, size_of
@@ -40,6 +40,7 @@ _WORDS = {
     "by_force": "an error of the gyro by force",
     "bending": "a mount that gives",
     BY_RATE: "a field by the rates, free",
+    BY_TILT: "a field by the tilt, free",
     QUICK: "a quick course in time, free (sensor)",
 }
 #: of 95 % of a normal size
