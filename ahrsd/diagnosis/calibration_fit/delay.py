@@ -37,12 +37,13 @@ from ahrsd.samples import Array
 ALIKE, ALIKE_SHARE = 0.25, 0.95
 #: a lag is half a step within this share of it
 HALF_A_STEP = 0.1
+#: s that a magnetometer is ordinarily late at most: BROAD 11 ms, a VN-100 by hand 25 to 40,
+#: a flight 50 to 100
+BEGIN_S = 0.1
 
 
 def without_lag(track: Track, lag_s: float, *, instants: bool = False) -> Track:
     """The track with a lag of the magnetometer against all else taken out; negative: the gyro's.
-
-    Where columns are logged, readings of before the first of a run are left out.
 
     instants: the gyro's values are rates at instants and not means, which is part of the lag
     """
@@ -52,18 +53,22 @@ def without_lag(track: Track, lag_s: float, *, instants: bool = False) -> Track:
     accel = track.accel_b_m_s2
     return replace(
         moved,
-        mag_b_gauss=_after_its_columns(track, lag_s) if track.covariates else track.mag_b_gauss,
         accel_b_m_s2=None if accel is None else earlier(track, accel, lag_s),
         covariates={name: earlier(track, row, lag_s) for name, row in track.covariates.items()},
     )
 
 
-def _after_its_columns(track: Track, lag_s: float) -> Array:
-    """(N, 3) readings without those of a run that are of a time at which nothing was logged yet."""
+def after_columns_begin(track: Track) -> Track:
+    """Without a run's first readings, which a late magnetometer took before columns were logged.
+
+    The same for every lag: models at different lags are compared by the same readings.
+    """
+    if not track.covariates:
+        return track
     mag = track.mag_b_gauss.copy()
     for run in series.runs(track.dt_s):
-        mag[run][track.time_s[run] - track.time_s[run.start] < lag_s] = np.nan
-    return mag
+        mag[run][track.time_s[run] - track.time_s[run.start] < BEGIN_S] = np.nan
+    return replace(track, mag_b_gauss=mag)
 
 
 def of_magnetometer(track: Track, lag_s: float) -> bool:

@@ -9,7 +9,12 @@ import numpy as np
 
 from ahrsd.diagnosis.calibration_fit.coarse import noise_of
 from ahrsd.diagnosis.calibration_fit.coning import with_delta_angles
-from ahrsd.diagnosis.calibration_fit.delay import earlier, of_magnetometer, without_lag
+from ahrsd.diagnosis.calibration_fit.delay import (
+    after_columns_begin,
+    earlier,
+    of_magnetometer,
+    without_lag,
+)
 from ahrsd.diagnosis.calibration_fit.null import cold_start
 from ahrsd.diagnosis.calibration_fit.shaken import QUIETER, carrying, quieter
 from ahrsd.diagnosis.calibration_fit.thin import thinned, working_factor
@@ -90,7 +95,7 @@ def problem_of(track: Track, spec: Spec) -> tuple[Problem, NullModel]:
     cold = cold_start(track, spec)
     told = with_delta_angles(track, cold)
     notes = () if told is track else (MEAN_RATES,)
-    track = told
+    track = after_columns_begin(told)
     m = working_factor(track, carrying(track, cold))
     work = thinned(track, m, cold)
     if not _readings(work):
