@@ -69,10 +69,9 @@ def _groups(track: Track, size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]
 
 
 def noise_of(track: Track) -> tuple[float, float]:
-    """White noise of one reading, (gauss, rad/s): third differences, per second, the middle one.
+    """White noise of one reading, (gauss, rad/s), from third differences.
 
-    Of the middle axis: a propeller shakes one.
-
+    Of the middle second and the middle axis: a jolt is in some seconds, a propeller shakes one axis.
     Third differences of white noise have 20 times its variance and take out what is smooth over
     four samples; what motion is left makes both values too large, never too small.
     """

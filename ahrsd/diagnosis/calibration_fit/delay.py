@@ -40,6 +40,8 @@ HALF_A_STEP = 0.1
 #: s that a magnetometer is ordinarily late at most: BROAD 11 ms, a VN-100 by hand 25 to 40,
 #: a flight 50 to 100
 BEGIN_S = 0.1
+#: part of a run from which on its first readings are too many to be left out.  Chosen, not measured
+BEGIN_SHARE = 0.1
 
 
 def without_lag(track: Track, lag_s: float, *, instants: bool = False) -> Track:
@@ -61,13 +63,16 @@ def without_lag(track: Track, lag_s: float, *, instants: bool = False) -> Track:
 def after_columns_begin(track: Track) -> Track:
     """Without a run's first readings, which a late magnetometer took before columns were logged.
 
-    The same for every lag: models at different lags are compared by the same readings.
+    The same for every lag: models at different lags are compared by the same readings.  A run so
+    short that they are much of it keeps them.
     """
     if not track.covariates:
         return track
     mag = track.mag_b_gauss.copy()
     for run in series.runs(track.dt_s):
-        mag[run][track.time_s[run] - track.time_s[run.start] < BEGIN_S] = np.nan
+        before = track.time_s[run] - track.time_s[run.start] < BEGIN_S
+        if np.mean(before) < BEGIN_SHARE:
+            mag[run][before] = np.nan
     return replace(track, mag_b_gauss=mag)
 
 

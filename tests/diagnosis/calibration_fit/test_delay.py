@@ -171,3 +171,13 @@ def test_readings_of_a_time_at_which_no_column_was_logged_yet_are_left_out():
         begun = after_columns_begin(replace(track, covariates=covariates))
         unread = np.flatnonzero(np.isnan(begun.mag_b_gauss).any(axis=1))
         assert unread.tolist() == left_out
+
+
+def test_a_recording_in_short_bursts_keeps_all_of_its_readings():
+    """Five readings a second, a step of 40 ms apart: the first three would be most of each."""
+    track = track_of(experiment(samples=500))
+    dt_s = track.dt_s.copy()
+    dt_s[::5] = np.nan
+    runs = tuple(slice(k, k + 5) for k in range(0, 500, 5))
+    burst = replace(track, dt_s=dt_s, runs=runs, covariates={"lamp_on": np.ones(500)})
+    np.testing.assert_array_equal(after_columns_begin(burst).mag_b_gauss, track.mag_b_gauss)
