@@ -71,7 +71,7 @@ def _groups(track: Track, size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]
 def noise_of(track: Track) -> tuple[float, float]:
     """White noise of one reading, (gauss, rad/s), from third differences.
 
-    Of the middle second and the middle axis: a jolt is in some seconds, a propeller shakes one axis.
+    Of the middle second and the middle axis: a jolt is short, a propeller shakes one axis.
     Third differences of white noise have 20 times its variance and take out what is smooth over
     four samples; what motion is left makes both values too large, never too small.
     """
