@@ -39,6 +39,8 @@ CALIBRATION = "calibration"
 _BATCH = 96
 #: number of the readings among the batches
 _Y = -1
+#: rows whose products are made at once
+_ROWS = 8192
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,10 +121,11 @@ class Linearised:
         first = {id(one.columns): one for one in reversed(unknown)}
         new = list(reversed(first.values()))
         parts = [Columns(one.columns.mag, one.columns.gyro) for one in new]
+        amplitude = self.point.loud.amplitude[:, None, None]
         for batch in batches(parts, _BATCH):
             cube = sensitivities(self.regressing, joined([parts[k] for k in batch]))
-            rows = by_frequency(cube / self.point.loud.amplitude[:, None, None])
-            self.batches.append(rows.astype(np.float32))
+            rows = by_frequency(np.divide(cube, amplitude, dtype=np.float32, casting="same_kind"))
+            self.batches.append(rows)
             at = 0
             for k in batch:
                 columns = slice(at, at + new[k].width)
@@ -176,6 +179,29 @@ class Linearised:
                 self.blocks[right, left] = np.swapaxes(found, 1, 2)
         return self.blocks[left, right]
 
+    def meet(self, left: Sequence[int], right: Sequence[int]) -> None:
+        """Make the products of two groups of batches together: each is widened to double once."""
+        alike = left is right
+        mine, its = (self._places(one) for one in (left, right))
+        out = np.zeros((len(self.edges) - 1, mine[-1].stop, its[-1].stop))
+        for k, (begin, end) in enumerate(self._bands()):
+            for a in range(begin, end, _ROWS):
+                rows = slice(a, min(end, a + _ROWS))
+                X = self._widened(left, rows)
+                out[k] += X.T @ (X if alike else self._widened(right, rows))
+        for one, own in zip(left, mine, strict=True):
+            for other, part in zip(right, its, strict=True):
+                found = out[:, own, part]
+                self.blocks[one, other] = found
+                self.blocks[other, one] = np.swapaxes(found, 1, 2)
+
+    def _widened(self, numbers: Sequence[int], rows: slice) -> Array:
+        return np.concatenate([self.batches[k][rows] for k in numbers], axis=1, dtype=float)
+
+    def _places(self, numbers: Sequence[int]) -> list[slice]:
+        ends = np.cumsum([0, *(self.batches[k].shape[1] for k in numbers)]).tolist()
+        return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
     def pair(self, left: str, right: str) -> Array:
         """(B, q, q') products of two components, band by band."""
         one, other = self.seen[left], self.seen[right]
@@ -192,6 +218,13 @@ class Linearised:
     def products(self, keys: Sequence[str], step: float) -> Products:
         """All that the data say of these components; step: prior of the noise's spectrum."""
         self._apart(keys)
+        own = [self.seen[key].batch for key in keys]
+        new = [k for k in own if (k, k) not in self.blocks]
+        had = [k for k in own if (k, k) in self.blocks]
+        if new:
+            self.meet(new, new)
+        if new and had:
+            self.meet(new, had)
         ends = np.cumsum([0, *(self.seen[key].component.width for key in keys)])
         parts = [(key, slice(a, b)) for key, (a, b) in zip(keys, itertools.pairwise(ends))]
         G = np.empty((len(self.edges) - 1, ends[-1], ends[-1]))
@@ -220,6 +253,11 @@ class Linearised:
         (q, p) with the model, each other with itself, and (p,) with y
         """
         self._apart(keys)
+        own_batches = [self.seen[key].batch for key in keys]
+        for batch in dict.fromkeys(self.seen[other].batch for other in others):
+            new = [k for k in own_batches if (k, batch) not in self.blocks]
+            if new:
+                self.meet(new, [batch])
         mean: dict[tuple[int, int], Array] = {}
 
         def part(left: str, right: str) -> Array:
