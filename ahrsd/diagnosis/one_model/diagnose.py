@@ -27,6 +27,7 @@ from ahrsd.diagnosis.one_model import rich
 from ahrsd.diagnosis.one_model.answer.whole_answer import whole_answer
 from ahrsd.diagnosis.one_model.column_clocks import wrong_clock
 from ahrsd.diagnosis.one_model.lost_beside import lost_beside, nats
+from ahrsd.diagnosis.one_model.members import nats_of_remainder
 from ahrsd.diagnosis.one_model.recorded_rate import Quick, quick
 from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
 from ahrsd.diagnosis.one_model.search_rounds import Searched, answered
@@ -116,19 +117,41 @@ def _answered(
 def _found(
     problem: Problem, richest: rich.Judged, start: NullFit, library: Mapping[str, Effect]
 ) -> tuple[Searched, Quick]:
-    """The search, and what only the recorded rate shows; with that taken out the search anew."""
+    """The search, and what only the recorded rate shows; with that taken out the search anew.
+
+    A source that is quicker than the working rate is folded by it and looks like what real
+    recordings leave.  Where it is surer than that, and without it nothing of the kind is left, it
+    is the source.
+    """
     found = answered(richest, library)
-    fast = _quick(found, library)
+    real = found.all_sets.is_real(found.answer.best.names)
+    fast = _quick(found, library, real=real)
     if fast.slower is not None:
-        again = fit_null(fast.slower.track, problem.spec, start.model, walk=False)
-        found = answered(rich.richest(fast.slower, again.filtered, library), library)
-        fast = replace(fast, left=_quick(found, library).left)
+        return _without_quick(problem, fast, start, library)
+    if real:
+        instead = _quick(found, library, real=False)
+        left_nats = nats_of_remainder(found.all_sets, found.answer.best)
+        if instead.slower is not None and instead.answer.log_odds > left_nats:
+            again, quickly = _without_quick(problem, instead, start, library)
+            if not again.all_sets.is_real(again.answer.best.names):
+                return again, quickly
     return found, fast
 
 
-def _quick(found: Searched, library: Mapping[str, Effect]) -> Quick:
+def _without_quick(
+    problem: Problem, fast: Quick, start: NullFit, library: Mapping[str, Effect]
+) -> tuple[Searched, Quick]:
+    """The search anew, without what the recorded rate shows."""
+    if fast.slower is None:
+        raise ValueError("nothing was found at the recorded rate")
+    again = fit_null(fast.slower.track, problem.spec, start.model, walk=False)
+    found = answered(rich.richest(fast.slower, again.filtered, library), library)
+    real = found.all_sets.is_real(found.answer.best.names)
+    return found, replace(fast, left=_quick(found, library, real=real).left)
+
+
+def _quick(found: Searched, library: Mapping[str, Effect], *, real: bool) -> Quick:
     answer = found.answer
-    real = found.all_sets.is_real(answer.best.names)
     switches = any(key in found.space.sources for key in answer.unknown)
     nats = answer.unexplained.evidence_nats if switches else 0.0
     return quick(found.all_sets.made, answer.best, library, real=real, source_nats=nats)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis.effects.base import Effect
-from ahrsd.diagnosis.one_model import decision, priors, rich
+from ahrsd.diagnosis.one_model import decision, members, priors, rich
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import LAG, PIECES
 from ahrsd.diagnosis.one_model.linearised import unread
@@ -35,9 +35,9 @@ def answered(found: rich.Judged, library: Mapping[str, Effect]) -> Searched:
     all_sets, space, best = best_at(found, library, (), was_real=True)
     answer = decision.decided(all_sets, space, best, library)
     for _ in range(ROUNDS - 1):
-        before = decision.names_of(all_sets, answer.best)
-        members = [all_sets.component(key) for key in sorted(answer.best.names)]
-        named = [one for one in members if one.effect is not None and one.key != LAG]
+        before = members.names_of(all_sets, answer.best)
+        there = [all_sets.component(key) for key in sorted(answer.best.names)]
+        named = [one for one in there if one.effect is not None and one.key != LAG]
         if not named:
             break
         real = all_sets.is_real(answer.best.names)
@@ -47,7 +47,7 @@ def answered(found: rich.Judged, library: Mapping[str, Effect]) -> Searched:
         found = rich.settled(point, library, named)
         all_sets, space, best = best_at(found, library, named, real)
         answer = decision.decided(all_sets, space, best, library)
-        if decision.names_of(all_sets, answer.best) == before and not spans:
+        if members.names_of(all_sets, answer.best) == before and not spans:
             break
     return Searched(answer, all_sets, space)
 
@@ -122,4 +122,4 @@ def _put(all_sets: Hypotheses, best: Hypothesis, key: str) -> Array:
     columns = all_sets.component(key).columns.mag
     if columns is None:
         return np.zeros((len(all_sets.made.context.track), 3))
-    return np.asarray(columns @ decision.coefficients(all_sets, best, key)[0])
+    return np.asarray(columns @ members.coefficients(all_sets, best, key)[0])

@@ -31,10 +31,10 @@ from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.one_model import priors, rich
 from ahrsd.diagnosis.one_model.candidates import beside
-from ahrsd.diagnosis.one_model.decision import size_of
 from ahrsd.diagnosis.one_model.diagnose import begun, diagnose
 from ahrsd.diagnosis.one_model.effect_components import LAG
 from ahrsd.diagnosis.one_model.evidence import evaluated
+from ahrsd.diagnosis.one_model.members import size_of
 from ahrsd.diagnosis.one_model.search_space import space_at
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import RecordingError

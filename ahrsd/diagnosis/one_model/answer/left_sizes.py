@@ -25,7 +25,8 @@ from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.alternatives import BY_RATE, BY_TILT, QUICK, form_keys
 from ahrsd.diagnosis.one_model.candidates import beside
 from ahrsd.diagnosis.one_model.component import Fixed
-from ahrsd.diagnosis.one_model.decision import Answer, added_by, coefficients, size_of
+from ahrsd.diagnosis.one_model.decision import Answer
+from ahrsd.diagnosis.one_model.members import added_by, coefficients, size_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis
 from ahrsd.samples import Array
 

@@ -9,8 +9,9 @@ import numpy as np
 from ahrsd.diagnosis.answer.diagnosis import Contribution, Drawn
 from ahrsd.diagnosis.calibration_fit.descent import NullFit
 from ahrsd.diagnosis.one_model.answer.visibility import Seen
-from ahrsd.diagnosis.one_model.decision import Answer, added_by, coefficients
+from ahrsd.diagnosis.one_model.decision import Answer
 from ahrsd.diagnosis.one_model.linearised import moved
+from ahrsd.diagnosis.one_model.members import added_by, coefficients
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis
 from ahrsd.diagnosis.one_model.search_rounds import Searched
 from ahrsd.diagnosis.where_and_when.locate import FRAMES, Frame, Located, coarse_cut, single_source

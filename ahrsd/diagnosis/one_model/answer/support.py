@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ahrsd.diagnosis.answer.diagnosis import Finding, Unexplained, Validation
+from ahrsd.diagnosis.one_model.acceptance import asked_odds
 from ahrsd.diagnosis.one_model.answer.held_out import HeldOut
 from ahrsd.diagnosis.one_model.answer.prior_dependence import on_priors
-from ahrsd.diagnosis.one_model.decision import Answer, asked_odds
+from ahrsd.diagnosis.one_model.decision import Answer
 from ahrsd.diagnosis.one_model.model_search import Hypotheses
 
 
@@ -96,10 +97,3 @@ def nearest(answer: Answer, all_sets: Hypotheses) -> tuple[str, ...]:
         f"nearest to a name is {name}: {found.log_odds:+.1f} nats of odds where {asked:.0f} are "
         f"asked, {most:+.1f} at most with half or twice of what was assumed",
     )
-
-
-def nats_of_remainder(all_sets: Hypotheses, answer: Answer) -> float:
-    """By how much likelier an answer is with what recordings ordinarily leave."""
-    best = answer.best
-    without = best.names - frozenset(all_sets.remainder)
-    return 0.0 if without == best.names else best.score - all_sets.judge(without).score

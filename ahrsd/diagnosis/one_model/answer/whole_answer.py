@@ -35,6 +35,7 @@ from ahrsd.diagnosis.one_model.answer.left_sizes import told_sizes
 from ahrsd.diagnosis.one_model.answer.repaired_noise import repaired_noise
 from ahrsd.diagnosis.one_model.decision import Answer
 from ahrsd.diagnosis.one_model.logged_columns import as_recorded
+from ahrsd.diagnosis.one_model.members import nats_of_remainder
 from ahrsd.diagnosis.one_model.recorded_rate import Quick
 from ahrsd.diagnosis.one_model.search_rounds import Searched
 from ahrsd.diagnosis.values import Term
@@ -75,7 +76,7 @@ def whole_answer(
     if not left.detected:
         left = support.what_is_left(fast.answer, quickly)
     left = _with_channels(left, found, courses)
-    remainder_nats = support.nats_of_remainder(all_sets, answer)
+    remainder_nats = nats_of_remainder(all_sets, answer.best)
     left = told_sizes(all_sets, answer, left, remainder_nats, simulated=simulated)
     left = max(left, fast.hum, key=lambda one: (one.detected, one.evidence_nats))
     loud = _loud(found, fast, asked.facts, told, spec_given=spec_given)
