@@ -32,6 +32,8 @@ _BESIDE = ", beside the delay"
 _ALIKE = 1e-3
 #: parts in which the transition of a step is free
 PIECES = 20
+#: pieces of a pulse's form
+PULSE_PIECES = 12
 #: of a component's power beyond another that is rounding: no reading tells the two
 TO_THE_DIGIT = 1e-12
 #: s between the times at which a logged cause is tried
@@ -210,14 +212,17 @@ def neighbours(setting: Setting, duration_s: float, round_: int) -> list[Setting
 def form_of(known: Component, context: Context, library: Mapping[str, Effect]) -> Component | None:
     """What an effect leaves of its form; None where nothing is known of that.
 
-    A step takes its time: within some seconds of its onset the source may be at any size.  A cause
-    that changes quickly is logged late, or as a mean of some time: its change in time.
+    A step takes its time: within some seconds of its onset the source may be at any size.  What
+    comes once a period may swell and fade.  A cause that changes quickly is logged late, or as a
+    mean of some time: its change in time.
     """
     law = known.law
     if not isinstance(law, Sized):
         return None
     if known.jumps:
         return _way_of(known, law, context, cast("Frame", known.frame))
+    if "period_s" in known.setting:
+        return _swelling(known, law, context, cast("Frame", known.frame))
     effect = library.get(known.effect or "")
     if effect is None or len(in_time(context, effect, known.setting)) == 1:
         return None
@@ -255,6 +260,21 @@ def _way_of(known: Component, law: Sized, context: Context, frame: Frame) -> Com
     sized = Sized(np.full(columns.width, float(law.scale[0])), law.low, law.high)
     moments = {name: known.setting[name] for name in MOMENTS if name in known.setting}
     return Component(f"form of {known.key}", frame, columns, sized, setting=moments)
+
+
+def _swelling(known: Component, law: Sized, context: Context, frame: Frame) -> Component:
+    """Of pulses: pieces of a period, from a width before to one behind, along each axis."""
+    setting = known.setting
+    piece_s = 3.0 * setting["width_s"] / PULSE_PIECES
+
+    def inside() -> Array:
+        first_s = setting["start_s"] + setting["phase_s"] - setting["width_s"]
+        piece = ((context.track.time_s - first_s) % setting["period_s"] / piece_s).astype(int)
+        return np.asarray(piece[:, None] == np.arange(PULSE_PIECES), dtype=float)
+
+    columns = in_frame(context, frame, inside, PULSE_PIECES)
+    sized = Sized(np.full(columns.width, float(law.scale[0])), law.low, law.high)
+    return Component(f"form of {known.key}", frame, columns, sized)
 
 
 def while_there(

@@ -18,7 +18,8 @@ from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 from ahrsd.diagnosis.one_model import decision, noise_model, priors, rich
-from ahrsd.diagnosis.one_model.effect_components import component
+from ahrsd.diagnosis.one_model.component import Component
+from ahrsd.diagnosis.one_model.effect_components import component, form_of
 from ahrsd.diagnosis.one_model.linearised import (
     CALIBRATION,
     Linearised,
@@ -107,17 +108,23 @@ def _searched_in(
     fast: Linearised, library: Mapping[str, Effect], starts: Sequence[Names], *, real: bool
 ) -> tuple[Linearised, Hypotheses, Space, Hypothesis]:
     """The likeliest set in one form of the noise.  starts: sets beside the empty one."""
-    candidates = {}
+    candidates: dict[str, list[str]] = {}
+    forms: dict[str, Component] = {}
     for name, effect in library.items():
         settings = effect.settings(fast.context) if effect.quick else ()
         settings = tuple(one for one in settings if "covariate" in one or not real)
         parts = [component(fast.context, effect, one, len(settings)) for one in settings]
+        unlogged = [one for one in parts if "covariate" not in one.setting]
+        left = [(one.key, form_of(one, fast.context, library)) for one in unlogged]
+        forms |= {key: form for key, form in left if form is not None}
         fast.add(parts)
         if parts:
             candidates[name] = [one.key for one in parts]
     step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN
     noise = rich.fitted(fast, (CALIBRATION,), step).log_noise
-    all_sets = Hypotheses(fast, (), noise, {}, real=real)
+    fast.add(list(forms.values()))
+    known = {key: form.key for key, form in forms.items()}
+    all_sets = Hypotheses(fast, (), noise, {}, known, real=real)
     space = Space(
         candidates, (), lambda *_: [], lambda *_: [], lambda _: None, lambda _: [], lambda *_: []
     )

@@ -40,9 +40,13 @@ def test_a_mount_that_bends_more_and_more_has_none(track: Track) -> None:
 
 @pytest.mark.slow
 def test_a_mount_that_bends_fast_and_then_stays_is_no_crowd_of_names(track: Track) -> None:
+    """It has its mean turn, and beside it something unknown: how it came to that."""
     warmth = 1.0 - np.exp(-3.0 * np.linspace(0.0, 1.0, len(track)))[:, None]
-    found = diagnose(turned(track, warmth * np.array([12e-3, -8e-3, 10e-3])))
-    assert found.findings == ()
+    turns_rad = warmth * np.array([12e-3, -8e-3, 10e-3])
+    found = diagnose(turned(track, turns_rad))
+    assert [one.effect for one in found.findings] == ["mag_gyro_misalignment"]
+    values = [one.value for one in found.findings[0].parameters]
+    assert values == pytest.approx(turns_rad.mean(axis=0), abs=1.5e-3)
     assert found.unexplained.detected
 
 

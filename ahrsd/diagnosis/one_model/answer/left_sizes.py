@@ -22,7 +22,7 @@ from ahrsd.diagnosis.answer.added_field import (
 from ahrsd.diagnosis.answer.diagnosis import Component, Ordinary, Unexplained
 from ahrsd.diagnosis.answer.ordinary_text import SIMULATED
 from ahrsd.diagnosis.one_model import priors
-from ahrsd.diagnosis.one_model.alternatives import BY_RATE, BY_TILT, QUICK, form_keys
+from ahrsd.diagnosis.one_model.alternatives import BY_HEADING, BY_RATE, BY_TILT, QUICK, form_keys
 from ahrsd.diagnosis.one_model.candidates import beside
 from ahrsd.diagnosis.one_model.component import Fixed
 from ahrsd.diagnosis.one_model.decision import Answer
@@ -40,10 +40,13 @@ _WORDS = {
     "gyro_matrix": "a crooked gyro with scales of its own",
     "by_force": "an error of the gyro by force",
     "bending": "a mount that gives",
-    BY_RATE: "a field by the rates, free",
-    BY_TILT: "a field by the tilt, free",
-    QUICK: "a quick course in time, free (sensor)",
+    BY_RATE: "a field by the rates",
+    BY_TILT: "a field by the tilt",
+    BY_HEADING: "a field by the heading",
+    QUICK: "a quick course in time on the sensor",
 }
+#: what has a course in time, by its frame
+_COURSES = {"sensor": "on the sensor", "world": "of the field outside", "gyro": "of the gyro"}
 #: of 95 % of a normal size
 _WITHIN = 1.96
 
@@ -123,9 +126,8 @@ def _words(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
         return f"what {effect} stands in for"
     if one.row is not None:
         return f"one of the steps of a source that changes ({effect})"
-    return _WORDS.get(
-        key.removeprefix("free "), f"a course in time, free ({all_sets.component(key).frame})"
-    )
+    words = _WORDS.get(key) or _WORDS.get(key.removeprefix("free "))
+    return words or f"a course in time {_COURSES[one.frame]}"
 
 
 def _together(limits: Sequence[float]) -> float:
