@@ -20,6 +20,7 @@ from ahrsd.diagnosis.one_model.effect_components import (
     LAG,
     LAG_FORM,
     TO_THE_DIGIT,
+    delay_form,
     holds,
     plain_delay,
 )
@@ -157,7 +158,8 @@ def _which_delay(
 ) -> dict[str, float]:  # fmt: skip
     """Which delay it is, with probabilities, that which is told first.
 
-    A filter's where its form is there in full; half a step's where the delay is that and no other.
+    A filter's is as likely before the readings as any other, and told first only where its form is
+    surely there; half a step's where the delay is that and no other.
     """
     tau, unsure = float(lag_s[0]), float(deviation_s[0])
     late = cast("Effect", all_sets.component(LAG).row)
@@ -165,11 +167,9 @@ def _which_delay(
     nats = {plain.identifier: 0.0}
     half_s = _half_step_s(all_sets)
     for row in library.values() if tau > 0.0 else ():
-        if row.filters and LAG_FORM in best.keys:
-            value, deviation = (float(one[0]) for one in coefficients(all_sets, best, LAG_FORM))
-            whole = 0.5 * ((value / deviation) ** 2 - ((value - 1.0) / deviation) ** 2)
-            full = abs(value - 1.0) < max(2.0 * deviation, priors.NEARLY_ALL)
-            nats[row.identifier] = whole - priors.ODDS_REAL if full else -np.inf
+        if row.filters:
+            whole = _nats_of_filter(all_sets, best, tau)
+            nats[row.identifier] = whole if whole > priors.ODDS_REAL else min(whole, 0.0)
         elif row.of_step and half_s is not None:
             miss, usual = (tau - half_s) / unsure, tau / priors.ORDINARY_LAG_S
             point = 0.5 * (usual**2 - miss**2) + float(np.log(priors.ORDINARY_LAG_S / unsure))
@@ -177,6 +177,23 @@ def _which_delay(
     total = np.logaddexp.reduce(list(nats.values()))
     shares = {name: float(np.exp(one - total)) for name, one in nats.items()}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
+
+
+def _nats_of_filter(all_sets: Hypotheses, best: Hypothesis, tau: float) -> float:
+    """What the readings say for all of a delay being a filter's against none of it; -inf of a part.
+
+    Where the readings hardly show a filter's form, next to nothing.
+    """
+    if LAG_FORM in best.keys:
+        value, deviation = (float(one[0]) for one in coefficients(all_sets, best, LAG_FORM))
+    else:
+        form = delay_form(all_sets.made.context, tau)
+        scan = beside(all_sets.made, best.keys, best.at)
+        value, deviation = (float(one[0]) for one in scan.likeliest(form))
+    shown = max(deviation**-2 - priors.LAG_IS_FILTER**-2, 1e-9)  # without what was believed before
+    part = value / (deviation**2 * shown)
+    full = abs(part - 1.0) < max(2.0 / np.sqrt(shown), priors.NEARLY_ALL)
+    return shown * (part - 0.5) if full else -np.inf
 
 
 def _half_step_s(all_sets: Hypotheses) -> float | None:

@@ -205,7 +205,7 @@ def _levels(context: Context, frame: Frame, moments: Sequence[int]) -> Component
     odds = float(np.log(priors.COURSE * _share(frame))) - lasting / priors.BETWEEN_S
     odds += len(moments) * float(np.log(lasting / len(time_s) / priors.BETWEEN_S))
     key = f"{frame} that changes {len(moments)} times from {edges[1]:.3f} s on"
-    return Component(key, frame, columns, law, odds)
+    return Component(key, frame, columns, law, odds, setting={"edges_s": tuple(edges.tolist())})
 
 
 def likeliest_states(square: Array, count: Array, piece_s: float) -> tuple[NDArray[np.bool], float]:

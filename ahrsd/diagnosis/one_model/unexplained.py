@@ -94,9 +94,17 @@ def _other(all_sets: Hypotheses, best: Hypothesis, keys: Sequence[str], odds: fl
     turned = np.einsum("nia,ni->na", unit_columns(context, cast("Frame", one.frame)), added)
     time_s = context.track.time_s
     at = np.linspace(time_s[0], time_s[-1], _PIECES)
-    course = np.column_stack([np.interp(at, time_s, column) for column in turned.T])
-    whole = ((float(time_s[0]), float(time_s[-1])),)
-    return _described(at, course, one.frame, odds, one.setting.get("spans_s", whole))
+
+    def drawn(times_s: Array) -> Array:
+        return np.column_stack([np.interp(times_s, time_s, column) for column in turned.T])
+
+    spans = one.setting.get("spans_s", ((float(time_s[0]), float(time_s[-1])),))
+    if "edges_s" in one.setting:  # where its levels are not the usual one
+        edges = np.array(one.setting["edges_s"])
+        levels = drawn((edges[1:] + edges[:-1]) / 2)
+        unsure = float(np.max(coefficients(all_sets, best, keys[0])[1]))
+        spans = tuple(departures(edges, levels, np.full(len(levels), unsure)))
+    return _described(at, drawn(at), one.frame, odds, spans)
 
 
 def _described(
