@@ -159,10 +159,11 @@ def test_a_turned_magnetometer_is_found(bench, kind):
     np.testing.assert_allclose(answer.correction.offset, run.hard_iron_gauss, atol=1.5e-3)
 
 
-def test_no_misalignment_is_no_evidence(bench):
+@pytest.mark.parametrize("seeds", [2, pytest.param(5, marks=pytest.mark.slow)])
+def test_no_misalignment_is_no_evidence(bench, seeds):
     answers = [
         misalignment_of(bench, bench.simulate("mam", "rov", seed, samples=5000))
-        for seed in range(5)
+        for seed in range(seeds)
     ]
     assert not any(answer.significant for answer in answers)
     assert 0.2 < np.mean([answer.chi2 for answer in answers]) / 3 < 3.0
