@@ -341,7 +341,10 @@ def test_rotations_are_carried_along():
 
 @pytest.mark.parametrize(
     "name",
-    ["01_undisturbed_slow_rotation_A", "02_undisturbed_slow_rotation_B"],
+    [
+        pytest.param("01_undisturbed_slow_rotation_A", marks=pytest.mark.slow),
+        "02_undisturbed_slow_rotation_B",
+    ],
 )
 @pytest.mark.recordings
 def test_real_motion_is_silent_and_an_injected_step_is_told(name):
