@@ -156,6 +156,7 @@ def test_a_run_and_its_replay_decide_the_same(tmp_path):
     assert len(live.stream.gaps) == 0
 
 
+@pytest.mark.slow  # the quick one: a demo and its replay, in demo/test_demo.py
 def test_through_a_whole_write_back_with_approval(tmp_path):
     config = config_for(tmp_path, mode="stage")
     port = tmp_path / "vn100"

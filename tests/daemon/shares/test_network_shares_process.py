@@ -191,7 +191,7 @@ def test_readers_in_passive_get_every_byte_and_the_device_hears_none_of_theirs(v
 
 
 def test_a_device_that_is_unplugged_leaves_the_readers_and_comes_back_to_them(vehicle):
-    run = vehicle("observe", faults=("unplug@20",))
+    run = vehicle("observe", faults=("unplug@10",))
     raw, corrected = run.reader(run.raw), run.reader(run.corrected)
     run.until(lambda: any(not r["device_present"] for r in corrected.records("state")))
     gone = next(r for r in corrected.records("state") if not r["device_present"])
