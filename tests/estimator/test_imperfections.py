@@ -105,7 +105,7 @@ def test_what_the_instrument_has_is_within_the_sigmas(trouble, motion, seeds):
     [
         (("roll", 100.0),),
         pytest.param((("roll", 60.0), ("circles", 60.0)), marks=pytest.mark.slow),
-        (("circles", 100.0), ("pitch", 40.0)),
+        pytest.param((("circles", 100.0), ("pitch", 40.0)), marks=pytest.mark.slow),
     ],
     ids=["roll", "roll, circles", "circles, pitch"],
 )

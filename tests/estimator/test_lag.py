@@ -71,7 +71,7 @@ def test_where_there_is_no_lag_none_is_found(bench, seeds):
 
 @pytest.mark.parametrize("factor", [pytest.param(0.75, marks=pytest.mark.slow), 1.1])
 def test_times_or_units_that_are_wrong_are_no_answer(bench, factor):
-    run = bench.simulate("mam", "rov", 2, samples=5000)
+    run = bench.simulate("mam", "rov", 2, samples=3500)
     gyro = run.block.gyro_b_rad_s * factor
     found = answer(bench, replace(run, block=replace(run.block, gyro_b_rad_s=gyro)))
     assert found.gyro_misscaled == pytest.approx(1 / factor - 1, abs=0.06)
@@ -114,11 +114,12 @@ def test_a_rate_across_a_cut_is_that_of_the_side_that_is_linked():
     np.testing.assert_allclose(rates(data)[:, 0], [1.0, 1.0, 3.0, 3.0])
 
 
+@pytest.mark.slow
 @pytest.mark.recordings
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param("02_undisturbed_slow_rotation_B", marks=pytest.mark.slow),
+        "02_undisturbed_slow_rotation_B",
         "21_undisturbed_fast_combined",
     ],
 )

@@ -57,13 +57,14 @@ def test_iron_that_stays_is_not_divided(bench, kind):
         assert answer(bench, run)[0].restarted_s is None
 
 
+@pytest.mark.slow  # one of them, quick: the next test
 @pytest.mark.recordings
 @pytest.mark.parametrize(
     "name",
     [
         "36_disturbed_attached_magnet_5cm",
-        pytest.param("32_disturbed_attached_magnet_1cm", marks=pytest.mark.slow),
-        pytest.param("34_disturbed_attached_magnet_3cm", marks=pytest.mark.slow),
+        "32_disturbed_attached_magnet_1cm",
+        "34_disturbed_attached_magnet_3cm",
     ],
 )
 def test_a_magnet_that_was_taken_off_again(name):
