@@ -29,7 +29,7 @@ def turned(track: Track, angle_rad: np.ndarray) -> Track:
 
 
 def test_a_mount_that_stays_crooked_has_a_name() -> None:
-    track = driven(4000)
+    track = driven(3000)
     found = diagnose(turned(track, np.full((len(track), 3), 3e-3)))
     assert [one.effect for one in found.findings] == ["mag_gyro_misalignment"]
     assert not found.unexplained.detected
