@@ -77,7 +77,8 @@ def test_a_steady_line_is_named_though_its_copies_are_itself(tmp_path):
     assert min(one.confidence for one in found.findings) > 0.5
 
 
-@pytest.mark.parametrize("case", ["9e11d227", pytest.param("ccdde21f", marks=pytest.mark.slow)])
+@pytest.mark.slow  # a shorter form: diagnosis/innovation_filter/test_noise
+@pytest.mark.parametrize("case", ["9e11d227", "ccdde21f"])
 def test_bursts_of_noise_leave_no_unknown(case, tmp_path):
     found, _ = answered("ring600b", case, tmp_path)
     assert [one.effect for one in found.findings] == ["noise_burst"]

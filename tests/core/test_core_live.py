@@ -32,13 +32,13 @@ from drivers.vn100.emulator.pty import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
 
 SPEED = 15.0  # a disk that takes 0.3 s to sync must not look like one that hangs
-BAUD, RATE_HZ = 115200, 50
+BAUD = 115200
 #: a quiet machine takes half a minute, and what a busy one has not proven by then it never will
 GIVEN_UP_S = 240.0
 pytestmark = pytest.mark.timeout(600)
 EASY_TRIAL = {"max_spread_percent": 100.0, "max_jump_deg": 180.0}
 MOTION = (("static", 12.0), ("tumble", 1000.0))
-SCENE = Setup("rov", seed=2, output="binary", rate_hz=RATE_HZ, baud=BAUD, motion=MOTION)
+SCENE = Setup("rov", seed=2, output="binary", rate_hz=25, baud=BAUD, motion=MOTION)
 
 
 class AlwaysSafe:
@@ -156,6 +156,7 @@ def test_a_run_and_its_replay_decide_the_same(tmp_path):
     assert len(live.stream.gaps) == 0
 
 
+@pytest.mark.slow  # the quick one: a demo and its replay, in demo/test_demo.py
 def test_through_a_whole_write_back_with_approval(tmp_path):
     config = config_for(tmp_path, mode="stage")
     port = tmp_path / "vn100"
@@ -175,7 +176,7 @@ def test_through_a_whole_write_back_with_approval(tmp_path):
 
 def test_through_replugs_resets_and_damage(tmp_path):
     faults = ("unplug=0@20+2", "reset@45", "bit_flip=0.0005@60+5", "byte_drop=0.0005@70+5")
-    scene = Setup("rov", seed=2, output="binary", rate_hz=RATE_HZ, baud=BAUD, faults=faults)
+    scene = Setup("rov", seed=2, output="binary", rate_hz=50, baud=BAUD, faults=faults)
     config = config_for(tmp_path, mode="stage")
     port = tmp_path / "vn100"
     with EmulatorProcess(scene, link=port, speed=SPEED, lossless=True):

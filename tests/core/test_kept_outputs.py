@@ -131,7 +131,7 @@ def test_a_record_is_written_before_the_first_change_and_one_behind_the_last():
     assert outputs(run.emulator.memory.ram) == outputs(run.emulator.memory.flash)
 
 
-@pytest.mark.parametrize("output", ["ascii", "binary"])
+@pytest.mark.parametrize("output", [pytest.param("ascii", marks=pytest.mark.slow), "binary"])
 def test_a_kill_at_any_moment_of_the_set_up_leaves_the_users_outputs(output):
     """A run is killed after n steps, for one n after the other; each next one ends orderly."""
     run = world(output=output, rate_hz=20)

@@ -73,7 +73,7 @@ def said(time_s, field, gyro, rows=10):
 
 @pytest.mark.parametrize("kind", ["rest", "planar", "3D"])
 @pytest.mark.parametrize(
-    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 5))]
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 5))]
 )
 def test_a_sound_sensor_is_not_spoken_of(kind, seed):
     checks, told = said(*stream(kind, seed=seed))

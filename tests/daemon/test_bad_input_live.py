@@ -221,7 +221,9 @@ def importer(name):
     return module
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
+)
 def test_a_signal_ends_the_command_in_time_with_everything_put_back(emulated, tmp_path, number):
     config = tmp_path / "ahrsd.toml"
     config.write_text(

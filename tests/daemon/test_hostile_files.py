@@ -94,7 +94,11 @@ def test_a_word_that_ends_in_a_trial_undoes_it_whatever_else_hangs(program, tmp_
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param("columns", marks=pytest.mark.slow), "operator's word", "journal"]
+    "name",
+    [
+        *(pytest.param(one, marks=pytest.mark.slow) for one in ("columns", "operator's word")),
+        "journal",
+    ],
 )
 def test_a_fifo_at_any_path_of_others_stops_neither_stream_nor_stop(program, tmp_path, name):
     columns = tmp_path / "columns.json"
@@ -128,9 +132,11 @@ def test_dev_full_as_journal_writes_nothing_and_stops_nothing(program):
 @pytest.mark.parametrize(
     "place",
     [
-        "capture directory",
         "state directory",
-        *(pytest.param(one, marks=pytest.mark.slow) for one in ("config", "model")),
+        *(
+            pytest.param(one, marks=pytest.mark.slow)
+            for one in ("capture directory", "config", "model")
+        ),
     ],
 )
 def test_a_fifo_where_a_start_reads_ends_in_one_line(program, tmp_path, place):

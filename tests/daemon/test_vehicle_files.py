@@ -91,9 +91,9 @@ def until(process, condition):
 @pytest.mark.parametrize(
     ("key", "kind"),
     [
-        ("interlock", "a FIFO"),
         ("terms", "a folder"),
         ("interlock", "a device"),
+        pytest.param("interlock", "a FIFO", marks=pytest.mark.slow),  # quick: test_hostile_files
         pytest.param("terms", "a FIFO", marks=pytest.mark.slow),
         pytest.param("interlock", "a folder", marks=pytest.mark.slow),
         pytest.param("terms", "a device", marks=pytest.mark.slow),

@@ -19,6 +19,7 @@ from ahrsd.core.warm_start import CONFIRM_S, Present, WarmStart, too_old
 from ahrsd.daemon.daemon import Recall
 from ahrsd.offline.replay import replay
 from ahrsd.recording import capture
+from ahrsd.recording.capture import CaptureReader, Sent
 from ahrsd.recording.earlier_run import earlier_inputs
 from ahrsd.samples import SampleBlock
 from ahrsd.telemetry.status import LinkFacts, StatusMaker
@@ -51,18 +52,32 @@ def recorded(folder, scene=SCENE, **tables):
 # -- a run that was killed -------------------------------------------------------------------------
 
 
+def up_to(at_s, whole, folder):
+    """The run as it was then: its capture so far, and the device, to which nothing was written."""
+    run = recorded(folder, HALF)
+    run.emulator.advance(at_s)
+    run.now_s = at_s
+    for item in CaptureReader(whole.path):
+        if item.host_ns > run.now_ns:
+            break
+        if isinstance(item, Sent):
+            run.writer.write_sent(item.host_ns, item.data)
+        else:
+            run.writer.write(item)
+    return run
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """One that goes on for `MORE_S` after `DRIVEN_S`, and one that is killed then."""
     whole = recorded(tmp_path_factory.mktemp("whole"), HALF)
     whole.run(DRIVEN_S + 2.0 + MORE_S)
-    killed = recorded(tmp_path_factory.mktemp("killed"), HALF)
-    killed.run(DRIVEN_S)
-    first_s = killed.qualified_s
+    whole.writer.close()
+    killed = up_to(1.0 + DRIVEN_S, whole, tmp_path_factory.mktemp("killed"))
     killed.again(2.0)
     killed.run(MORE_S)
     killed.writer.close()
-    return whole, killed, first_s - 1.0
+    return whole, killed, whole.qualified_s - 1.0
 
 
 def test_a_run_that_was_killed_has_its_candidate_soon(runs):

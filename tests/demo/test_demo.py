@@ -81,7 +81,6 @@ def test_the_journal_tells_the_whole_way(done):
     assert {*records[0]["new"]} == {"23", "84"}
 
 
-@pytest.mark.slow
 def test_a_replay_takes_the_same_decisions(done):
     directory, result, *_ = done
     replayed = replay(directory / "capture.mcap", Config())
@@ -194,7 +193,7 @@ def test_an_output_below_a_file_is_one_line(tmp_path, run, capsys):
 
 
 def test_a_demo_without_enough_time_says_no(tmp_path, run, capsys):
-    assert run("demo", "--output", tmp_path, "--seconds", "90", "--seed", "3") == 1
+    assert run("demo", "--output", tmp_path, "--seconds", "60", "--seed", "3") == 1
     out = capsys.readouterr().out
     assert "The demo did not reach its goal: it ended in " in out
     assert "NOT what was approved" in out

@@ -151,11 +151,18 @@ def usual(tmp_path_factory):
     return folder / "report.html"
 
 
+@pytest.fixture
+def unprinted(monkeypatch):
+    """Pictures are drawn and not printed, which takes a page seconds: of its words only."""
+    monkeypatch.setattr("ahrsd.report.figures.as_data_uri", lambda draw: draw() and "data:,")
+
+
 def test_the_page_tells_how_an_effect_was_read(usual):
     text = usual.read_text()
     assert "by the column motor_&lt;1&gt;_a; logged 0.25 s late; each value the mean of" in text
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_a_spectrum_that_is_worse_after_says_so(tmp_path):
     found = diagnosis()
     drawn = found.drawn
@@ -172,7 +179,8 @@ def test_a_spectrum_that_is_worse_after_says_so(tmp_path):
     assert "farther from 1" not in page_of(replace(found, drawn=better), tmp_path)
 
 
-def test_a_longer_grey_bar_is_explained(tmp_path, usual):
+@pytest.mark.usefixtures("unprinted")
+def test_a_longer_grey_bar_is_explained(usual, tmp_path):
     found = diagnosis()
     assert "A longer grey bar" not in usual.read_text()
     longer = replace(found.drawn, evidence={"motor_current_field": 80.0, "hysteresis": 300.0})
@@ -181,6 +189,7 @@ def test_a_longer_grey_bar_is_explained(tmp_path, usual):
     )
 
 
+@pytest.mark.usefixtures("unprinted")
 @pytest.mark.parametrize(("size", "real"), [(0.5e-3, False), (5e-3, True)])
 def test_what_stays_in_its_own_band_is_not_called_real(tmp_path, size, real):
     edges = tuple(np.linspace(0.0, 333.0, 11))

@@ -72,6 +72,7 @@ def beyond(made, found):
     return float(np.max(np.abs(made.errors(found)[6:9]) / found.sigma[6:9]))
 
 
+@pytest.mark.parametrize("seeds", [4, pytest.param(6, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("trouble", "motion"),
     [
@@ -83,19 +84,19 @@ def beyond(made, found):
         pytest.param(turned, LEVEL, id="turned-level"),
     ],
 )
-def test_what_the_instrument_has_is_within_the_sigmas(trouble, motion):
+def test_what_the_instrument_has_is_within_the_sigmas(trouble, motion, seeds):
     """Taken for perfect, it makes answers that are wrong by many of their sigmas.
 
     Not in each: scales that the motion cannot tell from a hard iron stay unseen, and that an
     instrument as its maker calibrated it has none of that size is believed then.
     """
     perfect, known = [], []
-    for seed in range(6):
+    for seed in range(seeds):
         made = pieces.drive(motion, seed)
         gyro = troubled(made, trouble(seed))
         perfect.append(beyond(made, answer(made, gyro, pieces.IDEAL)))
         known.append(beyond(made, answer(made, gyro)))
-    assert sum(np.array(perfect) > 3.0) >= 3
+    assert sum(np.array(perfect) > 3.0) >= seeds / 2
     assert sum(np.array(known) > 3.0) <= 1
 
 
@@ -104,7 +105,7 @@ def test_what_the_instrument_has_is_within_the_sigmas(trouble, motion):
     [
         (("roll", 100.0),),
         pytest.param((("roll", 60.0), ("circles", 60.0)), marks=pytest.mark.slow),
-        (("circles", 100.0), ("pitch", 40.0)),
+        pytest.param((("circles", 100.0), ("pitch", 40.0)), marks=pytest.mark.slow),
     ],
     ids=["roll", "roll, circles", "circles, pitch"],
 )
@@ -404,15 +405,16 @@ LEVEL_AND_LEANING = (("circles", 120.0), ("roll", 40.0), ("pitch", 40.0), ("circ
 CIRCLES = (("circles", 160.0),)
 
 
+@pytest.mark.parametrize("seeds", [4, pytest.param(8, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "motion",
     [CIRCLES, pytest.param(LEVEL, marks=pytest.mark.slow), LEVEL_AND_LEANING],
     ids=["c", "l", "ll"],
 )
-def test_a_field_that_differs_with_the_heading_is_within_the_sigmas(motion):
+def test_a_field_that_differs_with_the_heading_is_within_the_sigmas(motion, seeds):
     """What of it is the same on all headings is taken for hard iron, and no fit shows that."""
     off = []
-    for seed in range(8):
+    for seed in range(seeds):
         made = at_a_place(pieces.drive(motion, seed), seed, 5e-3)
         found = answer(made)
         off.append(beyond(made, found))

@@ -60,11 +60,16 @@ def named_mg(found):
     return head, float(tail.split()[0])
 
 
-@pytest.mark.parametrize("motion", [RICH, LEVEL], ids=["rich", "level"])
 @pytest.mark.parametrize(
-    ("trouble", "follows"),
-    [(by_attitude, "the attitude"), (by_rate, "the rate of turn"), (by_time, "the time")],
-)
+    ("trouble", "follows", "motion"),
+    [
+        pytest.param(trouble, follows, motion, marks=() if quick else pytest.mark.slow)
+        for trouble, follows in (
+            (by_attitude, "the attitude"), (by_rate, "the rate of turn"), (by_time, "the time")
+        )
+        for motion, quick in ((LEVEL, True), (RICH, trouble is by_attitude))
+    ],
+)  # fmt: skip
 def test_what_is_left_is_named_and_within_the_sigmas(motion, trouble, follows):
     """A milligauss; what passes for iron of it is not seen."""
     for seed in SEEDS[:3]:
@@ -76,7 +81,9 @@ def test_what_is_left_is_named_and_within_the_sigmas(motion, trouble, follows):
         assert beyond(made, found) < 3.5
 
 
-@pytest.mark.parametrize("motion", [RICH, LEVEL], ids=["rich", "level"])
+@pytest.mark.parametrize(
+    "motion", [pytest.param(RICH, marks=pytest.mark.slow), LEVEL], ids=["rich", "level"]
+)
 def test_a_little_that_follows_the_attitude_holds_the_gate_for_flash(motion):
     """Half of the magnetometer's noise: it makes more of the heading than may be saved."""
     for seed in SEEDS:

@@ -57,13 +57,14 @@ def test_iron_that_stays_is_not_divided(bench, kind):
         assert answer(bench, run)[0].restarted_s is None
 
 
+@pytest.mark.slow  # one of them, quick: the next test
 @pytest.mark.recordings
 @pytest.mark.parametrize(
     "name",
     [
         "36_disturbed_attached_magnet_5cm",
-        pytest.param("32_disturbed_attached_magnet_1cm", marks=pytest.mark.slow),
-        pytest.param("34_disturbed_attached_magnet_3cm", marks=pytest.mark.slow),
+        "32_disturbed_attached_magnet_1cm",
+        "34_disturbed_attached_magnet_3cm",
     ],
 )
 def test_a_magnet_that_was_taken_off_again(name):
@@ -159,10 +160,11 @@ def test_a_turned_magnetometer_is_found(bench, kind):
     np.testing.assert_allclose(answer.correction.offset, run.hard_iron_gauss, atol=1.5e-3)
 
 
-def test_no_misalignment_is_no_evidence(bench):
+@pytest.mark.parametrize("seeds", [2, pytest.param(5, marks=pytest.mark.slow)])
+def test_no_misalignment_is_no_evidence(bench, seeds):
     answers = [
         misalignment_of(bench, bench.simulate("mam", "rov", seed, samples=5000))
-        for seed in range(5)
+        for seed in range(seeds)
     ]
     assert not any(answer.significant for answer in answers)
     assert 0.2 < np.mean([answer.chi2 for answer in answers]) / 3 < 3.0

@@ -416,8 +416,9 @@ def test_cost_and_memory_do_not_grow_with_the_run(kind):
 # -- real streams --------------------------------------------------------------------------------
 
 
-@pytest.fixture(params=[1, WHOLE])
+@pytest.fixture(params=[pytest.param(1, marks=pytest.mark.slow), WHOLE])
 def replayed(request, recordings):
+    """By epochs, as in the daemon, whose replays are in offline/test_replay_recordings; at once."""
     return lambda name: replay_of(recordings / "vn100" / f"{name}.csv.gz", request.param)
 
 

@@ -138,7 +138,7 @@ def test_the_page_shows_devices_worst_first_and_escapes_what_is_foreign(said, ou
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no browser is installed")
-@pytest.mark.parametrize("width_px", [400, 1000])
+@pytest.mark.parametrize("width_px", [400, pytest.param(1000, marks=pytest.mark.slow)])
 def test_the_page_in_a_browser(said, out, tmp_path, width_px):
     said("status", out, "--report", tmp_path / "page")
     seen = look_at(tmp_path / "page" / "report.html", width_px, tmp_path)

@@ -30,6 +30,7 @@ pytest.importorskip("duckdb", reason="duckdb (the extra fleet) is not installed"
 
 PLACE = Place(2, LOADS)
 ONE = Place(1, LOADS)  # for a single recording
+BARE = Place(1, ())  # for what is refused before anything is computed
 
 
 def ran(archive: Path | str, out: Path, place: Place = ONE, **orders: object) -> Progress:
@@ -135,9 +136,9 @@ def test_a_file_that_was_mended_has_a_row_of_its_own(archive, tmp_path):
     small = tmp_path / "archive"
     small.mkdir()
     (small / "dive.csv").write_text("a,b\n1,2\n")
-    assert dict(ran(small, tmp_path / "out").outcomes) == {"refused": 1}
+    assert dict(ran(small, tmp_path / "out", BARE).outcomes) == {"refused": 1}
     (small / "dive.csv").write_text("a,c\n1,2\n")
-    assert dict(ran(small, tmp_path / "out").outcomes) == {"refused": 1}
+    assert dict(ran(small, tmp_path / "out", BARE).outcomes) == {"refused": 1}
     with FleetRows(Store(tmp_path / "out")) as asked:
         assert asked.counts()["recordings"] == 2
 

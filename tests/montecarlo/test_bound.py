@@ -202,7 +202,13 @@ PUBLISHED = {
 }
 
 
-@pytest.mark.parametrize(("scenario", "motion"), PUBLISHED)
+@pytest.mark.parametrize(
+    ("scenario", "motion"),
+    [
+        pytest.param(*one, marks=pytest.mark.slow if "wam" in one or one == ("lam", "slow") else ())
+        for one in PUBLISHED
+    ],
+)
 def test_published_bounds_at_400_s(scenario, motion):
     """Seeds differ, so only the spread over runs can be asked for: 20 % where it is small.
 
@@ -355,12 +361,14 @@ def check_at_bound(errors, bounds, above):
     assert chi2.ppf(1e-3, n) < np.sum(q) < chi2.ppf(1 - 1e-3, n) * above**2
 
 
-def test_a_full_likelihood_smoother_of_its_own_reaches_it():
-    settings = [ScenarioSettings("mam", "rov", seed, samples=1500) for seed in range(40)]
+@pytest.mark.parametrize("runs", [15, pytest.param(40, marks=pytest.mark.slow)])
+def test_a_full_likelihood_smoother_of_its_own_reaches_it(runs):
+    settings = [ScenarioSettings("mam", "rov", seed, samples=1500) for seed in range(runs)]
     check_at_bound(*errors_and_bounds(smooth, settings), above=1.0)
 
 
-def test_the_estimator_fed_whole_reaches_it():
+@pytest.mark.parametrize("runs", [6, pytest.param(12, marks=pytest.mark.slow)])
+def test_the_estimator_fed_whole_reaches_it(runs):
     def estimate(experiment):
         estimator = Estimator()
         for block in experiment.blocks(1000):
@@ -370,5 +378,5 @@ def test_the_estimator_fed_whole_reaches_it():
             [found.soft_iron[UPPER], found.hard_iron_gauss, found.gyro_bias_rad_s]
         )
 
-    settings = [ScenarioSettings("mam", "rov", seed, samples=3000) for seed in range(12)]
+    settings = [ScenarioSettings("mam", "rov", seed, samples=3000) for seed in range(runs)]
     check_at_bound(*errors_and_bounds(estimate, settings), above=1.1)

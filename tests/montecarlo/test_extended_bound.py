@@ -172,7 +172,7 @@ def test_answers_scatter_as_it_says_where_the_imperfections_are_drawn():
         truth[own] = rng.normal(size=readings.besides)
         read = readings(truth) + rng.normal(size=len(J))
         x = np.zeros(readings.unknowns)
-        for _ in range(6):
+        for _ in range(4):
             x = x + gain @ (J.T @ (read - readings(x)) - prior * x)
         errors.append(x[:12])
     trajectory, extra = besides(experiment, ASSEMBLED, AROUND)

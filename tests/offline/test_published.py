@@ -91,7 +91,7 @@ def test_magfactor3_takes_the_devices_attitude_where_place_and_attitude_are_know
     assert "needs the attitude of every sample and the local field" in nowhere.reason
 
 
-@pytest.mark.parametrize("method", ["magyc", "all"])
+@pytest.mark.parametrize("method", [pytest.param("magyc", marks=pytest.mark.slow), "all"])
 def test_clipped_readings_end_in_one_line(simulated, tmp_path, run, capsys, method):
     """Ours would converge on them; what it says of itself does not show what was cut off."""
     path, _ = simulated

@@ -67,7 +67,7 @@ def test_an_emulated_stream_replays_to_its_facts(whole, name):
 
 
 @pytest.mark.parametrize("name", FACTS)
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_how_the_bytes_were_cut_changes_no_sample_and_no_decision(whole, monkeypatch, name, seed):
     core, seen = whole(name)
     pieces = cut(content(FOLDER / name), seed)

@@ -109,7 +109,7 @@ def has(place, words):
 
 
 @in_a_browser
-@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("dark", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_on_a_phone_and_on_a_desk(daemon, tmp_path, dark):
     with page_of(tmp_path) as (address, _), LiveBrowser(tmp_path / "browser") as browser:
         for width in (390, 1280):

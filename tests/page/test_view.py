@@ -257,7 +257,7 @@ def broken(status):
                 yield f"{key}.{inner}", status | {key: value | {inner: odd}}
 
 
-@pytest.mark.parametrize("name", ["gathering", "qualified"])
+@pytest.mark.parametrize("name", [pytest.param("gathering", marks=pytest.mark.slow), "qualified"])
 def test_no_status_ends_the_page(name, request):
     whole = request.getfixturevalue(name)
     told = 0

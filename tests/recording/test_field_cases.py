@@ -105,9 +105,13 @@ def test_every_case_of_the_folder_is_tried():
     assert listed - here - {name for names in ELSEWHERE.values() for name in names} == set()
 
 
-@pytest.mark.parametrize(
-    "case", CASES, ids=lambda case: f"{case.file.split('_')[0]}-{case.command}"
-)
+def of_case(case: Case) -> object:
+    """What has causes takes half a minute; a shorter one: diagnosis/test_diagnose_command.py."""
+    name = f"{case.file.split('_')[0]}-{case.command}"
+    return pytest.param(case, id=name, marks=pytest.mark.slow if case.named else ())
+
+
+@pytest.mark.parametrize("case", [of_case(case) for case in CASES])
 def test_the_command_line_says_what_is_right(tmp_path, run, capsys, case):
     written = tmp_path / "answer.json"
     code = run(case.command, FOLDER / case.file, "--json", written)

@@ -163,7 +163,7 @@ def test_a_true_stream_with_cr_lf_is_left_alone(tmp_path):
     ("every", "first"),
     [
         (1, "rates"),
-        (4, "field"),
+        pytest.param(4, "field", marks=pytest.mark.slow),
         pytest.param(1, "field", marks=pytest.mark.slow),
         pytest.param(4, "rates", marks=pytest.mark.slow),
     ],

@@ -157,8 +157,8 @@ def test_an_axis_is_turned_by_the_option(tmp_path):
     ("container", "kind"),
     [
         ("bag", "text"),
-        ("db3", "text"),
         ("mcap", "bytes"),
+        pytest.param("db3", "text", marks=pytest.mark.slow),
         pytest.param("bag", "bytes", marks=pytest.mark.slow),
         pytest.param("db3", "bytes", marks=pytest.mark.slow),
         pytest.param("mcap", "text", marks=pytest.mark.slow),
@@ -183,6 +183,7 @@ def test_what_the_device_sent_calibrates_as_its_byte_stream(tmp_path, container,
     assert any("what the device sent" in text for text in result.all_warnings())
 
 
+@pytest.mark.slow  # simulated ones: the test above
 def test_a_real_stream_in_a_bag_calibrates_as_the_stream(recordings, tmp_path):
     packed = recordings / "vn100" / "punch_2024_satish.vnraw.gz"
     lines = gzip.decompress(packed.read_bytes()).splitlines(keepends=True)

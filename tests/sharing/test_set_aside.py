@@ -46,7 +46,7 @@ def held(saved: dict[int, str]) -> tuple[str, str]:
     return saved[23], saved[84]
 
 
-@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize("binary", [True, pytest.param(False, marks=SLOW)])
 def test_the_trial_goes_on_behind_the_save(binary):
     run = on_trial(binary=binary)
     unit = run.cable.unit
@@ -277,8 +277,15 @@ def test_what_ends_a_trial_that_a_reset_set_aside(what, after_s):
     assert what == "stop" or run.state in RESTING, run.state
 
 
-@pytest.mark.parametrize("answer", [b"", b"$VNERR,05*74\r\n"])
-@pytest.mark.parametrize("saved", [True, False])
+@pytest.mark.parametrize(
+    ("saved", "answer"),
+    [
+        (True, b""),
+        (False, b"$VNERR,05*74\r\n"),
+        pytest.param(True, b"$VNERR,05*74\r\n", marks=SLOW),
+        pytest.param(False, b"", marks=SLOW),
+    ],
+)
 def test_a_reset_that_the_device_refuses_or_does_not_answer_ends_the_trial(saved, answer):
     run = on_trial()
     unit, usual = run.cable.unit, run.cable.unit.answer

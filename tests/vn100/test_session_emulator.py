@@ -132,7 +132,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_verified_is_true_under_every_fault_and_the_output_comes_back(fault, seed):
     """What must change: the write may fail, with a typed error. What must not: a verified write is
     in the memory, and once the fault is over the device streams (a resume may be needed)."""

@@ -29,11 +29,11 @@ def plural_always(tree: ast.AST) -> list[str]:
             if isinstance(number, ast.Constant):
                 before = str(number.value)
                 continue
-            named = ast.unparse(number).strip("f'\"{}")
-            limit = LIMIT.search(before) or re.fullmatch(r"[\w.]*\.?_?[A-Z_]+(?::.*)?", named)
             words = str(behind.value) if isinstance(behind, ast.Constant) else ""
-            if PLURAL.match(words) and not limit:
-                found.append(f"line {text.lineno}: {named}{words}")
+            if PLURAL.match(words) and not LIMIT.search(before):
+                named = ast.unparse(number).strip("f'\"{}")
+                if not re.fullmatch(r"[\w.]*\.?_?[A-Z_]+(?::.*)?", named):
+                    found.append(f"line {text.lineno}: {named}{words}")
             before = ""
     return found
 

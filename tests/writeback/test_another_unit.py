@@ -12,6 +12,9 @@ from cabled_run import FIRST, SPARE, CabledRun, two_units
 from ahrsd.inputs import Operator
 
 STREAMS = pytest.mark.parametrize("binary", [False, True], ids=["VNIMU", "packets"])
+#: which command, and whether the stream is binary: both kinds by turns
+QUICK_WRITE = ((1, False), (17, True), (33, False), (49, True))
+QUICK_SAVE = ((1, False), (16, True), (31, False))
 
 
 def untouched(run: CabledRun) -> None:
@@ -53,10 +56,13 @@ def test_before_the_approval(binary, bound):
     assert run.told("another device", str(SPARE), str(FIRST), "begins anew")
 
 
-@pytest.mark.parametrize(("binary", "silent_s"), [(False, 0.6), (True, 2.0)])
 @pytest.mark.parametrize(
-    "at",
-    [pytest.param(at, marks=[] if at % 16 == 1 else pytest.mark.slow) for at in range(1, 57, 4)],
+    ("at", "binary", "silent_s"),
+    [
+        pytest.param(at, *how, marks=[] if (at, how[0]) in QUICK_WRITE else pytest.mark.slow)
+        for at in range(1, 57, 4)
+        for how in ((False, 0.6), (True, 2.0))
+    ],
 )
 def test_at_every_command_of_the_write(binary, at, silent_s):
     """The cable goes at the n-th command after the approval."""
@@ -79,8 +85,15 @@ def test_at_every_command_of_the_write(binary, at, silent_s):
     assert first.saves == []
 
 
-@STREAMS
-@pytest.mark.parametrize("when", ["trial", "proven"])
+@pytest.mark.parametrize(
+    ("when", "binary"),
+    [
+        ("trial", False),
+        ("proven", True),
+        pytest.param("trial", True, marks=pytest.mark.slow),
+        pytest.param("proven", False, marks=pytest.mark.slow),
+    ],
+)
 def test_while_the_values_are_on_trial_or_proven(binary, when):
     run = CabledRun(two_units(binary=binary))
     if when == "trial":
@@ -100,10 +113,13 @@ def test_while_the_values_are_on_trial_or_proven(binary, when):
     assert len(run.cable.units[FIRST].writes) == 2
 
 
-@STREAMS
 @pytest.mark.parametrize(
-    "at",
-    [pytest.param(at, marks=[] if at % 3 == 1 else pytest.mark.slow) for at in range(1, 36, 5)],
+    ("binary", "at"),
+    [
+        pytest.param(binary, at, marks=[] if (at, binary) in QUICK_SAVE else pytest.mark.slow)
+        for binary in (False, True)
+        for at in range(1, 36, 5)
+    ],
 )
 def test_at_every_command_of_the_save(binary, at):
     run = CabledRun(two_units(binary=binary))
@@ -152,7 +168,7 @@ def test_a_rollback_writes_nothing_into_another_unit(binary, at):
 
 @pytest.mark.parametrize(
     "steps",
-    [pytest.param(n, marks=[] if n % 4 == 0 else pytest.mark.slow) for n in range(16, 30)],
+    [pytest.param(n, marks=[] if n in (16, 28) else pytest.mark.slow) for n in range(16, 30)],
 )
 def test_a_unit_that_has_the_cable_while_a_save_ends_confirms_nothing(steps):
     """It starts up there, so a time falls; the first one did not restart and is back.

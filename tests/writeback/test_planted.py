@@ -234,7 +234,9 @@ def test_what_no_estimate_can_be_is_never_sent(bad):
     assert any("not symmetric" in text for _, text in run.notes)
 
 
-@pytest.mark.parametrize("output", ["ascii", "imu", pytest.param("binary", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "output", ["imu", *(pytest.param(one, marks=pytest.mark.slow) for one in ("ascii", "binary"))]
+)
 def test_the_right_values_are_proven_and_stay(output):
     """Also on streams without the device's time, which stands still while the output is paused."""
     run = on_trial("rov", right(draw_truth(SEED)), output=output)

@@ -168,7 +168,7 @@ def test_the_largest_of_many_is_below_its_band_as_often_as_is_said():
     beyond = other > known.mean(axis=1) + predictive._LARGEST_REACH * known.std(axis=1, ddof=1)
     assert np.mean(beyond) == pytest.approx(1e-3, rel=0.1)
     for size in (60, 5000):  # segments in three axes; lines of a periodogram
-        share = np.random.default_rng(size).random((20_000, predictive.COPIES + 1))
+        share = np.random.default_rng(size).random((8_000, predictive.COPIES + 1))
         drawn = -np.log1p(-(share ** (1 / size)))  # of so many powers, by their distribution
         bands = [predictive.bands([{"line": float(x)} for x in row[:-1]]) for row in drawn]
         outside = [not b["line"][0] <= row[-1] <= b["line"][1] for b, row in zip(bands, drawn)]

@@ -189,6 +189,7 @@ def test_at_rest_the_gyro_reads_its_bias_and_nothing_runs_away() -> None:
     assert np.sqrt(np.diag(fit.covariance)[:8]).min() > 1e-4  # known by the prior alone
 
 
+@pytest.mark.slow  # a short one, simulated: the one at rest above
 @pytest.mark.recordings
 def test_a_stationary_recording_does_not_diverge() -> None:
     fit = fit_null(recorded("vn100/F00379"))

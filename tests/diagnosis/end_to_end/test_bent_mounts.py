@@ -15,7 +15,12 @@ from ahrsd.diagnosis.track import Track
 
 @pytest.fixture(scope="module")
 def track() -> Track:
-    return made(Trial(seed=11, samples=7500, rate_hz=25.0, scenario="wam", noise="white")).track
+    return driven(7500)
+
+
+def driven(samples: int) -> Track:
+    trial = Trial(seed=11, samples=samples, rate_hz=25.0, scenario="wam", noise="white")
+    return made(trial).track
 
 
 def turned(track: Track, angle_rad: np.ndarray) -> Track:
@@ -23,7 +28,8 @@ def turned(track: Track, angle_rad: np.ndarray) -> Track:
     return replace(track, mag_b_gauss=Rotation.from_rotvec(angle_rad).apply(track.mag_b_gauss))
 
 
-def test_a_mount_that_stays_crooked_has_a_name(track: Track) -> None:
+def test_a_mount_that_stays_crooked_has_a_name() -> None:
+    track = driven(3000)
     found = diagnose(turned(track, np.full((len(track), 3), 3e-3)))
     assert [one.effect for one in found.findings] == ["mag_gyro_misalignment"]
     assert not found.unexplained.detected

@@ -27,8 +27,6 @@ SHAPES = {
     "pulses": lambda t: 8.0 * (t % 9 < 0.7),
     "levels": lambda t: np.random.default_rng(7).uniform(0, 10, 100)[(t / 8).astype(int)],
 }
-#: those that a test takes which is not slow
-QUICK = ("square",)
 
 
 def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:
@@ -38,14 +36,8 @@ def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:
     )
 
 
-@pytest.mark.parametrize(
-    "shape",
-    [
-        pytest.param("quick square", marks=pytest.mark.slow),
-        "pulses",
-        *(pytest.param(shape, marks=pytest.mark.slow) for shape in ("square", "levels")),
-    ],
-)
+@pytest.mark.slow  # quick ones: one_model/test_one_model, test_turret
+@pytest.mark.parametrize("shape", ["quick square", "pulses", "square", "levels"])
 def test_an_unlogged_current_is_one_source_on_the_vehicle(shape: str) -> None:
     track = track_of(experiment("wam", seed=6, samples=3000))
     found = diagnose(_disturbed(track, 0.3 * SHAPES[shape](track.time_s), logged=False))
@@ -111,11 +103,9 @@ def test_a_rover_s_field_by_its_speed_is_named() -> None:
     np.testing.assert_allclose(values, k, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    "shape",
-    [pytest.param(one, marks=() if one in QUICK else pytest.mark.slow) for one in SHAPES],
-)
-@pytest.mark.parametrize("seed", [6, pytest.param(11, marks=pytest.mark.slow)])
+@pytest.mark.slow  # the square one, quick and by command: test_diagnose_command
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("seed", [6, 11])
 def test_a_logged_current_alone_is_named(shape: str, seed: int) -> None:
     track = track_of(experiment("wam", seed=seed, samples=2500))
     found = diagnose(_disturbed(track, SHAPES[shape](track.time_s), logged=True))

@@ -9,7 +9,7 @@ from ahrsd.diagnosis.one_model.diagnose import diagnose
 
 
 def test_wild_readings_are_no_object_and_no_step():
-    track = made(Trial(9, samples=8_000, rate_hz=25.0)).track
+    track = made(Trial(9, samples=4_500, rate_hz=25.0)).track
     rng = np.random.default_rng(4)
     mag = track.mag_b_gauss.copy()
     rows = rng.choice(len(mag), 24, replace=False)

@@ -22,7 +22,8 @@ def quiet() -> Track:
     return made(Trial(seed=5, samples=7000, rate_hz=RATE_HZ)).track
 
 
-def test_unlogged_pulses_are_named(quiet: Track) -> None:
+def test_unlogged_pulses_are_named() -> None:
+    quiet = made(Trial(seed=5, samples=4500, rate_hz=RATE_HZ)).track
     since = (quiet.time_s - 0.4) % 1.37
     hit = np.where(since < 0.06, 1.0, 0.0)[:, None]
     pulsed = replace(quiet, mag_b_gauss=quiet.mag_b_gauss + 2.5e-3 * hit * np.array([0.8, 0, 0.6]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis.one_model.diagnose import diagnose
@@ -19,6 +20,7 @@ def rung(time_s: np.ndarray) -> np.ndarray:
     return np.where(since > 0, swing, 0.0).sum(axis=1)
 
 
+@pytest.mark.slow  # bursts, which are told in the same way, are quick: test_bursts_located
 def test_what_rings_on_the_sensor_is_located_and_not_named() -> None:
     quiet = replace(made(Trial(seed=8, samples=6000)).track, covariates={})
     field = np.outer(rung(quiet.time_s), [1.5e-3, -1.0e-3, 1.2e-3])

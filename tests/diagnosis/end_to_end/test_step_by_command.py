@@ -21,7 +21,7 @@ from ahrsd.recording.table import write_table
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """A simulated recording with a step of the hard iron at 70 s."""
-    made = experiment("wam", seed=8, samples=3500).samples
+    made = experiment("wam", seed=8, samples=2800).samples
     step = (made.time_s >= 70.0)[:, None] * np.array([0.0, 9e-3, -4e-3])
     columns = {"time_s": made.time_s}
     for k, axis in enumerate("xyz"):

@@ -41,6 +41,7 @@ LIBRARY = {
 }
 
 
+@pytest.mark.slow  # a quick one that is unknown on the sensor: test_bursts_located
 def test_a_source_that_swells_is_unknown() -> None:
     swelled = diagnose(with_field(swelling), library=LIBRARY)
     assert [one.effect for one in swelled.findings] == []

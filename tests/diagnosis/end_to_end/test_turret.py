@@ -33,6 +33,7 @@ def test_a_weak_turret_is_unknown_and_on_the_vehicle(library) -> None:
     assert found.unexplained.where.frame == "sensor"
 
 
+@pytest.mark.slow
 def test_what_does_not_turn_with_the_heading_is_no_turret() -> None:
     assert not diagnose(turret(0.0), library={}).unexplained.detected
 

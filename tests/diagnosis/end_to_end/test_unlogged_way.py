@@ -13,7 +13,7 @@ PLACES = ("position_north_m", "position_east_m", "position_down_m")
 
 def test_a_field_along_a_way_that_nobody_logged_is_no_set_of_names():
     """Three gains of an on-board calibration followed it to a quarter of a hundredth."""
-    trial = made(Trial(2, (), PLACES, scenario="lam", samples=6000))
+    trial = made(Trial(2, (), PLACES, scenario="lam", samples=4000))
     R_nb = simulate(trial.settings).R_nb
     rng, track = np.random.default_rng(2), trial.track
     phase = np.pi * (track.time_s - track.time_s[0]) / track.duration_s

@@ -25,13 +25,14 @@ def test_a_bias_that_walks_a_lot_is_named_and_leaves_nothing(track):
     assert not found.unexplained.detected
 
 
+@pytest.mark.slow  # a walk that is named, quick: one_model/test_one_model
 @pytest.mark.parametrize(
     ("seed", "size"),
     [
         # the few modes of the name explain a tenth of what the filter gains by walking as much
         (19, 1.2e-5),
         # where the filter walks as an ordinary bias does, what is left of it looks like no walk
-        pytest.param(21, 2.6e-5, marks=pytest.mark.slow),
+        (21, 2.6e-5),
     ],
 )
 def test_a_walk_that_the_names_few_modes_hardly_show_is_named_too(track, seed, size):

@@ -12,7 +12,7 @@ from ahrsd.diagnosis.one_model.diagnose import diagnose
 
 
 def test_a_warm_up_that_nobody_logged_is_one_drift() -> None:
-    quiet = replace(made(Trial(seed=8)).track, covariates={})
+    quiet = replace(made(Trial(seed=8, samples=6000)).track, covariates={})
     passed_s = quiet.time_s - quiet.time_s[0]
     part = -np.expm1(-passed_s / 90.0) / -np.expm1(-passed_s[-1] / 90.0)
     field = part[:, None] * np.array([2e-3, -3e-3, 1.5e-3])

@@ -13,12 +13,13 @@ from ahrsd.diagnosis.one_model.diagnose import diagnose
 SAMPLES, RATE_HZ = 8_000, 25.0
 
 
-def answer(*effects, seed=3, **more):
-    one = made(Trial(seed, tuple(effects), samples=SAMPLES, rate_hz=RATE_HZ, **more))
+def answer(*effects, seed=3, samples=SAMPLES, **more):
+    one = made(Trial(seed, tuple(effects), samples=samples, rate_hz=RATE_HZ, **more))
     return diagnose(one.track), one
 
 
-@pytest.mark.parametrize("noise", ["white", pytest.param("red", marks=pytest.mark.slow)])
+@pytest.mark.slow  # a shorter one: test_quiet
+@pytest.mark.parametrize("noise", ["white", "red"])
 def test_nothing_is_said_where_nothing_is_wrong(noise):
     found, _ = answer(noise=noise)
     assert not found.mismatch
@@ -46,7 +47,7 @@ def test_a_slow_low_pass_is_one_name_and_leaves_nothing_for_others():
 
 
 def test_two_effects_are_both_named_and_nothing_else():
-    found, one = answer(("hard_iron_step", 1.0), ("gyro_scale", 1.0))
+    found, one = answer(("hard_iron_step", 1.0), ("gyro_scale", 1.0), samples=5000)
     assert sorted(x.effect for x in found.findings) == ["gyro_scale", "hard_iron_step"]
     step = next(x for x in found.findings if x.effect == "hard_iron_step")
     _, value, setting = one.truth[0]

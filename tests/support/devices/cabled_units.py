@@ -8,16 +8,19 @@ unit acts on it, so that a test can pull the cable at every command.
 
 from __future__ import annotations
 
+import math
 import struct
+from binascii import crc_hqx
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import reduce
+from functools import cache, reduce
 from operator import xor
 
 import numpy as np
 
 ONE = "1,0,0,0,1,0,0,0,1,0,0,0"
-FIELD_N = np.array([0.24, 0.0, 0.42])
+FIELD_N, WEIGHT_N = np.array([0.24, 0.0, 0.42]), np.array([0.0, 0.0, -9.81])
+I_3 = np.eye(3)
 FACTORY = {
     1: "VN-100T-CR", 2: "7", 4: "3.1.0.0", 5: "115200", 6: "19", 7: "20",
     21: "0.234,0,0.4212,0,0,-9.79375", 23: ONE, 25: ONE, 26: "1,0,0,0,1,0,0,0,1",
@@ -33,12 +36,7 @@ def sentence(body: str) -> bytes:
 
 def crc16(data: bytes) -> int:
     """CCITT, as at the end of a packet."""
-    crc = 0
-    for byte in data:
-        crc ^= byte << 8
-        for _ in range(8):
-            crc = (crc << 1 ^ 0x1021 if crc & 0x8000 else crc << 1) & 0xFFFF
-    return crc
+    return crc_hqx(data, 0)
 
 
 def printed(values: str) -> str:
@@ -46,8 +44,11 @@ def printed(values: str) -> str:
     return ",".join(f"{np.float32(float(v)):.6g}" for v in values.split(","))
 
 
-def numbers(values: str) -> np.ndarray:
-    return np.array([float(v) for v in values.split(",")])
+@cache
+def matrix_and_offset(values: str) -> tuple[np.ndarray, np.ndarray]:
+    """Of register 23 or 84."""
+    numbers = np.array([float(v) for v in values.split(",")])
+    return numbers[:9].reshape(3, 3), numbers[9:]
 
 
 @dataclass
@@ -111,17 +112,18 @@ class Unit:
 
     def measure(self, R_nb: np.ndarray, rate: np.ndarray, iron: np.ndarray, noise) -> bytes:
         """One message, through the registers in RAM."""
-        raw = R_nb.T @ FIELD_N + self.hard_iron + iron + 1e-3 * noise.normal(size=3)
-        spin = rate + self.gyro_bias + 1e-3 * noise.normal(size=3)
-        force = R_nb.T @ np.array([0.0, 0.0, -9.81]) + 1e-2 * noise.normal(size=3)
-        mag, gyro = (numbers(self.ram[n]) for n in (23, 84))
-        raw = mag[:9].reshape(3, 3) @ (raw - mag[9:])
-        spin = gyro[:9].reshape(3, 3) @ (spin - gyro[9:])
+        of_field, of_spin, of_force = noise.normal(size=(3, 3))
         if self.paused:
             return b""
+        mag, mag_offset = matrix_and_offset(self.ram[23])
+        gyro, gyro_offset = matrix_and_offset(self.ram[84])
+        raw = R_nb.T @ FIELD_N + self.hard_iron + iron + 1e-3 * of_field
+        raw = (mag @ (raw - mag_offset)).tolist()
+        spin = (gyro @ (rate + self.gyro_bias + 1e-3 * of_spin - gyro_offset)).tolist()
+        force = (R_nb.T @ WEIGHT_N + 1e-2 * of_force).tolist()
         if not self.binary:
-            body = [*(f"{v:+.6f}" for v in (*raw, *force, *spin)), "+25.0", "+101.300"]
-            return sentence("VNIMU," + ",".join(body))
+            body = ("%+.6f," * 9) % (*raw, *force, *spin)
+            return sentence(f"VNIMU,{body}+25.0,+101.300")
         head = bytes([0xFA, 0x06]) + struct.pack("<HH", 0x0001, 0x003F)
         data = struct.pack("<Q", int(self.uptime_s * 1e9))
         data += struct.pack("<H3f3f3fff", 0, *raw, *force, *spin, 25.0, 101.3)
@@ -169,7 +171,7 @@ class Cable:
         """One step of time; what went to the host."""
         self._t_s += self.step_s
         t = self._t_s
-        rate = np.array([0.5 * np.sin(0.7 * t), 0.6 * np.cos(0.45 * t), 0.7]) * self.moving
+        rate = np.array([0.5 * math.sin(0.7 * t), 0.6 * math.cos(0.45 * t), 0.7]) * self.moving
         self._R = self._R @ turn(rate * self.step_s)
         self.unit.uptime_s += self.step_s
         if self._silent_s > 0.0:
@@ -181,9 +183,9 @@ class Cable:
 
 def turn(angle: np.ndarray) -> np.ndarray:
     """Rodrigues."""
-    size = float(np.linalg.norm(angle))
-    x, y, z = angle
+    x, y, z = angle.tolist()
+    size = math.hypot(x, y, z)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     if size < 1e-9:
-        return np.eye(3) + K
-    return np.eye(3) + np.sin(size) / size * K + (1.0 - np.cos(size)) / size**2 * K @ K
+        return I_3 + K
+    return I_3 + math.sin(size) / size * K + (1.0 - math.cos(size)) / size**2 * (K @ K)

@@ -190,7 +190,7 @@ def test_compensated_set_agrees_with_the_codec_and_with_the_truth():
     """syn_time_imu_comp_uncomp: FA 06 8100 0E07; HSI is not applied, so Mag = UncompMag."""
     bias = np.array([0.01, -0.02, 0.03])
     truth = EmulatedTruth(gyro_bias_rad_s=bias, noise_gyro_rad_s=0)
-    wire = binary_device((1, 16, 6, 0x0081, 0x070E), "static", truth=truth).advance(200.0)
+    wire = binary_device((1, 80, 6, 0x0081, 0x070E), "static", truth=truth).advance(200.0)
     last = packets(wire, bytes.fromhex("FA0681000E07"), 92)[-1]
     raw = struct.unpack("<QI18f", last[6:-2])
     measured = decode(Deframer().feed(last)[0])

@@ -59,8 +59,14 @@ def test_the_way_has_many_points(reference):
     assert 100 < reference[2] < POINTS
 
 
-@pytest.mark.parametrize("lost", ["all", "device", "program"])
-@pytest.mark.parametrize("mode", [Mode.STAGE, Mode.COMMIT])
+@pytest.mark.parametrize(
+    ("mode", "lost"),
+    [
+        *((Mode.COMMIT, lost) for lost in ("all", "device", "program")),
+        (Mode.STAGE, "all"),
+        *(pytest.param(Mode.STAGE, lost, marks=pytest.mark.slow) for lost in ("device", "program")),
+    ],
+)
 def test_every_cut_ends_in_agreement(make_rig, reference, lost, mode):
     old, new, _ = reference
     ends = set()

@@ -16,7 +16,8 @@ from ahrsd.writeback.states import Mode
 THEIRS = "1.02,0,0,0,1.01,0,0,0,1,0.11,0.01,0.02"
 OLD = ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2
 NEW = ("1,0,0,0,1,0,0,0,1,0.05,-0.03,0.04", "1,0,0,0,1,0,0,0,1,0.01,-0.02,0.005")
-STREAMS = pytest.mark.parametrize("binary", [False, True], ids=["VNIMU", "packets"])
+#: which command, and whether the stream is binary
+QUICK_SAVE = ((1, False), (21, True))
 
 
 def theirs_stays(run: CabledRun) -> None:
@@ -31,8 +32,15 @@ def theirs_stays(run: CabledRun) -> None:
     assert run.told("values that nobody here wrote")
 
 
-@STREAMS
-@pytest.mark.parametrize("when", ["trial", "proven"])
+@pytest.mark.parametrize(
+    ("when", "binary"),
+    [
+        ("trial", False),
+        ("proven", True),
+        pytest.param("trial", True, marks=pytest.mark.slow),
+        pytest.param("proven", False, marks=pytest.mark.slow),
+    ],
+)
 def test_their_value_is_found_within_the_interval_and_stays(binary, when):
     run = CabledRun(two_units(binary=binary))
     if when == "trial":
@@ -46,10 +54,13 @@ def test_their_value_is_found_within_the_interval_and_stays(binary, when):
     theirs_stays(run)
 
 
-@STREAMS
 @pytest.mark.parametrize(
-    "at",
-    [pytest.param(at, marks=[] if at in (1, 21) else pytest.mark.slow) for at in range(1, 33, 5)],
+    ("at", "binary"),
+    [
+        pytest.param(at, how, marks=[] if (at, how) in QUICK_SAVE else pytest.mark.slow)
+        for at in range(1, 33, 5)
+        for how in (False, True)
+    ],
 )
 def test_just_before_the_save(binary, at):
     run, heard = CabledRun(two_units(binary=binary)), []
@@ -77,9 +88,13 @@ def test_a_rollback_does_not_write_over_it():
     theirs_stays(run)
 
 
-@STREAMS
 @pytest.mark.parametrize(
-    "nth", [1, *(pytest.param(nth, marks=pytest.mark.slow) for nth in (3, 5, 7, 9))]
+    ("binary", "nth"),
+    [
+        pytest.param(binary, nth, marks=[] if (binary, nth) == (False, 1) else pytest.mark.slow)
+        for binary in (False, True)
+        for nth in (1, 3, 5, 7, 9)
+    ],
 )
 def test_a_restart_between_the_two_registers_leaves_no_half_a_calibration(binary, nth):
     """After 23 was written; its time goes on in a text stream, which carries none."""
@@ -153,7 +168,7 @@ def test_the_reads_are_rare_and_the_stream_goes_on():
     assert run.core.stream.gaps == []
 
 
-@STREAMS
+@pytest.mark.parametrize("binary", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_capture_replays_to_the_same_decisions(binary):
     """Every doubt and every look is of the inputs."""
     from ahrsd.core.core import Core

@@ -9,7 +9,7 @@ from scripted_world import fitted
 REAL = 1
 
 
-@pytest.mark.parametrize("histories", [40, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("histories", [30, pytest.param(200, marks=pytest.mark.slow)])
 def test_random_histories_write_nothing_wrong(histories):
     tally = write_histories.HistoriesTally()
     with fitted():
@@ -21,7 +21,7 @@ def test_random_histories_write_nothing_wrong(histories):
     assert tally.seen["CONFIRMED"] > histories / 30
 
 
-@pytest.mark.parametrize("histories", [16, pytest.param(80, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("histories", [12, pytest.param(80, marks=pytest.mark.slow)])
 def test_histories_with_a_driver_that_saves_and_writes_are_as_right(histories):
     tally = write_histories.HistoriesTally()
     with fitted():

@@ -47,8 +47,8 @@ def moments(events: list[str]) -> pytest.MarkDecorator:
     return pytest.mark.parametrize(("event", "places"), [*thirds, *whole])
 
 
-#: of what follows from a client's save in a trial: 10 moments of the 240 that there are
-BEHIND_A_SAVE = range(0, 240, 24)
+#: of what follows from a client's save in a trial: 5 or 10 moments of the 240 that there are
+BEHIND_A_SAVE = {5: range(0, 240, 48), 10: range(0, 240, 24)}
 
 
 QUICK = ("kill and other writes", "swap", "disk full", "client saves and resets")
@@ -56,17 +56,18 @@ OTHERS = ("kill", "host reboots", "restart", "other writes", "unsafe for a while
     "lie", "client saves", "client calibrates")  # fmt: skip
 
 
+@pytest.mark.parametrize("count", [5, pytest.param(10, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "event", [*QUICK, *(pytest.param(event, marks=pytest.mark.slow) for event in OTHERS)]
 )
-def test_anything_at_every_moment_behind_a_clients_save_or_reset_in_a_trial(event):
+def test_anything_at_every_moment_behind_a_clients_save_or_reset_in_a_trial(event, count):
     names = [*write_histories.NAMES, *write_histories.CLIENT_EVENTS]
     tally, does = write_histories.HistoriesTally(), write_histories.ASIDE_FOR
-    for k, turn in enumerate(BEHIND_A_SAVE):
+    for k, turn in enumerate(BEHIND_A_SAVE[count]):
         number = (turn + names.index(event) % 16) * len(names) + names.index(event)
         write_histories.run_aside(number * len(does) + k % len(does), 2, tally)
     assert tally.wrong == []
-    assert tally.events == {event: len(BEHIND_A_SAVE)}
+    assert tally.events == {event: count}
     assert tally.seen["client saves"] > 0
     assert tally.seen["CLIENT_RESET"] > 0
 
@@ -119,9 +120,9 @@ def test_a_killed_program_at_every_moment(event, places):
     assert wrong(event, places) == []
 
 
-@pytest.mark.parametrize("event", ["stop and start", "unsafe for a while", "disk full", "person"])
-def test_ordinary_trouble_at_every_moment(event):
-    assert wrong(event, PLACES[::2]) == []
+@moments(["stop and start", "unsafe for a while", "disk full", "person"])
+def test_ordinary_trouble_at_every_moment(event, places):
+    assert wrong(event, places) == []
 
 
 @moments(["lie", "bad line", "silence", "journal lost"])

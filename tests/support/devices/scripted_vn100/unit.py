@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -182,20 +183,8 @@ class Unit:
     @property
     def period_s(self) -> float:
         """Between two samples that are sent; inf where nothing is."""
-        binary = self._binaries()
-        divisors = [divisor for divisor, _, _ in binary]
-        rate = int(self.memory.ram[7])
-        if self.memory.ram[6] != "0" and rate:
-            divisors.append(round(BASE_HZ / rate))
-        return min(divisors) / BASE_HZ if divisors else float("inf")
-
-    def _binaries(self) -> list[tuple[int, int, list[int]]]:
-        found = []
-        for number in (75, 76, 77):
-            mode, divisor, groups, *words = self.memory.ram[number].split(",")
-            if mode in ("1", "3") and int(divisor) and int(groups, 16):
-                found.append((int(divisor), int(groups, 16), [int(w, 16) for w in words]))
-        return found
+        ram = self.memory.ram
+        return _period_s(ram[6], ram[7], ram[75], ram[76], ram[77])
 
     def attach(self, at_s: float) -> None:
         """It was put on a cable; what it would have said before is gone."""
@@ -225,7 +214,7 @@ class Unit:
     def _messages(self, sample_s: float, period_s: float) -> bytes:
         facts = self._facts(sample_s, period_s)
         out = bytearray()
-        for _, groups, words in self._binaries():
+        for _, groups, words in _binaries(*(self.memory.ram[n] for n in (75, 76, 77))):
             names, form = layout_of(groups, words)
             values: list[Any] = []
             for name in names:
@@ -253,13 +242,38 @@ class Unit:
 
     def _applied(self, number: int, values: np.ndarray) -> list[float]:
         """C (x - B) of the register in RAM."""
-        numbers = np.array(self.memory.floats(number))
-        result: list[float] = (numbers[:9].reshape(3, 3) @ (values - numbers[9:])).tolist()
+        matrix, offset = _matrix_and_offset(self.memory.ram[number])
+        result: list[float] = (matrix @ (values - offset)).tolist()
         return result
 
     def uptime_s(self, at_s: float) -> float:
         """Its own time since it was switched on."""
         return at_s - self.boot_s
+
+
+@cache
+def _binaries(*registers: str) -> list[tuple[int, int, list[int]]]:
+    """Divisor, groups and words of each packet that these registers ask for."""
+    found = []
+    for register in registers:
+        mode, divisor, groups, *words = register.split(",")
+        if mode in ("1", "3") and int(divisor) and int(groups, 16):
+            found.append((int(divisor), int(groups, 16), [int(w, 16) for w in words]))
+    return found
+
+
+@cache
+def _period_s(text: str, rate: str, *binary: str) -> float:
+    divisors = [divisor for divisor, _, _ in _binaries(*binary)]
+    if text != "0" and int(rate):
+        divisors.append(round(BASE_HZ / int(rate)))
+    return min(divisors) / BASE_HZ if divisors else float("inf")
+
+
+@cache
+def _matrix_and_offset(register: str) -> tuple[np.ndarray, np.ndarray]:
+    numbers = np.array([float(token) for token in register.split(",")])
+    return numbers[:9].reshape(3, 3), numbers[9:]
 
 
 def _ymr(facts: dict[str, Any]) -> str:
