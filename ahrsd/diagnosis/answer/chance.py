@@ -17,8 +17,9 @@ must be far beyond what is told of these.  Calibration and noise are those of th
 any name or beside the names, whose magnetometer is the quieter one: what a missing name leaves is
 no noise, and louder copies show more by chance.
 
-The motion is what the gyro's readings are expected to be without their noise (`wiener`), held by
-field and accelerometer.  Nothing is different in a copy, so whatever is told of one is chance.
+The motion is what the gyro's readings are expected to be without their noise
+(`time_series.denoised`), held by field and accelerometer.  Nothing is different in a copy, so
+whatever is told of one is chance.
 Evidence that is too large by an unknown factor has an exponential tail of unknown scale: it is t
 times the largest of n such with the chance n! / ((1 + t) ... (n + t)), whatever that scale: 1 in
 126 for four times the largest of five.  Of what is far beyond the first copies the others need not
@@ -34,6 +35,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.answer.diagnosis import Check, Diagnosis, Finding, Unexplained
 from ahrsd.diagnosis.answer.predictive import beside_refitted, checks, usual_noise
 from ahrsd.diagnosis.calibration_fit.descent import NullFit
@@ -42,8 +44,12 @@ from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate, problem_of
 from ahrsd.diagnosis.data_quality.hygiene import would_have_shown
 from ahrsd.diagnosis.effects.base import Readings
-from ahrsd.diagnosis.innovation_filter import wiener
-from ahrsd.diagnosis.innovation_filter.context import Given, attitude, build_context, smoothed_rate
+from ahrsd.diagnosis.innovation_filter.context import (
+    Given,
+    attitude,
+    build_context,
+    smoothed_rate,
+)
 from ahrsd.diagnosis.innovation_filter.innovation import (
     bearings,
     carried_along,
@@ -52,9 +58,9 @@ from ahrsd.diagnosis.innovation_filter.innovation import (
     sensitivities,
 )
 from ahrsd.diagnosis.limits import LIMITS, Limits
+from ahrsd.diagnosis.model import Noise, NullModel
 from ahrsd.diagnosis.repaired_model import forward
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Noise, NullModel
 from ahrsd.samples import Array
 
 LOUD = "the gyro's noise is louder than the magnetometer's"
@@ -214,8 +220,8 @@ def _without_noise(track: Track, model: NullModel) -> Array:
     runs = track.runs or (slice(0, len(track)),)
     out = smoothed_rate(rate, runs, track.step_s, model.sigma_gyro_rad_s)
     for run in runs:
-        if run.stop - run.start >= wiener.FEWEST:
-            out[run] = wiener.expected(rate[run])
+        if run.stop - run.start >= time_series.SPECTRUM_ROWS:
+            out[run] = time_series.denoised(rate[run])
     return out
 
 

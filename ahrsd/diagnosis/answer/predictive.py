@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.answer.diagnosis import Check
 from ahrsd.diagnosis.calibration_fit.descent import NullFit
 from ahrsd.diagnosis.calibration_fit.rounded import before_rounding, bent, calibration_covariance
-from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation_filter.innovation import (
@@ -30,10 +30,10 @@ from ahrsd.diagnosis.innovation_filter.innovation import (
     sensitivities,
 )
 from ahrsd.diagnosis.innovation_filter.noise import before, colour_of, freedom_of
-from ahrsd.diagnosis.innovation_filter.probabilities import student_quantile
+from ahrsd.diagnosis.innovation_filter.regression_statistics import student_quantile
+from ahrsd.diagnosis.model import Context, Noise, Term
 from ahrsd.diagnosis.repaired_model import forward
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Context, Noise, Term
 from ahrsd.samples import Array
 
 COPIES = 16
@@ -294,7 +294,7 @@ def scene_of(context: Context) -> Scene:
                 course
                 for values in track.covariates.values()
                 if np.isfinite(values).all() and np.ptp(values) > 0
-                for course in (values, series.derivative(values, track.time_s, track.dt_s))
+                for course in (values, time_series.derivative(values, track.time_s, track.dt_s))
             ]
         ).reshape(len(track), -1),
     )
@@ -369,7 +369,7 @@ def _joined(tracks: Sequence[Track]) -> Track:
         gyro_b_rad_s=np.vstack([track.gyro_b_rad_s for track in tracks]),
         accel_b_m_s2=None,
         covariates={},
-        runs=tuple(series.runs(dt_s)),
+        runs=tuple(time_series.runs(dt_s)),
         lost_turns=np.concatenate(lost) if lost else None,
     )
 

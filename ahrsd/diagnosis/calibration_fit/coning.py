@@ -12,13 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.calibration_fit.null import fit_null, unusable
 from ahrsd.diagnosis.calibration_fit.shaken import carrying
 from ahrsd.diagnosis.calibration_fit.thin import thinned, working_factor
-from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.innovation_filter.innovation import nuisance_columns, sensitivities
+from ahrsd.diagnosis.model import Columns, NullModel
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Columns, NullModel
 from ahrsd.samples import Array
 
 #: a gyro's noise per sample, rad/s, below which none is: coning that is lost even in this is left
@@ -93,5 +93,5 @@ def _of_the_rate(track: Track, bias_rad_s: Array) -> Columns:
     out = np.zeros((len(track), 3, 10))
     for axis in range(3):
         out[:, axis, 3 * axis : 3 * axis + 3] = rate
-    out[:, :, 9] = series.derivative(rate, track.time_s, track.dt_s)
+    out[:, :, 9] = time_series.derivative(rate, track.time_s, track.dt_s)
     return Columns(gyro=out)

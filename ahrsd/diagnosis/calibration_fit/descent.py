@@ -18,8 +18,8 @@ from ahrsd.diagnosis.innovation_filter.innovation import (
     run_filter,
     sensitivities,
 )
+from ahrsd.diagnosis.model import Context, NullModel
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Context, NullModel
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from ahrsd.diagnosis.calibration_fit.coarse import group_size, noise_of, thinned
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
+from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Spec, Track
-from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
 
 #: times the gyro's differenced noise that its noise may be at most

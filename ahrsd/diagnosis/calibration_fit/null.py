@@ -38,8 +38,8 @@ from ahrsd.diagnosis.calibration_fit.prior import (
 )
 from ahrsd.diagnosis.calibration_fit.thin import turned_up
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
+from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import NothingToFit, Spec, Track
-from ahrsd.diagnosis.values import NullModel
 from ahrsd.estimator import chain
 from ahrsd.estimator.chain import linear_start
 from ahrsd.samples import Array

@@ -11,7 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.diagnosis.calibration_fit.coarse import noise_of
-from ahrsd.diagnosis.innovation_filter.innovation import Filtered, nuisance_columns, sensitivities
+from ahrsd.diagnosis.innovation_filter.innovation import (
+    Filtered,
+    nuisance_columns,
+    sensitivities,
+)
 from ahrsd.diagnosis.track import Track
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array

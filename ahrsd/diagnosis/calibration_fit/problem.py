@@ -18,8 +18,8 @@ from ahrsd.diagnosis.calibration_fit.delay import (
 from ahrsd.diagnosis.calibration_fit.null import cold_start
 from ahrsd.diagnosis.calibration_fit.shaken import QUIETER, carrying, quieter
 from ahrsd.diagnosis.calibration_fit.thin import thinned, working_factor
+from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import NothingToFit, Spec, Track
-from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
 
 MEAN_RATES = (

@@ -20,10 +20,14 @@ from ahrsd.diagnosis.answer.confound import separating_manoeuvre
 from ahrsd.diagnosis.answer.diagnosis import Finding, Share, Value, Where
 from ahrsd.diagnosis.calibration_fit.descent import NullFit
 from ahrsd.diagnosis.effects.base import Effect, Setting
-from ahrsd.diagnosis.innovation_filter.evidence import log_bayes, posterior
-from ahrsd.diagnosis.innovation_filter.score import solve, total_score
+from ahrsd.diagnosis.innovation_filter.regression_statistics import (
+    log_bayes,
+    posterior,
+    solve,
+    total_score,
+)
 from ahrsd.diagnosis.limits import LIMITS
-from ahrsd.diagnosis.values import Context
+from ahrsd.diagnosis.model import Context
 from ahrsd.samples import Array
 
 #: 1 - |mean direction| of the field in the sensor: directions within about 5 degrees

@@ -15,9 +15,9 @@ import numpy as np
 
 from ahrsd.diagnosis.calibration_fit.descent import NullFit
 from ahrsd.diagnosis.effects.base import Readings
-from ahrsd.diagnosis.innovation_filter.evidence import colour
 from ahrsd.diagnosis.innovation_filter.innovation import nuisance_columns, sensitivities
-from ahrsd.diagnosis.values import Noise
+from ahrsd.diagnosis.innovation_filter.regression_statistics import colour
+from ahrsd.diagnosis.model import Noise
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 

@@ -20,8 +20,8 @@ from ahrsd.diagnosis.calibration_fit import noise_fit
 from ahrsd.diagnosis.calibration_fit.coarse import noise_of
 from ahrsd.diagnosis.calibration_fit.null import fit_null, unusable
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
+from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Spec, Track
-from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
 
 _FEWEST = 25  # samples whose scatter is compared with that of others

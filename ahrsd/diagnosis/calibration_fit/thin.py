@@ -19,8 +19,8 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd import so3
+from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import NothingToFit, Track
-from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
 
 #: rows per second that a search works with, and what is enough where a group of samples hardly

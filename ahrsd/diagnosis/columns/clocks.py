@@ -18,7 +18,7 @@ import numpy as np
 
 from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.columns.shown import shown
-from ahrsd.diagnosis.data_quality.aligned import cut
+from ahrsd.diagnosis.external_simulation import cut
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.where_and_when.locate import Located
 from ahrsd.samples import Array

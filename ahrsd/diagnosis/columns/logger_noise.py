@@ -4,7 +4,7 @@ A speed, a depth or a temperature is often logged with a noise of its own, a few
 and held or drawn straight between.  The noise is then in the regressor: what follows the column is
 told too small, and the noise itself is left over as a source that nobody knows.  Where the noise
 can be told from the course, the column is what it is expected to be, given what was logged
-(`wiener`).
+(`time_series.denoised`).
 
 It can be told where the values' upper half of frequencies is flat and Gaussian, as what a sensor
 adds is, and next to nothing of the course.  A throttle has steps, a gust is not flat: these are
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from ahrsd.diagnosis.innovation_filter.wiener import FEWEST, expected
+from ahrsd.diagnosis.time_series import SPECTRUM_ROWS, denoised
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
@@ -67,9 +67,9 @@ def without_noise(values: Array) -> Array | None:
     that can be told from its course."""
     how = logged(values)
     own = values[how.first :: how.rows]
-    if len(own) < FEWEST or not _is_noise(own):
+    if len(own) < SPECTRUM_ROWS or not _is_noise(own):
         return None
-    course = expected(own[:, None])[:, 0]
+    course = denoised(own[:, None])[:, 0]
     if np.var(course) < COURSE * np.var(own):
         return None
     return how.between(course, len(values))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.calibration_fit.coarse import noise_of
 from ahrsd.diagnosis.data_quality.facts import Fact, spans_of
-from ahrsd.diagnosis.effects.series import runs
+from ahrsd.diagnosis.time_series import runs
 from ahrsd.diagnosis.track import Track
 from ahrsd.printable import counted
 from ahrsd.samples import Array

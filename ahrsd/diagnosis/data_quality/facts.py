@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.base import Effect
-from ahrsd.diagnosis.values import Term
+from ahrsd.diagnosis.model import Term
 from ahrsd.samples import Array
 
 

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.calibration_fit.coarse import noise_of
 from ahrsd.diagnosis.data_quality.clipping import clipping, quantisation
@@ -28,7 +29,6 @@ from ahrsd.diagnosis.data_quality.handedness import (
 )
 from ahrsd.diagnosis.data_quality.repeats import repeats
 from ahrsd.diagnosis.data_quality.stamps import regular, stamps
-from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.track import Track
 
 _EXPLAINED = 0.6  # cost of the best frame, of that of no motion, at most
@@ -274,7 +274,7 @@ def put_right(track: Track, facts: Sequence[Fact]) -> Track:
             unseen = fact.unseen if fact.unseen is not None else unseen
         if fact.bad is not None:
             mag[fact.bad] = np.nan
-    runs = track.runs if dt_s is track.dt_s else tuple(series.runs(dt_s))
+    runs = track.runs if dt_s is track.dt_s else tuple(time_series.runs(dt_s))
     return replace(
         track,
         time_s=time_s,

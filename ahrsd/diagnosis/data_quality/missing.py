@@ -18,8 +18,8 @@ from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.data_quality.facts import Fact
 from ahrsd.diagnosis.data_quality.turns import LONGER_NATS, QUARTER, Turns, recovered, some_lost
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
+from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import NullModel
 from ahrsd.printable import counted
 from ahrsd.samples import Array
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.effects import series, shapes
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects import shapes
 from ahrsd.diagnosis.effects.base import (
     Clipped,
     Effect,
@@ -17,7 +18,7 @@ from ahrsd.diagnosis.effects.base import (
     readings_of,
     rowwise_readings_of,
 )
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 #: by which the earth turns among the stars: no axis has more of it
@@ -211,7 +212,7 @@ class GyroIntegration(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """From the step's mean to the instant."""
-        change = series.instant_rate(readings) - readings.rate_b_rad_s
+        change = time_series.instant_rate(readings) - readings.rate_b_rad_s
         return Columns(gyro=change[:, :, None])
 
 
@@ -244,14 +245,14 @@ class GyroTimeLag(Effect):
     def columns(self, context: Context, setting: Setting) -> Columns:
         """-dw/dt."""
         r = readings_of(context)
-        return Columns(gyro=-series.derivative(r.rate_b_rad_s, r.time_s, r.dt_s)[:, :, None])
+        return Columns(gyro=-time_series.derivative(r.rate_b_rad_s, r.time_s, r.dt_s)[:, :, None])
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """What the gyro would have read `value` seconds ago in place of the present."""
         lag_s = float(value[0])
         others = readings.gyro_b_rad_s - readings.rate_b_rad_s
-        others = series.earlier(others, readings.time_s, readings.dt_s, lag_s)
-        return replace(readings, gyro_b_rad_s=series.delayed_rate(readings, lag_s) + others)
+        others = time_series.earlier(others, readings.time_s, readings.dt_s, lag_s)
+        return replace(readings, gyro_b_rad_s=time_series.delayed_rate(readings, lag_s) + others)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """Ten milliseconds."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.effects import series, shapes
+from ahrsd.diagnosis.effects import shapes
 from ahrsd.diagnosis.effects.base import Linear, Parameter, Readings, Setting
-from ahrsd.diagnosis.values import Columns
+from ahrsd.diagnosis.model import Columns
 from ahrsd.samples import Array
 
 _WALK_MODES = 4
@@ -193,9 +194,9 @@ class VibrationRectification(Linear):
 
 def _shaking(readings: Readings, window_s: float) -> Array:
     """Variance (N,) in g^2 of the specific force about its mean over the window, all axes."""
-    rows = max(round(window_s / series.median_step(readings.dt_s)), 3)
+    rows = max(round(window_s / time_series.median_step(readings.dt_s)), 3)
     total = np.zeros(len(readings.time_s))
     for axis in readings.accel_b_m_s2.T / shapes.GRAVITY_M_S2:
-        slow = series.moving_mean(axis, readings.dt_s, rows)
-        total += series.moving_mean((axis - slow) ** 2, readings.dt_s, rows)
+        slow = time_series.moving_mean(axis, readings.dt_s, rows)
+        total += time_series.moving_mean((axis - slow) ** 2, readings.dt_s, rows)
     return total

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.effects import series, shapes
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects import shapes
 from ahrsd.diagnosis.effects.base import (
     Discrete,
     Effect,
@@ -18,7 +19,7 @@ from ahrsd.diagnosis.effects.base import (
     readings_of,
     rowwise_readings_of,
 )
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 _MG = 1e-3
@@ -77,7 +78,7 @@ class TimestampJitter(Scatter):
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Stamps off by a normal deviate, never so far that time would go back."""
         draw = np.random.default_rng(setting["seed"]).standard_normal(len(readings.time_s))
-        most = 0.45 * series.median_step(readings.dt_s)
+        most = 0.45 * time_series.median_step(readings.dt_s)
         time_s = readings.time_s + np.clip(float(value[0]) * draw, -most, most)
         step = np.concatenate([[np.nan], np.diff(time_s)])
         return replace(
@@ -183,7 +184,7 @@ class DroppedSamples(Discrete):
         """The rows that are left; never the first."""
         draw = np.random.default_rng(setting["seed"]).random(len(readings.time_s))
         draw[0] = 1.0
-        return series.kept(readings, draw >= float(value[0]))
+        return time_series.kept(readings, draw >= float(value[0]))
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """Two in a hundred."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from ahrsd.diagnosis.effects.base import Effect, Readings, Setting
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.values import Term
+from ahrsd.diagnosis.model import Term
 
 
 @dataclass(frozen=True, slots=True)

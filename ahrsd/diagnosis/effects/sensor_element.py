@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis.effects import series, shapes
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects import shapes
 from ahrsd.diagnosis.effects.base import (
     Clipped,
     Effect,
@@ -17,7 +18,7 @@ from ahrsd.diagnosis.effects.base import (
     Setting,
     left_over,
 )
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 Rows = NDArray[np.intp]
@@ -65,7 +66,7 @@ class AcInterference(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The alias of 60 Hz at this rate, or a line in the middle of the band."""
-        rate_hz = 1.0 / series.median_step(readings.dt_s)
+        rate_hz = 1.0 / time_series.median_step(readings.dt_s)
         alias = aliased(60.0, rate_hz)
         return ({"frequency_hz": alias if alias > _LOWEST_HZ else 0.31 * rate_hz},)
 
@@ -295,8 +296,8 @@ def lines(residual: Array, gyro_b_rad_s: Array, dt_s: Array) -> tuple[Setting, .
     None that keeps step with the samples: no source outside the device does.  None where the
     vehicle turns to and fro: whatever the model lacks returns at that rate.
     """
-    run = max(series.runs(dt_s), key=lambda r: int(r.stop - r.start))
-    values, step_s = residual[run] - residual[run].mean(axis=0), series.median_step(dt_s[run])
+    run = max(time_series.runs(dt_s), key=lambda r: int(r.stop - r.start))
+    values, step_s = residual[run] - residual[run].mean(axis=0), time_series.median_step(dt_s[run])
     if len(values) < 64 or not np.any(values):
         return ()
     window = np.hanning(len(values))[:, None]
@@ -313,7 +314,7 @@ def lines(residual: Array, gyro_b_rad_s: Array, dt_s: Array) -> tuple[Setting, .
     found: list[Setting] = []
     for _ in range(_LINES + len(_IN_STEP)):
         at = int(np.argmax(power))
-        best = float(frequency[at] + series.peak(power, at) * frequency[1])
+        best = float(frequency[at] + time_series.peak(power, at) * frequency[1])
         mains = [f for f in _MAINS_HZ if abs(aliased(f, 1 / step_s) - best) < width + 5e-4 * f]
         if mains or min(abs(best * step_s - part) for part in _IN_STEP) > width * step_s / 4:
             found.append({"frequency_hz": best, "searched": len(values) // 2, "mains_hz": mains})
@@ -343,7 +344,7 @@ def _background(power: Array) -> Array:
 def _last_update(dt_s: Array, setting: Setting) -> Rows:
     """Row of the last update for each row, counted within runs."""
     out = np.empty(len(dt_s), dtype=np.intp)
-    for run in series.runs(dt_s):
+    for run in time_series.runs(dt_s):
         row = np.arange(run.stop - run.start)
         back = (row - setting["phase"]) % setting["hold_samples"]
         out[run] = run.start + np.maximum(row - back, 0)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.effects import series, shapes
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects import shapes
 from ahrsd.diagnosis.effects.base import Linear, Readings, Setting
-from ahrsd.diagnosis.values import Columns
+from ahrsd.diagnosis.model import Columns
 
 _MG = 1e-3
 #: time constants of a drift that settles, as a vehicle that warms up does
@@ -153,7 +154,7 @@ class Hysteresis(Linear):
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """Between -1 and 1 per axis."""
         induced, radius = readings.field_b @ readings.soft_iron.T, setting["radius_gauss"]
-        gap = (series.play(induced, radius, setting.get("memory")) - induced) / radius
+        gap = (time_series.play(induced, radius, setting.get("memory")) - induced) / radius
         return Columns(mag=np.asarray(gap[:, :, None] * np.eye(3)))
 
 
@@ -186,5 +187,5 @@ class ViscousMagnetisation(Linear):
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The symmetric matrices on what trails."""
         tau, memory = setting["time_constant_s"], setting.get("memory")
-        slow = series.low_pass(readings.field_b, readings.dt_s, tau, memory)
+        slow = time_series.low_pass(readings.field_b, readings.dt_s, tau, memory)
         return Columns(mag=shapes.times_symmetric(slow - readings.field_b))

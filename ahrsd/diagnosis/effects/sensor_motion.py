@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.diagnosis.effects import series, shapes
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects import shapes
 from ahrsd.diagnosis.effects.base import (
     Effect,
     Linear,
@@ -17,7 +18,7 @@ from ahrsd.diagnosis.effects.base import (
     readings_of,
     smooth_readings_of,
 )
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 
@@ -47,7 +48,7 @@ class EddyCurrent(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """A matrix on the field's derivative."""
-        return Columns(mag=shapes.times_matrix(series.field_dot(readings)))
+        return Columns(mag=shapes.times_matrix(time_series.field_dot(readings)))
 
 
 class MagTimeLag(Effect):
@@ -82,16 +83,16 @@ class MagTimeLag(Effect):
     def columns(self, context: Context, setting: Setting) -> Columns:
         """-A dh/dt."""
         readings = readings_of(context)
-        change = series.field_dot(readings) @ readings.soft_iron.T
+        change = time_series.field_dot(readings) @ readings.soft_iron.T
         return Columns(mag=-change[:, :, None])
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """What the magnetometer would have read `value` seconds ago in place of the present."""
         lag_s = float(value[0])
         delay_s = np.full(len(readings.time_s), lag_s)
-        field = series.delayed_field(readings, delay_s) @ readings.soft_iron.T
+        field = time_series.delayed_field(readings, delay_s) @ readings.soft_iron.T
         others = readings.mag_b_gauss - readings.field_b @ readings.soft_iron.T
-        others = series.earlier(others, readings.time_s, readings.dt_s, lag_s)
+        others = time_series.earlier(others, readings.time_s, readings.dt_s, lag_s)
         return replace(readings, mag_b_gauss=field + others)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
@@ -134,9 +135,9 @@ class MagLowPass(Linear):
         """What the filter takes away, per second of its time constant."""
         tau0 = setting["time_constant_s"]
         field_b, time_s, dt_s = readings.field_b, readings.time_s, readings.dt_s
-        change = series.low_pass_of_curves(field_b, time_s, dt_s, tau0) - field_b
+        change = time_series.low_pass_of_curves(field_b, time_s, dt_s, tau0) - field_b
         others = readings.mag_b_gauss - field_b @ readings.soft_iron.T
-        change = change @ readings.soft_iron.T + series.low_pass(others, dt_s, tau0) - others
+        change = change @ readings.soft_iron.T + time_series.low_pass(others, dt_s, tau0) - others
         return Columns(mag=np.asarray(change / tau0)[:, :, None])
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.effects import pulses, series, shapes
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects import pulses, shapes
 from ahrsd.diagnosis.effects.base import Linear, Readings, Setting, left_over, readings_of
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 _MG = 1e-3
@@ -74,7 +75,7 @@ class CurrentDerivativeField(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """dI/dt on each axis."""
-        change = series.derivative(
+        change = time_series.derivative(
             shapes.course_of(readings, setting), readings.time_s, readings.dt_s
         )
         return Columns(mag=shapes.on_axes(change))
@@ -319,4 +320,6 @@ def _strongest_near(left: Array, phase: Array, time_s: Array) -> tuple[float, in
     sums, middle = np.add.reduceat(turned, starts), since[starts]
     power = np.sum(np.abs(np.exp(-2j * np.pi * np.outer(off_hz, middle)) @ sums) ** 2, axis=1)
     best = int(np.argmax(power))
-    return float(off_hz[best]) + series.peak(power, best) * float(off_hz[1] - off_hz[0]), reach + 1
+    return float(off_hz[best]) + time_series.peak(power, best) * float(
+        off_hz[1] - off_hz[0]
+    ), reach + 1

@@ -10,11 +10,12 @@ from itertools import product
 
 import numpy as np
 
+from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.effects import series, shapes
+from ahrsd.diagnosis.effects import shapes
 from ahrsd.diagnosis.effects.base import Linear, Parameter, Readings, Setting, readings_of
 from ahrsd.diagnosis.effects.dipole import found_place, unit_fields
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 _MG = 1e-3
@@ -319,8 +320,8 @@ def size_departure(context: Context) -> Array:
 
 def departures(size: Array, readings: Readings) -> tuple[list[int], int]:
     """Rows where the size departs most, and how many places there were to look at."""
-    rows = max(round(_BUMP_LENGTHS_S[0] / 2 / series.median_step(readings.dt_s)), 1)
-    away = np.abs(series.moving_mean(size, readings.dt_s, rows))
+    rows = max(round(_BUMP_LENGTHS_S[0] / 2 / time_series.median_step(readings.dt_s)), 1)
+    away = np.abs(time_series.moving_mean(size, readings.dt_s, rows))
     found: list[int] = []
     for _ in range(_BUMPS):
         found.append(int(np.argmax(away)))

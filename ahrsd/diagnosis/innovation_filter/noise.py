@@ -18,7 +18,7 @@ from scipy.linalg import solve_toeplitz
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.data_quality.facts import Fact, spans_of
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered
-from ahrsd.diagnosis.innovation_filter.probabilities import student_log_density
+from ahrsd.diagnosis.innovation_filter.regression_statistics import student_log_density
 from ahrsd.samples import Array
 
 _MOST = 12  # order of the autoregression

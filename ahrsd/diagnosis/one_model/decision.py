@@ -20,6 +20,7 @@ from ahrsd.diagnosis.answer.diagnosis import Cost, Finding, Share, Unexplained, 
 from ahrsd.diagnosis.calibration_fit.delay import usual_step
 from ahrsd.diagnosis.calibration_fit.prior import prior_of
 from ahrsd.diagnosis.effects.base import Effect, Setting
+from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.alternatives import (
     by_heading,
@@ -41,7 +42,6 @@ from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, come_and_gone
 from ahrsd.diagnosis.one_model.near_settings import changed, opened
 from ahrsd.diagnosis.one_model.remainder import GYRO_MATRIX, TURNS, still_spells
-from ahrsd.diagnosis.values import Term
 from ahrsd.diagnosis.where_and_when.address import AXES, where_of
 from ahrsd.diagnosis.where_and_when.intervals import departures
 from ahrsd.diagnosis.where_and_when.locate import Frame, single_source, unit_columns

@@ -20,13 +20,13 @@ from ahrsd.diagnosis.columns.held_columns import drawn_between, held_columns
 from ahrsd.diagnosis.columns.logger_noise import cleaned
 from ahrsd.diagnosis.columns.shown import shown
 from ahrsd.diagnosis.effects.base import Effect, Setting
+from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.one_model import effect_components, priors
 from ahrsd.diagnosis.one_model.candidates import Beside, beside
 from ahrsd.diagnosis.one_model.effect_components import LATE_STEP_S
 from ahrsd.diagnosis.one_model.evidence import At
 from ahrsd.diagnosis.one_model.linearised import Linearised
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Context
 from ahrsd.samples import Array
 
 #: rounds in which the likeliest mean is sought more finely

@@ -8,7 +8,7 @@ import numpy as np
 
 from ahrsd.diagnosis.effects.base import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.values import Term
+from ahrsd.diagnosis.model import Term
 from ahrsd.samples import Array
 
 _PROBE = 64

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.model import NullModel, Term
 from ahrsd.diagnosis.repaired_model.forward import context_along, contribution
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import NullModel, Term
 
 
 def without(

@@ -16,15 +16,15 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.diagnosis.effects import series
+from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.effects.base import Effect, Readings, readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation_filter.context import Given, build_context
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, bearings
 from ahrsd.diagnosis.innovation_filter.noise import colour_of
-from ahrsd.diagnosis.innovation_filter.recursive import autoregression, both_ways
+from ahrsd.diagnosis.model import Context, Noise, NullModel, Term
+from ahrsd.diagnosis.time_series import autoregression, both_ways
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Context, Noise, NullModel, Term
 from ahrsd.samples import Array
 
 DRIFT_S = 3.0  # shorter follows the field, longer the gyro; a gyro sampled at 10 Hz needs 3 s
@@ -88,7 +88,7 @@ def truth_along(context: Context) -> Readings:
     seen = np.einsum("nij,nj->ni", start.R_nb, start.field_b)
     direction = seen.mean(axis=0) / np.linalg.norm(seen.mean(axis=0))
     R_nb, rate = start.R_nb.copy(), start.rate_b_rad_s.copy()
-    for run in series.runs(start.dt_s):
+    for run in time_series.runs(start.dt_s):
         slow = _both_ways(seen[run], DRIFT_S, start.time_s[run])
         R_nb[run] = _smallest_turn(slow, direction) @ start.R_nb[run]
         rate[run] = _mean_rate(R_nb[run], start.time_s[run], rate[run])
@@ -141,7 +141,7 @@ def track_of(readings: Readings, like: Track | None = None) -> Track:
         gyro_b_rad_s=readings.gyro_b_rad_s,
         accel_b_m_s2=accel,
         covariates={**others, **readings.covariates},
-        runs=tuple(series.runs(readings.dt_s)),
+        runs=tuple(time_series.runs(readings.dt_s)),
     )
 
 

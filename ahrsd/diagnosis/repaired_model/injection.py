@@ -14,8 +14,8 @@ from ahrsd import so3
 from ahrsd.diagnosis.effects import profiles, request
 from ahrsd.diagnosis.effects.base import Effect, Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.repaired_model.forward import simulated
-from ahrsd.diagnosis.values import Term
 from ahrsd.samples import Array
 from ahrsd.simulation import Experiment
 from drivers.vn100.emulator.physics import GRAVITY_M_S2, matrices, quaternions

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.model import Columns, Context
 
 #: waves in a turn, at most; the variance of each falls with the square of its number
 HARMONICS = 6

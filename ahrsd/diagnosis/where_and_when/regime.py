@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis.columns.shown import shown
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 BINS = {"heading_deg": 12}

@@ -13,7 +13,7 @@ from ahrsd.diagnosis.answer.added_field import (
     less_calibration,
 )
 from ahrsd.diagnosis.calibration_fit.null import fit_null
-from ahrsd.diagnosis.values import Context
+from ahrsd.diagnosis.model import Context
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from ahrsd.diagnosis.calibration_fit.descent import NullFit
 from ahrsd.diagnosis.calibration_fit.noise_fit import FLOOR_MAG_GAUSS
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
-from ahrsd.diagnosis.values import Context
+from ahrsd.diagnosis.model import Context
 from ahrsd.samples import Array
 
 

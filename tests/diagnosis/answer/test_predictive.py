@@ -11,8 +11,8 @@ from effect_motion import moving
 from ahrsd.diagnosis.answer import predictive
 from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.repaired_model import forward
-from ahrsd.diagnosis.values import Term
 
 
 def recorded(name=None, strength=1.0, seed=0, rows=3000):

@@ -16,8 +16,8 @@ from ahrsd.diagnosis.calibration_fit.noise_fit import WALK_CAP_RAD_S_SQRT_S
 from ahrsd.diagnosis.calibration_fit.null import fit_null
 from ahrsd.diagnosis.calibration_fit.prior import rate_at_rest
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Spec, Track
-from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
 from ahrsd.simulation import ScenarioSettings, simulate
 

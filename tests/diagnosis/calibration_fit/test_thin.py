@@ -10,8 +10,8 @@ from tracks import experiment, track_of, true_model
 
 from ahrsd import so3
 from ahrsd.diagnosis.calibration_fit.thin import thin_factor, thinned, working_factor
+from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import NullModel
 
 FIELD = np.array([0.3, 0.1, 0.4])
 

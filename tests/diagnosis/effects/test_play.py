@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.diagnosis.effects.series import play
+from ahrsd.diagnosis.time_series import play
 
 
 @pytest.mark.parametrize("memory", [None, (0.3, -1.0, 0.9)])

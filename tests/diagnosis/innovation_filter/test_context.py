@@ -19,8 +19,8 @@ from ahrsd.diagnosis.innovation_filter.context import (
     smoothed_rate,
 )
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
+from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Context
 from ahrsd.samples import Array
 from ahrsd.simulation import Experiment
 

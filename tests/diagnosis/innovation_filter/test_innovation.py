@@ -10,7 +10,6 @@ from scipy import stats
 from tracks import experiment, moved_model, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.innovation_filter.blocks import NARROW, layout_of
 from ahrsd.diagnosis.innovation_filter.innovation import (
     Filtered,
     bearings,
@@ -19,8 +18,9 @@ from ahrsd.diagnosis.innovation_filter.innovation import (
     run_filter,
     sensitivities,
 )
+from ahrsd.diagnosis.innovation_filter.parallel_scan import NARROW, layout_of
+from ahrsd.diagnosis.model import Columns, NullModel
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Columns, NullModel
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 from scipy import ndimage, signal, stats
 
-from ahrsd.diagnosis.innovation_filter import probabilities, recursive
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.innovation_filter import regression_statistics
 
 VALUES = np.random.default_rng(0).standard_normal((500, 3))
 
 
 def test_one_constant_is_lfilter():
-    found = recursive.first_order(VALUES, 0.93)
+    found = time_series.first_order(VALUES, 0.93)
     np.testing.assert_allclose(found, signal.lfilter([1.0], [1.0, -0.93], VALUES, axis=0))
-    assert np.array_equal(recursive.first_order(VALUES[:1], 0.93), VALUES[:1])
+    assert np.array_equal(time_series.first_order(VALUES[:1], 0.93), VALUES[:1])
 
 
 def test_a_constant_that_changes_is_the_loop():
@@ -23,41 +24,45 @@ def test_a_constant_that_changes_is_the_loop():
     expected = VALUES.copy()
     for k in range(1, len(expected)):
         expected[k] += keep[k - 1] * expected[k - 1]
-    np.testing.assert_allclose(recursive.first_order(VALUES, keep), expected, rtol=1e-12)
+    np.testing.assert_allclose(time_series.first_order(VALUES, keep), expected, rtol=1e-12)
 
 
 def test_autoregression_is_lfilter():
     taps = np.array([0.5, -0.2, 0.3])
-    found = recursive.autoregression(VALUES, taps[:, None])
+    found = time_series.autoregression(VALUES, taps[:, None])
     np.testing.assert_allclose(found, signal.lfilter([1.0], [1.0, *-taps], VALUES, axis=0))
 
 
 def test_both_ways_weighs_by_distance():
     keep = 0.8
     weight = keep ** np.abs(np.subtract.outer(np.arange(500), np.arange(500)))
-    np.testing.assert_allclose(recursive.both_ways(VALUES, keep), weight @ VALUES, rtol=1e-9)
+    np.testing.assert_allclose(time_series.both_ways(VALUES, keep), weight @ VALUES, rtol=1e-9)
 
 
 @pytest.mark.parametrize("width", [0.4, 3.0, 200.0])
 def test_gaussian_is_mirrored_at_the_ends(width):
     expected = ndimage.gaussian_filter1d(VALUES, width, axis=0, mode="reflect")
-    np.testing.assert_allclose(recursive.gaussian(VALUES, width), expected, atol=1e-12)
+    np.testing.assert_allclose(time_series.gaussian(VALUES, width), expected, atol=1e-12)
 
 
 def test_probabilities_are_those_of_the_distributions():
-    assert probabilities.chi2_above(7.3, 4) == pytest.approx(stats.chi2.sf(7.3, 4), rel=1e-12)
-    assert probabilities.chi2_below(7.3, 4) == pytest.approx(stats.chi2.cdf(7.3, 4), rel=1e-12)
+    assert regression_statistics.chi2_above(7.3, 4) == pytest.approx(
+        stats.chi2.sf(7.3, 4), rel=1e-12
+    )
+    assert regression_statistics.chi2_below(7.3, 4) == pytest.approx(
+        stats.chi2.cdf(7.3, 4), rel=1e-12
+    )
     above = stats.kstwobign.sf(1.1)
-    assert probabilities.kolmogorov_above(1.1) == pytest.approx(above, rel=1e-9)
+    assert regression_statistics.kolmogorov_above(1.1) == pytest.approx(above, rel=1e-9)
     quantile = stats.t.ppf(0.9995, 15)
-    assert probabilities.student_quantile(0.9995, 15) == pytest.approx(quantile, rel=1e-9)
+    assert regression_statistics.student_quantile(0.9995, 15) == pytest.approx(quantile, rel=1e-9)
 
 
 def test_student_of_variance_one():
     for freedom in (2.2, 5.0, 60.0):
         scale = np.sqrt((freedom - 2) / freedom)
         expected = stats.t.logpdf(VALUES, freedom, scale=scale)
-        found = probabilities.student_log_density(VALUES, freedom)
+        found = regression_statistics.student_log_density(VALUES, freedom)
         np.testing.assert_allclose(found, expected, rtol=1e-10)
 
 

@@ -7,8 +7,13 @@ import pytest
 from scipy.signal import lfilter
 
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.innovation_filter.evidence import SIZES, log_bayes, posterior
-from ahrsd.diagnosis.innovation_filter.score import solve, total_score
+from ahrsd.diagnosis.innovation_filter.regression_statistics import (
+    SIZES,
+    log_bayes,
+    posterior,
+    solve,
+    total_score,
+)
 
 
 def test_a_direction_counts_where_one_prior_deviation_would_show():

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.innovation_filter.gains import inverse
-from ahrsd.diagnosis.innovation_filter.side_by_side import batches, joined
-from ahrsd.diagnosis.values import Columns
+from ahrsd.diagnosis.innovation_filter.innovation import batches, joined
+from ahrsd.diagnosis.innovation_filter.parallel_scan import inverse
+from ahrsd.diagnosis.model import Columns
 
 
 def of(mag: int = 0, gyro: int = 0) -> Columns:

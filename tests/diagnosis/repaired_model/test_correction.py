@@ -10,11 +10,11 @@ from tracks import experiment, track_of, true_model
 
 from ahrsd.diagnosis.effects import profiles
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.model import Noise, Term
 from ahrsd.diagnosis.repaired_model.correction import without
 from ahrsd.diagnosis.repaired_model.forward import context_along, simulated, truth_along
 from ahrsd.diagnosis.repaired_model.forward import track_of as track_from
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, to_text
-from ahrsd.diagnosis.values import Noise, Term
 
 LEFT = ("mag_quantisation", "dropped_samples", "noise_level")
 UNDONE = (  # share of the effect that may stay: its contribution is taken along the measured motion

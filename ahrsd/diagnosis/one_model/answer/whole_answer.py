@@ -28,6 +28,7 @@ from ahrsd.diagnosis.data_quality.hygiene import would_have_shown
 from ahrsd.diagnosis.data_quality.prepared import Prepared
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.innovation_filter.noise import level_facts
+from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.answer import pictures, residual_checks, support, visibility
 from ahrsd.diagnosis.one_model.answer.held_out import HeldOut
@@ -37,7 +38,6 @@ from ahrsd.diagnosis.one_model.decision import Answer
 from ahrsd.diagnosis.one_model.logged_columns import as_recorded
 from ahrsd.diagnosis.one_model.recorded_rate import Quick
 from ahrsd.diagnosis.one_model.search_rounds import Searched
-from ahrsd.diagnosis.values import Term
 from ahrsd.diagnosis.where_and_when import locate
 
 #: what has a setting

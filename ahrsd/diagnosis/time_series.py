@@ -1,6 +1,18 @@
-"""Operations on columns of samples that know about gap-free runs: rates, delays, filters, play.
+"""Operations on columns of samples, by linear algebra alone: rates, delays, filters, play.
 
-A run begins where `dt_s` is nan.  Nothing here reaches over a gap.
+They know about gap-free runs: a run begins where `dt_s` is nan, and nothing here reaches over a
+gap.
+
+A recursive filter
+
+    y_k = keep_k y_(k-1) + x_k
+
+is a triangular system with one band.  (Importing scipy's signal processing costs more time than a
+short recording's whole diagnosis spends in filters.)
+
+What a time series is expected to be, given values of it with white noise, is Wiener's filter of
+them (`denoised`): of every frequency the part S - N of the power S is kept, where the noise's power
+N is that of the upper half of the frequencies.
 """
 
 from __future__ import annotations
@@ -10,11 +22,22 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
+from scipy.linalg.lapack import dtbtrs
 
 from ahrsd import so3
 from ahrsd.diagnosis.effects.base import Readings
-from ahrsd.diagnosis.innovation_filter.recursive import first_order
 from ahrsd.samples import Array
+
+_TRUNCATED = 4.0  # deviations of a Gaussian that are kept
+#: rows from which on values have a spectrum
+SPECTRUM_ROWS = 200
+#: frequencies over which the power is averaged, half a cycle per recording apart
+SPECTRUM_WIDTH = 40
+#: where the power is less than this many times the noise's, nothing of it is the course's
+SPECTRUM_SINK = 2.0
+#: median of the square of a standard normal number
+_MEDIAN_SQUARE = 0.4549
 
 
 def runs(dt_s: Array) -> list[slice]:
@@ -233,3 +256,51 @@ def peak(power: Array, best: int) -> float:
     left, middle, right = (float(p) for p in power[best - 1 : best + 2])
     bend = left - 2 * middle + right
     return 0.5 * (left - right) / bend if bend < 0 else 0.0
+
+
+def first_order(values: Array, keep: float | Array) -> Array:
+    """(N, k) of (N, k): each row plus `keep`, one number or (N - 1,), times the result before."""
+    return autoregression(values, np.atleast_1d(np.asarray(keep, float))[None])
+
+
+def autoregression(values: Array, coefficients: Array) -> Array:
+    """(N, k): y_k = sum_j coefficients_j y_(k-j) + values_k, from zero.
+
+    coefficients: (p, 1), or (p, N - 1) where they change from row to row
+    """
+    count = len(values)
+    band = np.ones((len(coefficients) + 1, count))
+    band[1:, : count - 1] = -coefficients
+    out, _ = dtbtrs(band, values.reshape(count, -1), uplo="L", diag="U")
+    return np.asarray(out).reshape(values.shape)
+
+
+def both_ways(values: Array, keep: float) -> Array:
+    """(N, k) sums over all rows, weighted by keep^|distance|."""
+    back = first_order(values[::-1], keep)[::-1]
+    return np.asarray(first_order(values, keep) + back - values)
+
+
+def gaussian(values: Array, width: float) -> Array:
+    """(N, k) smoothed by a Gaussian of `width` rows, mirrored at the ends."""
+    reach = int(_TRUNCATED * width + 0.5)
+    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+    weight /= weight.sum()
+    mirrored = np.pad(values, [(reach, reach), (0, 0)], mode="symmetric")
+    columns = [np.convolve(column, weight, mode="valid") for column in mirrored.T]
+    return np.column_stack(columns)
+
+
+def denoised(values: Array) -> Array:
+    """(N, k) courses as they are expected to be, given values (N, k) with white noise.
+
+    In cosines: no step from the end to the beginning.
+    """
+    mean = values.mean(axis=0)
+    cosines = fft.dct(values - mean, axis=0, norm="ortho")
+    power = cosines**2
+    noise = np.median(power[len(power) // 2 :], axis=0) / _MEDIAN_SQUARE
+    one_run = np.concatenate([[np.nan], np.ones(len(power) - 1)])
+    smooth = np.column_stack([moving_mean(column, one_run, SPECTRUM_WIDTH) for column in power.T])
+    part = np.where(smooth > SPECTRUM_SINK * noise, 1.0 - noise / np.maximum(smooth, 1e-300), 0.0)
+    return np.asarray(fft.idct(cosines * part, axis=0, norm="ortho") + mean)
