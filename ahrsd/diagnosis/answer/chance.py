@@ -38,9 +38,8 @@ import numpy as np
 from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.answer.diagnosis import Check, Diagnosis, Finding, Unexplained
 from ahrsd.diagnosis.answer.predictive import beside_refitted, checks, usual_noise
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
 from ahrsd.diagnosis.calibration_fit.noise_fit import FLOOR_MAG_GAUSS
-from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null
 from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate, problem_of
 from ahrsd.diagnosis.data_quality.hygiene import would_have_shown
 from ahrsd.diagnosis.effects.base import Readings

@@ -19,8 +19,12 @@ from numpy.typing import NDArray
 
 from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.answer.diagnosis import Check
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
-from ahrsd.diagnosis.calibration_fit.rounded import before_rounding, bent, calibration_covariance
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
+from ahrsd.diagnosis.calibration_fit.quantisation_noise import (
+    before_rounding,
+    bent,
+    calibration_covariance,
+)
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation_filter.innovation import (

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
-from ahrsd.diagnosis.calibration_fit.coarse import noise_of
+from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.data_quality.facts import Fact, spans_of
 from ahrsd.diagnosis.track import Track
 from ahrsd.printable import counted
@@ -26,7 +26,7 @@ _COARSE = 2.0  # steps of the quantisation over the noise's deviation that matte
 
 def clipping(track: Track) -> list[Fact]:
     """Saturation of either sensor."""
-    mag_noise, gyro_noise = noise_of(track)
+    mag_noise, gyro_noise = noise_of_differences(track)
     out = []
     for effect, values, noise, unit, frame in (
         ("mag_saturation", track.mag_b_gauss, mag_noise, "gauss", "sensor"),
@@ -144,7 +144,7 @@ def _heap(values: Array, noise: float) -> float:
 
 def quantisation(track: Track) -> list[Fact]:
     """A step of the magnetometer's numbers that is coarse against its noise."""
-    noise = noise_of(track)[0]
+    noise = noise_of_differences(track)[0]
     steps = np.array([step_of(track.mag_b_gauss[:, axis]) for axis in range(3)])
     coarse = steps > _COARSE * noise
     if noise == 0.0:  # most seconds show no change at all: coarse, or stuck

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
-from ahrsd.diagnosis.calibration_fit.coarse import noise_of
+from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.data_quality.facts import Fact, spans_of
 from ahrsd.diagnosis.time_series import runs
 from ahrsd.diagnosis.track import Track
@@ -119,7 +119,7 @@ def _turned_by_field(track: Track, k: int) -> float:
     across = -np.cross(unit[k], m)
     turn = np.sum(rest * across, axis=1) / np.maximum(np.sum(across**2, axis=1), 1e-300)
     left = rest - turn[:, None] * across
-    noise = noise_of(track)[0] * np.sqrt(2.0 / _BLOCK)
+    noise = noise_of_differences(track)[0] * np.sqrt(2.0 / _BLOCK)
     shown = 1.0 - np.sum(left**2) / max(float(np.sum(rest**2)), 1e-300)
     if shown < _SHOWN_SHARE or rest.std() < _ABOVE_NOISE * noise:
         return 0.0
@@ -258,7 +258,7 @@ def _words(vector: Array) -> str:
 
 def _least_gauss(track: Track) -> float:
     """By how much a reading must move to have moved for certain."""
-    return max(_MOVED * track.usual_gauss, _MOVED_NOISE * noise_of(track)[0], 1e-6)
+    return max(_MOVED * track.usual_gauss, _MOVED_NOISE * noise_of_differences(track)[0], 1e-6)
 
 
 def _swing_rad(mag: Array) -> float:

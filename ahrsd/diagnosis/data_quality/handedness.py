@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.diagnosis.calibration_fit.prior import ellipsoid, sphere_centre
+from ahrsd.diagnosis.calibration_fit.null_fit import ellipsoid, sphere_centre
 from ahrsd.diagnosis.data_quality.frames import Windows, free_frame, ranked, windows
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array

@@ -15,7 +15,7 @@ import numpy as np
 
 from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
-from ahrsd.diagnosis.calibration_fit.coarse import noise_of
+from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.data_quality.clipping import clipping, quantisation
 from ahrsd.diagnosis.data_quality.dead import stuck_axes, stuck_gyro
 from ahrsd.diagnosis.data_quality.facts import Fact
@@ -222,7 +222,7 @@ def _hidden(track: Track) -> bool:
     if not whole:
         return True
     means = np.nan_to_num(track.gyro_b_rad_s[:whole]).reshape(-1, rows, 3).mean(axis=1)
-    noise = 3 * noise_of(track)[1] ** 2 / rows
+    noise = 3 * noise_of_differences(track)[1] ** 2 / rows
     return bool(noise > _NOISE_SHARE * np.sum(np.var(means, axis=0)))
 
 
@@ -288,7 +288,7 @@ def put_right(track: Track, facts: Sequence[Fact]) -> Track:
 
 def would_have_shown(track: Track) -> tuple[str, ...]:
     """What the checks would have shown here, one line each."""
-    mag, gyro = noise_of(track)
+    mag, gyro = noise_of_differences(track)
     step = track.step_s
     found = windows(track)
     shown = [

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding
-from ahrsd.diagnosis.calibration_fit.null import unusable
+from ahrsd.diagnosis.calibration_fit.null_fit import unusable
 from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.data_quality.dead import dead
 from ahrsd.diagnosis.data_quality.facts import Fact, matters, of_fact, stopped

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
-from ahrsd.diagnosis.calibration_fit.coarse import noise_of
-from ahrsd.diagnosis.calibration_fit.prior import sphere_centre
+from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
+from ahrsd.diagnosis.calibration_fit.null_fit import sphere_centre
 from ahrsd.diagnosis.data_quality.clipping import step_of
 from ahrsd.diagnosis.data_quality.facts import Fact, spans_of
 from ahrsd.diagnosis.track import Track
@@ -82,7 +82,7 @@ def _turned(track: Track, centre: Array, first: int, last: int) -> float:
 
 def _resolution(track: Track) -> float:
     """The noise, or the step of the numbers where that is coarser: within it readings repeat."""
-    return max(noise_of(track)[0], _step(track), 1e-6)
+    return max(noise_of_differences(track)[0], _step(track), 1e-6)
 
 
 def _step(track: Track) -> float:
@@ -182,7 +182,7 @@ def _doubled(track: Track, again: NDArray[np.bool]) -> list[Fact]:
     it does not turn about, each sensor's for itself: a sample that came twice repeats both.
     """
     rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
-    turning = np.max(np.abs(rate), axis=1) > _TURNING * noise_of(track)[1]
+    turning = np.max(np.abs(rate), axis=1) > _TURNING * noise_of_differences(track)[1]
     mag, gyro = again & turning, _again(track, track.gyro_b_rad_s) & turning
     both = mag & gyro
     count, fresh = int(np.count_nonzero(both)), turning & ~mag

@@ -14,10 +14,9 @@ from functools import partial
 
 from ahrsd.diagnosis.answer.chance import Answered, beyond_chance
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
-from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.gyro_at_rest import at_rest, resting, told_at_rest
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null
 from ahrsd.diagnosis.calibration_fit.problem import Problem, problem_of
-from ahrsd.diagnosis.calibration_fit.resting import at_rest, resting, told_at_rest
 from ahrsd.diagnosis.columns.logged import with_holes
 from ahrsd.diagnosis.data_quality.missing import differ, lost_turns
 from ahrsd.diagnosis.data_quality.prepared import prepared

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
 
 from ahrsd.diagnosis.calibration_fit import noise_fit
-from ahrsd.diagnosis.calibration_fit.prior import prior_of
+from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
 from ahrsd.diagnosis.calibration_fit.problem import Problem
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import (

@@ -20,7 +20,7 @@ from ahrsd.diagnosis.answer.chance import (
 )
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Unexplained, Where
 from ahrsd.diagnosis.answer.spoken import verdict
-from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.repaired_model.forward import noise_of

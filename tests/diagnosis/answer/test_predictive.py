@@ -9,7 +9,7 @@ import pytest
 from effect_motion import moving
 
 from ahrsd.diagnosis.answer import predictive
-from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.repaired_model import forward

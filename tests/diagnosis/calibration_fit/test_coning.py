@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.diagnosis.calibration_fit.coning import with_delta_angles
-from ahrsd.diagnosis.calibration_fit.null import cold_start
+from ahrsd.diagnosis.calibration_fit.gyro_readings import with_delta_angles
+from ahrsd.diagnosis.calibration_fit.null_fit import cold_start
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.samples import Array
 

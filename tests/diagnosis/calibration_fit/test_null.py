@@ -10,12 +10,10 @@ from scipy import stats
 from tracks import experiment, recorded, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.calibration_fit.coarse import noise_of, thinned
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
-from ahrsd.diagnosis.calibration_fit.noise_fit import WALK_CAP_RAD_S_SQRT_S
-from ahrsd.diagnosis.calibration_fit.null import fit_null
-from ahrsd.diagnosis.calibration_fit.prior import rate_at_rest
+from ahrsd.diagnosis.calibration_fit.noise_fit import WALK_CAP_RAD_S_SQRT_S, noise_of_differences
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null, rate_at_rest
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.calibration_fit.resampling import decimated
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.samples import Array
@@ -110,7 +108,7 @@ def test_the_gyros_noise_does_not_swallow_a_drift_of_the_gyro() -> None:
     track = track_of(made)
     ramp = np.linspace(-1, 1, 3000)[:, None] * np.array([3e-3, -2e-3, 4e-3])
     fit = fit_null(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + ramp))
-    assert fit.model.sigma_gyro_rad_s <= 1.5 * noise_of(track)[1] * 1.01
+    assert fit.model.sigma_gyro_rad_s <= 1.5 * noise_of_differences(track)[1] * 1.01
     assert fit.model.gyro_walk_rad_s_sqrt_s <= WALK_CAP_RAD_S_SQRT_S * 1.01
 
 
@@ -128,7 +126,7 @@ def test_a_wandering_gyro_bias_is_in_the_null() -> None:
 
 def test_thinning_composes_rotations_exactly() -> None:
     track = track_of(experiment("wam", samples=400))
-    coarse = thinned(track, 5)
+    coarse = decimated(track, 5)
     assert len(coarse) == 80
     by_one = np.eye(3)
     for k in range(5, 10):
@@ -142,7 +140,7 @@ def test_a_track_with_holes_is_thinned_at_its_readings() -> None:
     track = track_of(experiment("wam", samples=400))
     mag = track.mag_b_gauss.copy()
     mag[np.arange(400) % 4 != 1] = np.nan
-    coarse = thinned(replace(track, mag_b_gauss=mag), 5)
+    coarse = decimated(replace(track, mag_b_gauss=mag), 5)
     assert np.isfinite(coarse.mag_b_gauss).all()
     # whatever the groups, the whole turn stays
     whole, composed = np.eye(3), np.eye(3)
@@ -158,7 +156,7 @@ def test_a_track_with_holes_is_thinned_at_its_readings() -> None:
 
 
 def test_noise_of_differences() -> None:
-    mag, gyro = noise_of(track_of(experiment("lam", samples=4000, sigma_gyro=2e-3)))
+    mag, gyro = noise_of_differences(track_of(experiment("lam", samples=4000, sigma_gyro=2e-3)))
     assert abs(mag / 1e-3 - 1) < 0.06
     assert abs(gyro / 2e-3 - 1) < 0.06
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from odd_tracks import COUNT, RATE_HZ, standing, warming
 
-from ahrsd.diagnosis.calibration_fit.null import fit_null
-from ahrsd.diagnosis.calibration_fit.resting import resting
+from ahrsd.diagnosis.calibration_fit.gyro_at_rest import resting
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.track import Track
 

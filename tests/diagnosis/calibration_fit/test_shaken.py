@@ -9,9 +9,9 @@ import pytest
 from odd_tracks import shaking, wobbling
 from tracks import experiment, recorded, track_of
 
-from ahrsd.diagnosis.calibration_fit.coarse import noise_of
+from ahrsd.diagnosis.calibration_fit.gyro_readings import shaken
+from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
-from ahrsd.diagnosis.calibration_fit.shaken import shaken
 from ahrsd.diagnosis.track import Spec
 
 
@@ -42,7 +42,9 @@ def test_one_axis_that_a_propeller_shakes_says_nothing_of_the_gyro_s_noise() -> 
     track = track_of(experiment("wam", seed=3, samples=6000, sigma_gyro=3e-4))
     rate = track.gyro_b_rad_s.copy()
     rate[:, 0] += 5e-3 * np.sin(2 * np.pi * 11.0 * track.time_s)
-    assert noise_of(replace(track, gyro_b_rad_s=rate))[1] == pytest.approx(3e-4, rel=0.15)
+    assert noise_of_differences(replace(track, gyro_b_rad_s=rate))[1] == pytest.approx(
+        3e-4, rel=0.15
+    )
 
 
 def test_where_the_averaged_rows_differ_by_their_motion_the_noise_is_that_of_the_recorded() -> None:
@@ -50,5 +52,5 @@ def test_where_the_averaged_rows_differ_by_their_motion_the_noise_is_that_of_the
     problem, _ = problem_of(wobbling(sigma_gyro), Spec())
     assert problem.thin > 1
     of_row = sigma_gyro / np.sqrt(problem.thin)
-    assert noise_of(problem.track)[1] > 2 * of_row
+    assert noise_of_differences(problem.track)[1] > 2 * of_row
     assert problem.spec.sigma_gyro_rad_s == pytest.approx(of_row, rel=0.3)

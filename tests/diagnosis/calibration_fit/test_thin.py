@@ -9,7 +9,7 @@ import pytest
 from tracks import experiment, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.calibration_fit.thin import thin_factor, thinned, working_factor
+from ahrsd.diagnosis.calibration_fit.resampling import thin_factor, thinned, working_factor
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Track
 

@@ -11,7 +11,7 @@ from tracks import experiment, recorded, track_of, true_model
 
 from ahrsd import so3
 from ahrsd.diagnosis.answer.diagnosis import Where
-from ahrsd.diagnosis.calibration_fit.coarse import noise_of
+from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.data_quality.clipping import clipping, quantisation, step_of
 from ahrsd.diagnosis.data_quality.facts import Fact, around, lost_at, matters, spans_of
 from ahrsd.diagnosis.data_quality.frames import ranked, windows
@@ -421,13 +421,13 @@ def test_steps_so_coarse_that_most_seconds_show_no_change(track: Track) -> None:
     slow = 0.3 * np.column_stack([np.cos(turn), np.sin(turn), np.cos(turn + 1)])
     slow += np.random.default_rng(6).normal(0, 5e-4, slow.shape)
     coarse = replace(track, mag_b_gauss=np.round(slow / 0.02) * 0.02)
-    assert noise_of(coarse)[0] == 0.0
+    assert noise_of_differences(coarse)[0] == 0.0
     [fact] = quantisation(coarse)
     assert abs(_value(fact) / 0.02 - 1) < 1e-6
     # a sensor that stands for three seconds each has no change either, but then it jumps
     stood = np.random.default_rng(7).integers(100, 200, (len(track) // 120 + 1, 3))
     stuck = replace(track, mag_b_gauss=np.repeat(1e-3 * stood, 120, axis=0)[: len(track)])
-    assert noise_of(stuck)[0] == 0.0
+    assert noise_of_differences(stuck)[0] == 0.0
     assert abs(step_of(stuck.mag_b_gauss[:, 1]) / 1e-3 - 1) < 1e-6
     assert quantisation(stuck) == []
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tracks import experiment, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.innovation_filter.context import (
     bandwidth_hz,
     build_context,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.where_and_when.by_heading import HARMONICS, heading_columns
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.diagnosis.answer.predictive import usual_noise
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.data_quality.facts import Fact, rounding
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.model import Noise

@@ -20,9 +20,8 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Suspect,
     Unexplained,
 )
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
-from ahrsd.diagnosis.calibration_fit.null import baseline
-from ahrsd.diagnosis.calibration_fit.resting import HARDLY_TURNED, at_rest
+from ahrsd.diagnosis.calibration_fit.gyro_at_rest import HARDLY_TURNED, at_rest
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, baseline
 from ahrsd.diagnosis.data_quality.facts import Fact, around, lost_at, of_fact, rounding
 from ahrsd.diagnosis.data_quality.hygiene import would_have_shown
 from ahrsd.diagnosis.data_quality.prepared import Prepared

@@ -1,22 +1,28 @@
-"""A track at a lower rate with next to all of its information.
+"""A track at a lower rate: averaged for a search, or decimated for a quick descent.
 
-Every m samples become one: readings carried to the middle sample by the gyro and averaged there,
-the gyro's turns from middle to middle multiplied.  Noise stays white as long as what the gyro's
-noise turns a group by is little beside the magnetometer's noise: carried and multiplied, the same
-noise is in the mean and in the turns on both sides of it.  Carried needs a calibration,
-h = C (m - b), turned, m = A h + b; one near the truth will do, since a group turns by a few degrees
-only.
+`thinned` keeps next to all of its information.  Every m samples become one: readings carried to the
+middle sample by the gyro and averaged there, the gyro's turns from middle to middle multiplied.
+Noise stays white as long as what the gyro's noise turns a group by is little beside the
+magnetometer's noise: carried and multiplied, the same noise is in the mean and in the turns on both
+sides of it.  Carried needs a calibration, h = C (m - b), turned, m = A h + b; one near the truth
+will do, since a group turns by a few degrees only.
 
 The middle of an even number is the later of two.  What was logged besides is averaged over the
 group, as what it does to the readings is; what tells the attitude is averaged about the middle
 sample, with half a sample at either end.
+
+`decimated` composes rotations exactly.  Each row stands for a group of consecutive samples: the
+last reading of the magnetometer, and the rate whose rotation over the whole group equals the
+product of the samples' own.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ahrsd import so3
 from ahrsd.diagnosis.model import NullModel
@@ -29,6 +35,8 @@ WORKING_HZ, SLOWEST_HZ, GROUP_TURN_RAD = 12.0, 8.0, 0.15
 #: field that the gyro's noise of m samples turns up over the magnetometer's noise, at most; of the
 #: variance of an innovation neighbours share some three hundredths there
 CARRIED = 0.5
+_DECIMATED_ROWS = 3000
+_LARGEST_TURN_RAD = 0.3  # per row, root mean square: beyond, a bias no longer adds to the mean rate
 
 
 def thin_factor(track: Track, wanted_hz: float) -> int:
@@ -170,3 +178,52 @@ def _carried(track: Track, rows: slice, m: int, model: NullModel) -> Array:
         ahead = ahead @ back[:, half - k + 1]
         h[:, half - k] = np.einsum("nij,nj->ni", ahead, h[:, half - k])
     return np.asarray(h.reshape(-1, 3) @ model.soft_iron + model.hard_iron_gauss)
+
+
+def decimation(track: Track) -> int:
+    """Samples per row: at most about 3000 rows, and no row that turns too far."""
+    step = np.linalg.norm(track.gyro_b_rad_s, axis=1) * np.nan_to_num(track.dt_s, nan=0.0)
+    turn = float(np.sqrt(np.mean(step**2)))
+    return max(1, min(len(track) // _DECIMATED_ROWS, int(_LARGEST_TURN_RAD / max(turn, 1e-9))))
+
+
+def decimated(track: Track, size: int) -> Track:
+    """Groups of `size` samples; the remainder of each run is left out.  Covariates are dropped."""
+    if size <= 1:
+        return track
+    last, first, begins = _groups(track, size)
+    if not begins:
+        return track
+    dt = np.nan_to_num(track.dt_s, nan=0.0)
+    angle = track.gyro_b_rad_s * dt[:, None]
+    total = so3.exp(angle[first])
+    for step in range(1, int(np.max(last - first)) + 1):
+        at = np.minimum(first + step, last)
+        total = total @ so3.exp(np.where((first + step <= last)[:, None], angle[at], 0.0))
+    clock = np.concatenate([[0.0], np.cumsum(dt)])
+    length = clock[last + 1] - clock[first]
+    rate = so3.log(total) / np.maximum(length, 1e-12)[:, None]
+    length[begins] = np.nan
+    runs = tuple(slice(a, b) for a, b in pairwise([*begins, len(last)]))
+    accel = None if track.accel_b_m_s2 is None else track.accel_b_m_s2[last]
+    return Track(track.time_s[last], length, track.mag_b_gauss[last], rate, accel, {}, runs)
+
+
+def _groups(track: Track, size: int) -> tuple[NDArray[np.intp], NDArray[np.intp], list[int]]:
+    """Last and first sample of each group, and which group is its run's first.
+
+    A group ends at the last sample that has a reading; what is behind it goes to the next.
+    """
+    seen = np.isfinite(track.mag_b_gauss).all(axis=1)
+    latest = np.maximum.accumulate(np.where(seen, np.arange(len(track)), -1))
+    last: list[int] = []
+    first: list[int] = []
+    begins: list[int] = []
+    for run in track.runs or (slice(0, len(track)),):
+        ends = np.unique(latest[run.start + size - 1 : run.stop : size])
+        ends = ends[ends >= run.start]
+        if len(ends) > 1:
+            begins.append(len(last))
+            first.extend([run.start, *(ends[:-1] + 1).tolist()])
+            last.extend(ends.tolist())
+    return np.array(last, dtype=np.intp), np.array(first, dtype=np.intp), begins
