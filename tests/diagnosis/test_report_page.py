@@ -32,7 +32,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Where,
 )
 from ahrsd.diagnosis.answer.spoken import lines
-from ahrsd.diagnosis.columns.shown import MOST, shown
+from ahrsd.diagnosis.columns.roles import MOST, shown
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.report import diagnosis_page
 from ahrsd.report.diagnosis_page import _STATISTICS, write_diagnosis_report

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ahrsd.diagnosis.columns.shown import shown
+from ahrsd.diagnosis.columns.roles import shown
 
 
 @dataclass(frozen=True, slots=True)

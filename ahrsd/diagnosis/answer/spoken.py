@@ -15,7 +15,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
 )
 from ahrsd.diagnosis.answer.ordinary_text import in_one_sentence, ordinary_left, size_lines
 from ahrsd.diagnosis.answer.setting_text import setting_text
-from ahrsd.diagnosis.columns.shown import shown
+from ahrsd.diagnosis.columns.roles import shown
 
 _FRAMES = {
     "sensor": "turns with the vehicle",

@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.columns.shown import shown
+from ahrsd.diagnosis.columns.roles import shown
 from ahrsd.diagnosis.external_simulation import cut
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.where_and_when.locate import Located

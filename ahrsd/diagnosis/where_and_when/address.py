@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Where
-from ahrsd.diagnosis.columns.shown import shown
+from ahrsd.diagnosis.columns.roles import shown
 from ahrsd.diagnosis.effects.base import Setting
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.where_and_when.intervals import spans

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis.columns.shown import shown
+from ahrsd.diagnosis.columns.roles import shown
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.columns.held_columns import drawn_between, held_columns
+from ahrsd.diagnosis.columns.held_and_noisy import drawn_between, held_columns
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.columns.logger_noise import cleaned, logged, without_noise
+from ahrsd.diagnosis.columns.held_and_noisy import cleaned, logged, without_noise
 
 ROWS = 12_000
 
