@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.diagnosis.columns.roles import prepared
-from ahrsd.diagnosis.data_quality.dead import dead_axes, possible
+from ahrsd.diagnosis.data_quality.axes_and_units import as_recorded, windows
 from ahrsd.diagnosis.data_quality.facts import matters
-from ahrsd.diagnosis.data_quality.frames import windows
-from ahrsd.diagnosis.data_quality.hygiene import as_recorded, hygiene
-from ahrsd.diagnosis.data_quality.pauses import without_jumps
+from ahrsd.diagnosis.data_quality.preparation import facts_of
+from ahrsd.diagnosis.data_quality.stuck import dead_axes, possible
+from ahrsd.diagnosis.data_quality.timestamps import without_jumps
 from ahrsd.diagnosis.effects.shapes import GRAVITY_M_S2
 from ahrsd.diagnosis.repaired_model.correction import without
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
@@ -98,7 +98,7 @@ def faults(blocks: list[SampleBlock]) -> tuple[list[str], list[str]]:
 
     A clock that jumps where a run begins (a restart of the device) is no wrong time.
     """
-    facts = hygiene(without_jumps(track_of(blocks))[0]) if blocks else ()
+    facts = facts_of(without_jumps(track_of(blocks))[0]) if blocks else ()
     wrong = [fact.words for fact in facts if fact.stops]
     return wrong, [fact.words for fact in facts if not fact.stops and matters(fact)]
 

@@ -32,7 +32,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Where,
 )
 from ahrsd.diagnosis.answer.spoken import lines
-from ahrsd.diagnosis.columns.roles import MOST, shown
+from ahrsd.diagnosis.columns.roles import SHOWN_CHARACTERS, shown
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.report import diagnosis_page
 from ahrsd.report.diagnosis_page import _STATISTICS, write_diagnosis_report
@@ -314,6 +314,6 @@ def test_a_long_name_keeps_its_beginning_and_its_end():
     assert shown("motor_current_a") == "motor_current_a"
     assert shown("a\tb") == "a\\tb"
     long = shown("begin" + "x" * 100 + "_a")
-    assert len(long) == MOST
+    assert len(long) == SHOWN_CHARACTERS
     assert long.startswith("begin")
     assert long.endswith("..." + "x" * 8 + "_a")

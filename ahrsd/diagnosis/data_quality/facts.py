@@ -17,7 +17,7 @@ from ahrsd.samples import Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fact:
-    """One finding of the hygiene.
+    """One thing that is wrong with a recording.
 
     effect:     identifier of the contract;  words: one line that says it with its numbers
     confidence: of the name, 0..1

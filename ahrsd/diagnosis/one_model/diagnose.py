@@ -17,9 +17,8 @@ from ahrsd.diagnosis.answer.diagnosis import Diagnosis
 from ahrsd.diagnosis.calibration_fit.gyro_at_rest import at_rest, resting, told_at_rest
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null
 from ahrsd.diagnosis.calibration_fit.problem import Problem, problem_of
-from ahrsd.diagnosis.columns.logged import with_holes
-from ahrsd.diagnosis.data_quality.missing import differ, lost_turns
-from ahrsd.diagnosis.data_quality.prepared import prepared
+from ahrsd.diagnosis.data_quality.dropped_samples import differ, lost_turns
+from ahrsd.diagnosis.data_quality.preparation import prepared, with_holes
 from ahrsd.diagnosis.effects.base import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.one_model import rich

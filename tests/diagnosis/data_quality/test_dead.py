@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 from tracks import experiment, recorded, track_of
 
-from ahrsd.diagnosis.data_quality.dead import dead, dead_axes, possible, stuck_axes, stuck_gyro
 from ahrsd.diagnosis.data_quality.facts import matters
-from ahrsd.diagnosis.data_quality.hygiene import hygiene, put_right
+from ahrsd.diagnosis.data_quality.preparation import facts_of, put_right
+from ahrsd.diagnosis.data_quality.stuck import (
+    dead,
+    dead_axes,
+    possible,
+    stuck_axes,
+    stuck_gyro,
+)
 from ahrsd.diagnosis.track import Track
 
 
@@ -98,7 +104,7 @@ def test_a_dead_axis_is_said(track: Track) -> None:
 def test_an_axis_that_is_stuck_for_a_while_is_not_used(track: Track) -> None:
     mag = track.mag_b_gauss.copy()
     mag[2000:3000, 1] = mag[2000, 1]
-    (fact,) = hygiene(replace(track, mag_b_gauss=mag))
+    (fact,) = facts_of(replace(track, mag_b_gauss=mag))
     assert fact.effect == "stuck_magnetometer"
     assert fact.where.axes == ("y",)
     assert fact.bad is not None
@@ -109,7 +115,7 @@ def test_a_gyro_that_is_stuck_for_a_while_ends_the_run(track: Track) -> None:
     gyro = track.gyro_b_rad_s.copy()
     gyro[2000:3000] = gyro[2000]
     wrong = replace(track, gyro_b_rad_s=gyro)
-    (fact,) = hygiene(wrong)
+    (fact,) = facts_of(wrong)
     assert not matters(fact)
     assert "the gyro repeats one reading while the field turns" in fact.words
     right = put_right(wrong, (fact,))
@@ -120,7 +126,7 @@ def test_a_gyro_that_is_stuck_for_a_while_ends_the_run(track: Track) -> None:
 def test_readings_of_zero_are_none(track: Track) -> None:
     mag = track.mag_b_gauss.copy()
     mag[3000:] = 0.0
-    (fact,) = hygiene(replace(track, mag_b_gauss=mag))
+    (fact,) = facts_of(replace(track, mag_b_gauss=mag))
     assert fact.effect == "stuck_magnetometer"
     assert fact.bad is not None
     assert fact.bad[3000:].all()

@@ -12,13 +12,13 @@ from tracks import experiment, recorded, track_of, true_model
 from ahrsd import so3
 from ahrsd.diagnosis.answer.diagnosis import Where
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
-from ahrsd.diagnosis.data_quality.clipping import clipping, quantisation, step_of
+from ahrsd.diagnosis.data_quality.axes_and_units import as_recorded, ranked, windows
+from ahrsd.diagnosis.data_quality.dropped_samples import missing_turns, whole_nats
 from ahrsd.diagnosis.data_quality.facts import Fact, around, lost_at, matters, spans_of
-from ahrsd.diagnosis.data_quality.frames import ranked, windows
-from ahrsd.diagnosis.data_quality.hygiene import as_recorded, hygiene, put_right, would_have_shown
-from ahrsd.diagnosis.data_quality.missing import missing_turns, whole_nats
-from ahrsd.diagnosis.data_quality.repeats import _turned
-from ahrsd.diagnosis.data_quality.stamps import regular
+from ahrsd.diagnosis.data_quality.preparation import facts_of, put_right, would_have_shown
+from ahrsd.diagnosis.data_quality.range_and_resolution import clipping, quantisation, step_of
+from ahrsd.diagnosis.data_quality.stuck import turned_gauss
+from ahrsd.diagnosis.data_quality.timestamps import regular
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
@@ -55,13 +55,13 @@ def track() -> Track:
 def test_nothing_on_simulated_nulls(scenario: str, motion: str, sigma: float) -> None:
     for seed in range(6):
         made = experiment(scenario, motion=motion, seed=seed, samples=5000, sigma_gyro=sigma)
-        assert hygiene(track_of(made)) == ()
+        assert facts_of(track_of(made)) == ()
 
 
 @pytest.mark.parametrize("name", CLEAN)
 @pytest.mark.recordings
 def test_nothing_that_matters_on_clean_recordings(name: str) -> None:
-    assert [fact.words for fact in hygiene(recorded(name)) if matters(fact)] == []
+    assert [fact.words for fact in facts_of(recorded(name)) if matters(fact)] == []
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_nothing_that_matters_on_clean_recordings(name: str) -> None:
 )
 def test_a_wrong_frame_is_named_and_undone(track: Track, axes: list[int], signs: list[int]) -> None:
     wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s[:, axes] * np.array(signs))
-    fact = _only(hygiene(wrong))
+    fact = _only(facts_of(wrong))
     assert fact.effect == "frame_error"
     assert fact.stops
     assert fact.confidence > 0.9
@@ -94,13 +94,13 @@ def test_a_turn_at_a_constant_rate_says_nothing_of_axes_and_unit() -> None:
     dt_s = np.full(len(h), 1 / 40.0)
     dt_s[0] = np.nan
     spin = Track(time_s, dt_s, mag, gyro, None, {}, (slice(0, len(h)),))
-    assert [fact.words for fact in hygiene(spin)] == []
+    assert [fact.words for fact in facts_of(spin)] == []
     assert any("would not have been seen" in line for line in would_have_shown(spin))
 
 
 def test_left_handed_axes_are_called_so(track: Track) -> None:
     wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s * np.array([1.0, 1.0, -1.0]))
-    assert "left-handed" in _only(hygiene(wrong)).words
+    assert "left-handed" in _only(facts_of(wrong)).words
 
 
 MIRRORED = [[1, 0, 0], [0, -1, 0], [0, 0, 1]]
@@ -122,7 +122,7 @@ def test_a_mirrored_magnetometer_is_no_turned_gyro(read: list[list[int]], words:
     """By gyro and field alone m and -m are the same; gravity tells, or every heading is off."""
     made = track_of(experiment("wam", samples=3000))
     wrong = replace(made, mag_b_gauss=made.mag_b_gauss @ np.array(read, float).T)
-    fact = _only(hygiene(wrong))
+    fact = _only(facts_of(wrong))
     assert fact.effect == "frame_error"
     assert words in fact.words
     assert fact.where.frame == "sensor"
@@ -133,7 +133,7 @@ def test_a_mirrored_magnetometer_is_no_turned_gyro(read: list[list[int]], words:
 def test_without_gravity_nobody_is_told_to_turn_a_sensor() -> None:
     made = track_of(experiment("wam", samples=3000))
     wrong = replace(made, mag_b_gauss=made.mag_b_gauss * np.array([1.0, -1.0, 1.0]))
-    words = _only(hygiene(replace(wrong, accel_b_m_s2=None))).words
+    words = _only(facts_of(replace(wrong, accel_b_m_s2=None))).words
     assert "or the magnetometer is left-handed (negate its y)" in words
     assert "180 deg" in words
 
@@ -141,7 +141,7 @@ def test_without_gravity_nobody_is_told_to_turn_a_sensor() -> None:
 def test_a_turned_gyro_is_told_by_the_accelerometer() -> None:
     made = track_of(experiment("wam", samples=3000))
     wrong = replace(made, gyro_b_rad_s=made.gyro_b_rad_s * np.array([-1.0, 1.0, -1.0]))
-    fact = _only(hygiene(wrong))
+    fact = _only(facts_of(wrong))
     assert fact.words == "the gyro's x y z are the magnetometer's -x y -z and the accelerometer's"
     assert fact.where.frame == "gyro"
 
@@ -162,7 +162,7 @@ def test_a_magnetometer_that_is_askew_is_told_with_its_angle(
     whole = track_of(experiment("mam", samples=6000, seed=3))
     R_mg = so3.exp(np.radians([turn_deg]))[0]
     turned = replace(whole, mag_b_gauss=whole.mag_b_gauss @ R_mg.T)
-    fact = _only(hygiene(turned))
+    fact = _only(facts_of(turned))
     assert fact.effect == "mag_gyro_misalignment"
     assert fact.stops
     found = np.degrees([value.value for value in fact.parameters])
@@ -180,7 +180,7 @@ def test_without_gravity_either_sensor_may_be_askew() -> None:
     whole = track_of(experiment("mam", samples=6000, seed=3))
     R_mg = so3.exp(np.radians([[0.0, 0.0, 45.0]]))[0]
     turned = replace(whole, mag_b_gauss=whole.mag_b_gauss @ R_mg.T, accel_b_m_s2=None)
-    assert "or the gyro is the one that is turned" in _only(hygiene(turned)).words
+    assert "or the gyro is the one that is turned" in _only(facts_of(turned)).words
 
 
 def test_a_crooked_mount_of_five_degrees_is_no_wrong_frame() -> None:
@@ -193,12 +193,12 @@ def test_a_crooked_mount_of_five_degrees_is_no_wrong_frame() -> None:
 def test_iron_that_deforms_favours_no_other_frame() -> None:
     """A slow turn of half a period; the frames' fit leaves out iron that deforms by a fifth."""
     made = experiment("wam", motion="slow", seed=0, samples=10_000, rate_hz=100.0, sigma_gyro=5e-3)
-    assert hygiene(track_of(made)) == ()
+    assert facts_of(track_of(made)) == ()
 
 
 def test_degrees_and_swapped_axes_together(track: Track) -> None:
     wrong = replace(track, gyro_b_rad_s=np.degrees(track.gyro_b_rad_s[:, [1, 0, 2]]))
-    facts = hygiene(wrong)
+    facts = facts_of(wrong)
     assert {fact.effect for fact in facts} == {"frame_error", "unit_error"}
     unit = next(fact for fact in facts if fact.effect == "unit_error")
     assert abs(_value(unit) / (180 / np.pi - 1) - 1) < 1e-9
@@ -209,7 +209,7 @@ def test_degrees_and_swapped_axes_together(track: Track) -> None:
 @pytest.mark.parametrize(("unit", "factor"), [("uT", 100.0), ("mG", 1e3), ("nT", 1e5), ("T", 1e-4)])
 def test_the_magnetometers_unit_by_the_earths_field(track: Track, unit: str, factor: float) -> None:
     wrong = replace(track, mag_b_gauss=track.mag_b_gauss * factor)
-    facts = [fact for fact in hygiene(wrong) if fact.effect == "unit_error"]
+    facts = [fact for fact in facts_of(wrong) if fact.effect == "unit_error"]
     fact = _only(tuple(facts))
     assert fact.setting == {"sensor": "mag", "unit": unit}
     right = put_right(wrong, facts).mag_b_gauss
@@ -225,7 +225,7 @@ def test_a_quiet_motion_does_not_tell_the_frame() -> None:
         mag_b_gauss=np.array([0.2, 0.1, 0.4]) + 1e-3 * rng.standard_normal((2000, 3)),
         gyro_b_rad_s=1e-3 * rng.standard_normal((2000, 3)),
     )
-    assert hygiene(at_rest) == ()
+    assert facts_of(at_rest) == ()
     assert "hardly turned" in would_have_shown(at_rest)[-1]
     assert "left-handed" in would_have_shown(track_of(made))[-1]
 
@@ -234,7 +234,7 @@ def test_a_stuck_magnetometer(track: Track) -> None:
     mag = track.mag_b_gauss.copy()
     mag[2000:2125] = mag[2000]
     stuck = replace(track, mag_b_gauss=mag)
-    fact = _only(hygiene(stuck))
+    fact = _only(facts_of(stuck))
     assert fact.effect == "stuck_magnetometer"
     assert abs(_value(fact) - 124 * 0.04) < 0.05
     begin, end = fact.where.intervals_s[0]
@@ -247,7 +247,7 @@ def test_a_stuck_magnetometer(track: Track) -> None:
 
 def test_a_held_magnetometer(track: Track) -> None:
     at = np.arange(len(track)) // 4 * 4
-    fact = _only(hygiene(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
+    fact = _only(facts_of(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
     assert fact.effect == "mag_sample_hold"
     assert fact.setting["hold"] == 4
     assert fact.bad is not None
@@ -260,7 +260,7 @@ def test_a_magnetometer_that_is_read_a_little_more_often_than_it_measures(
 ) -> None:
     count = np.arange(len(track))
     at = np.ceil(np.floor(count / rows + 1e-9) * rows - 1e-9).astype(int)
-    fact = _only(hygiene(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
+    fact = _only(facts_of(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
     assert fact.effect == "mag_sample_hold"
     assert abs(fact.setting["hold"] - rows) < 0.01
     assert f"only every {fact.setting['hold']:.4g} samples" in fact.words
@@ -272,7 +272,7 @@ def test_numbers_that_repeat_by_chance_are_not_held(track: Track) -> None:
     """As often as of a magnetometer that is held for 1.34 rows."""
     again = np.random.default_rng(3).random(len(track)) < 0.25
     at = np.maximum.accumulate(np.where(again, 0, np.arange(len(track))))
-    assert not hygiene(replace(track, mag_b_gauss=track.mag_b_gauss[at]))
+    assert not facts_of(replace(track, mag_b_gauss=track.mag_b_gauss[at]))
 
 
 @pytest.mark.parametrize("share", [0.005, 0.01, 0.02, 0.05])
@@ -282,7 +282,7 @@ def test_the_few_that_repeat_by_chance_are_no_clock(track: Track, share: float) 
     for seed in range(25):
         again = np.random.default_rng(seed).random(len(track)) < share
         at = np.maximum.accumulate(np.where(again, 0, np.arange(len(track))))
-        told += hygiene(replace(track, mag_b_gauss=track.mag_b_gauss[at]))
+        told += facts_of(replace(track, mag_b_gauss=track.mag_b_gauss[at]))
     assert [fact.words for fact in told] == []
 
 
@@ -290,7 +290,7 @@ def test_a_clock_that_repeats_seldom_is_told(track: Track) -> None:
     """39.2 readings a second in 40 rows."""
     count = np.arange(len(track))
     at = np.ceil(np.floor(count / 1.02 + 1e-9) * 1.02 - 1e-9).astype(int)
-    fact = _only(hygiene(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
+    fact = _only(facts_of(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
     assert fact.effect == "mag_sample_hold"
     assert "only every 1.02 samples" in fact.words
 
@@ -307,7 +307,7 @@ def test_a_rate_of_its_own_above_100_hz_is_ordinary(track: Track) -> None:
         gyro_b_rad_s=track.gyro_b_rad_s * 400.0 * float(np.nanmedian(track.dt_s)),
         mag_b_gauss=track.mag_b_gauss[at],
     )
-    assert [fact.effect for fact in hygiene(fast)] == []
+    assert [fact.effect for fact in facts_of(fast)] == []
 
 
 def test_doubled_samples(track: Track) -> None:
@@ -315,7 +315,7 @@ def test_doubled_samples(track: Track) -> None:
     doubled = replace(
         track, mag_b_gauss=track.mag_b_gauss[order], gyro_b_rad_s=track.gyro_b_rad_s[order]
     )
-    fact = _only(hygiene(doubled))
+    fact = _only(facts_of(doubled))
     assert fact.effect == "dropped_samples"
     assert fact.setting == {"doubled": True}
     assert abs(_value(fact) - 100 / 6000) < 2e-3
@@ -337,7 +337,7 @@ def test_coarse_numbers_of_a_vehicle_that_turns_about_one_axis_came_once() -> No
     spin = Track(time_s, dt_s, mag, gyro, None, {}, (slice(0, len(h)),))
     again = np.all(mag[1:] == mag[:-1], axis=1) & np.all(gyro[1:] == gyro[:-1], axis=1)
     assert np.count_nonzero(again) > 2e-3 * len(h)
-    assert "dropped_samples" not in [fact.effect for fact in hygiene(spin)]
+    assert "dropped_samples" not in [fact.effect for fact in facts_of(spin)]
 
 
 def test_a_limit_that_the_sensor_stays_near_for_long(track: Track) -> None:
@@ -388,14 +388,14 @@ def test_noise_that_is_added_behind_a_limit_hides_none_of_what_stands_there(trac
 
 def test_saturation_of_both_sensors(track: Track) -> None:
     mag = np.clip(track.mag_b_gauss, -np.inf, 0.3)
-    fact = _only(hygiene(replace(track, mag_b_gauss=mag)))
+    fact = _only(facts_of(replace(track, mag_b_gauss=mag)))
     assert fact.effect == "mag_saturation"
     assert _value(fact) == 0.3
     assert fact.bad is not None
     assert fact.bad[(mag == 0.3).any(axis=1)].all()
     assert not fact.bad[(np.abs(mag) < 0.29).all(axis=1)].any()
     top = 0.7 * float(np.abs(track.gyro_b_rad_s).max())
-    fact = _only(hygiene(replace(track, gyro_b_rad_s=np.clip(track.gyro_b_rad_s, -top, top))))
+    fact = _only(facts_of(replace(track, gyro_b_rad_s=np.clip(track.gyro_b_rad_s, -top, top))))
     assert fact.effect == "gyro_saturation"
     assert fact.turned is not None
     clipped = np.max(np.abs(track.gyro_b_rad_s), axis=1) >= top
@@ -409,11 +409,11 @@ def test_saturation_of_both_sensors(track: Track) -> None:
 
 def test_coarse_steps(track: Track) -> None:
     coarse = replace(track, mag_b_gauss=np.round(track.mag_b_gauss / 0.01) * 0.01)
-    fact = _only(hygiene(coarse))  # neither a limit nor a stuck sensor, though readings repeat
+    fact = _only(facts_of(coarse))  # neither a limit nor a stuck sensor, though readings repeat
     assert fact.effect == "mag_quantisation"
     assert abs(_value(fact) / 0.01 - 1) < 1e-6
     fine = replace(track, mag_b_gauss=np.round(track.mag_b_gauss / 1e-4) * 1e-4)
-    assert hygiene(fine) == ()
+    assert facts_of(fine) == ()
 
 
 def test_steps_so_coarse_that_most_seconds_show_no_change(track: Track) -> None:
@@ -450,7 +450,7 @@ def _without(track: Track, keep: np.ndarray, *, restamp: bool) -> Track:
 @pytest.mark.parametrize("missing", [0.02, 0.3])
 def test_missing_samples_by_their_stamps(track: Track, missing: float) -> None:
     keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > missing)
-    fact = _only(hygiene(_without(track, keep, restamp=False)))
+    fact = _only(facts_of(_without(track, keep, restamp=False)))
     assert fact.effect == "dropped_samples"
     assert abs(_value(fact) - (1 - len(keep) / len(track))) < 1e-3
 
@@ -504,7 +504,7 @@ def test_jittering_stamps_and_their_regular_clock(track: Track) -> None:
     rng = np.random.default_rng(2)
     stamped = track.time_s + 3e-3 * rng.standard_normal(len(track))
     jittered = replace(track, time_s=stamped, dt_s=np.diff(stamped, prepend=np.nan))
-    fact = _only(hygiene(jittered))
+    fact = _only(facts_of(jittered))
     assert fact.effect == "timestamp_jitter"
     assert abs(_value(fact) / 3e-3 - 1) < 0.1
     assert np.abs(regular(jittered) - track.time_s).max() < 3e-4
@@ -519,7 +519,7 @@ def test_stamps_in_bunches_scatter_about_the_clock_and_not_within_a_bunch() -> N
     dt_s = np.diff(stamps_s, prepend=np.nan)
     fact = next(
         one
-        for one in hygiene(replace(track, time_s=stamps_s, dt_s=dt_s))
+        for one in facts_of(replace(track, time_s=stamps_s, dt_s=dt_s))
         if one.effect == "timestamp_jitter"
     )
     assert _value(fact) == pytest.approx(np.sqrt(2 / 3) * 0.005, rel=0.1)
@@ -530,18 +530,18 @@ def test_stamps_in_bunches_scatter_about_the_clock_and_not_within_a_bunch() -> N
 def test_time_that_goes_back_stops_everything(track: Track) -> None:
     stamped = track.time_s.copy()
     stamped[700] -= 1.0
-    facts = hygiene(replace(track, time_s=stamped))
+    facts = facts_of(replace(track, time_s=stamped))
     assert facts[0].stops
     assert "row 700" in facts[0].words
 
 
 def test_two_clocks(track: Track) -> None:
     other = 5.0 + track.time_s * 1.002
-    fact = _only(hygiene(replace(track, covariates={"host_time_s": other})))
+    fact = _only(facts_of(replace(track, covariates={"host_time_s": other})))
     assert fact.effect == "clock_rate"
     assert abs(_value(fact) - 2e-3) < 1e-6
     same = replace(track, covariates={"host_time_s": track.time_s + 3.0})
-    assert hygiene(same) == ()
+    assert facts_of(same) == ()
 
 
 def test_frames_are_ranked_with_their_scale(track: Track) -> None:
@@ -566,7 +566,7 @@ def test_a_short_stop_of_the_magnetometer_and_another_one_that_no_turn_shows(tra
     mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
     mag[2000:2012], mag[3000:3012] = mag[2000], mag[3000]
     gyro[3000:3012] = np.median(gyro, axis=0)
-    fact = _only(hygiene(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro)))
+    fact = _only(facts_of(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro)))
     assert fact.effect == "stuck_magnetometer"
     assert [begin for begin, _ in fact.where.intervals_s] == [
         track.time_s[2000],
@@ -574,7 +574,7 @@ def test_a_short_stop_of_the_magnetometer_and_another_one_that_no_turn_shows(tra
     ]
     at_rest = track.mag_b_gauss.copy()
     at_rest[3000:3012] = at_rest[3000]
-    assert hygiene(replace(track, mag_b_gauss=at_rest, gyro_b_rad_s=gyro)) == ()
+    assert facts_of(replace(track, mag_b_gauss=at_rest, gyro_b_rad_s=gyro)) == ()
 
 
 @pytest.mark.parametrize(("rate_hz", "rows", "found"), [(286.0, 9, False), (40.0, 12, True)])
@@ -585,7 +585,7 @@ def test_a_reading_that_came_late_is_no_stuck_magnetometer(
     made = track_of(experiment("wam", samples=4000, rate_hz=rate_hz, sigma_mag=5e-5))
     mag = made.mag_b_gauss.copy()
     mag[2000 : 2000 + rows] = mag[2000]
-    facts = hygiene(replace(made, mag_b_gauss=mag))
+    facts = facts_of(replace(made, mag_b_gauss=mag))
     assert [fact.effect for fact in facts] == ["stuck_magnetometer"]
     assert matters(facts[0]) is found
     assert facts[0].bad is not None
@@ -598,7 +598,7 @@ def test_readings_that_came_late_again_and_again_are_a_stuck_magnetometer() -> N
     mag = made.mag_b_gauss.copy()
     for first in (1000, 3000, 5000, 7000):
         mag[first : first + 20] = mag[first]
-    (fact,) = hygiene(replace(made, mag_b_gauss=mag))
+    (fact,) = facts_of(replace(made, mag_b_gauss=mag))
     assert fact.effect == "stuck_magnetometer"
     assert fact.parameters[0].value == pytest.approx(0.38, abs=0.006)
     assert matters(fact)
@@ -645,7 +645,7 @@ def test_rates_that_are_off_by_the_factor_of_no_unit_may_be_the_time(
     track: Track, factor: float
 ) -> None:
     wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s * factor)
-    fact = _only(tuple(hygiene(wrong)))
+    fact = _only(tuple(facts_of(wrong)))
     assert fact.effect == "unit_error"
     assert "in another unit, or the time is" in fact.words
     right = put_right(wrong, [fact]).gyro_b_rad_s
@@ -659,7 +659,7 @@ def test_a_magnet_that_is_put_on_and_off_is_no_unit_of_the_gyro(track: Track) ->
     put = np.clip((t - middle) / 2.0, 0.0, 1.0) - np.clip((t - end) / 2.0, 0.0, 1.0)
     near = replace(track, mag_b_gauss=track.mag_b_gauss + 3.0 * put[:, None] * [0.6, -0.64, 0.48])
     assert not 0.5 < ranked(windows(near))[0].scale < 2.0
-    assert [one for one in hygiene(near) if one.effect == "unit_error"] == []
+    assert [one for one in facts_of(near) if one.effect == "unit_error"] == []
 
 
 def test_a_turn_about_one_axis_tells_that_axes_are_wrong_and_not_which() -> None:
@@ -717,5 +717,5 @@ def test_a_turn_about_the_field_moves_no_reading_however_large_the_hard_iron(tra
         gyro_b_rad_s=rate,
     )
     seconds = 100 * track.step_s
-    assert _turned(still, centre, 100, 200) == pytest.approx(0.0, abs=1e-12)
-    assert _turned(still, np.zeros(3), 100, 200) == pytest.approx(0.4 * seconds)
+    assert turned_gauss(still, centre, 100, 200) == pytest.approx(0.0, abs=1e-12)
+    assert turned_gauss(still, np.zeros(3), 100, 200) == pytest.approx(0.4 * seconds)

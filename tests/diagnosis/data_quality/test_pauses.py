@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.data_quality.pauses import LEFT_S, without_jumps
+from ahrsd.diagnosis.data_quality.timestamps import LEFT_S, without_jumps
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 

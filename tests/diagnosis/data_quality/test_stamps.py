@@ -7,8 +7,8 @@ import pytest
 
 from ahrsd import so3
 from ahrsd.diagnosis.data_quality.facts import matters
-from ahrsd.diagnosis.data_quality.hygiene import put_right
-from ahrsd.diagnosis.data_quality.stamps import stamps
+from ahrsd.diagnosis.data_quality.preparation import put_right
+from ahrsd.diagnosis.data_quality.timestamps import stamps
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.data_quality.missing import UNSEEN, missing_turns
-from ahrsd.diagnosis.data_quality.turns import (
+from ahrsd.diagnosis.data_quality.dropped_samples import (
+    UNSEEN,
     Means,
-    _Jumps,
+    _JumpsOfRows,
     _put_right,
+    missing_turns,
     recovered,
     some_lost,
     surplus,
@@ -151,5 +152,5 @@ def test_a_fact_says_how_many_it_expects_beyond_those_it_found() -> None:
 def test_a_step_is_not_taken_back_twice() -> None:
     lost = np.array([0, 0, 1, 0, 0])
     none = np.zeros(5)
-    found = _Jumps(np.full(5, -1), none, np.ones(5, dtype=np.int64), none)
+    found = _JumpsOfRows(np.full(5, -1), none, np.ones(5, dtype=np.int64), none)
     assert _put_right(lost, found, np.array([1, 3])).tolist() == [0, 0, 0, 0, 0]
