@@ -26,7 +26,7 @@ from scipy import fft
 from scipy.linalg.lapack import dtbtrs
 
 from ahrsd import so3
-from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.samples import Array
 
 _TRUNCATED = 4.0  # deviations of a Gaussian that are kept

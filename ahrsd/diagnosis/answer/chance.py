@@ -42,7 +42,7 @@ from ahrsd.diagnosis.calibration_fit.noise_fit import FLOOR_MAG_GAUSS
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null
 from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate, problem_of
 from ahrsd.diagnosis.data_quality.preparation import would_have_shown
-from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.innovation_filter.context import (
     Given,
     attitude,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
 
 
 def separating_manoeuvre(library: Mapping[str, Effect], name: str, others: Sequence[str]) -> str:

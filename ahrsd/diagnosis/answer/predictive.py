@@ -25,7 +25,7 @@ from ahrsd.diagnosis.calibration_fit.quantisation_noise import (
     bent,
     calibration_covariance,
 )
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation_filter.innovation import (
     Filtered,

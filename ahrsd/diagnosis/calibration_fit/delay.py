@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from ahrsd import so3
 from ahrsd.diagnosis import time_series
-from ahrsd.diagnosis.effects.base import readings_of
+from ahrsd.diagnosis.effects.effect import readings_of
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array

@@ -19,7 +19,7 @@ from scipy.special import logsumexp
 from ahrsd.diagnosis.answer.confound import separating_manoeuvre
 from ahrsd.diagnosis.answer.diagnosis import Finding, Share, Value, Where
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
-from ahrsd.diagnosis.effects.base import Effect, Setting
+from ahrsd.diagnosis.effects.effect import Effect, Setting
 from ahrsd.diagnosis.innovation_filter.regression_statistics import (
     log_bayes,
     posterior,

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
-from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.innovation_filter.innovation import nuisance_columns, sensitivities
 from ahrsd.diagnosis.innovation_filter.regression_statistics import colour
 from ahrsd.diagnosis.model import Noise

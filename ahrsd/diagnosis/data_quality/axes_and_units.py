@@ -1,6 +1,6 @@
 """Units, axes and signs of the magnetometer and the gyro, against each other and gravity.
 
-Do gyro and magnetometer mean the same axes and the same unit (`ranked`)? A field that is fixed in
+Do gyro and magnetometer mean the same axes and the same unit (`ranked`)?  A field that is fixed in
 the world turns against the sensor: with iron b, gyro bias -c, and the gyro's axes and unit P
 between it and the magnetometer,
 

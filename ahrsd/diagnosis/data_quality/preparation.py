@@ -27,7 +27,7 @@ from ahrsd.diagnosis.data_quality.facts import Fact, matters, of_fact, stopped
 from ahrsd.diagnosis.data_quality.range_and_resolution import clipping, quantisation
 from ahrsd.diagnosis.data_quality.stuck import dead, repeats, stuck_axes, stuck_gyro
 from ahrsd.diagnosis.data_quality.timestamps import regular, stamps, without_jumps
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 
 #: a diagnosis of a track and what is known of the sensor

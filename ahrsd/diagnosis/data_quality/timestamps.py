@@ -1,5 +1,4 @@
-"""What the time stamps say: samples that are missing, stamps that jitter, clocks that disagree or
-jump.
+"""What the time stamps say: missing samples, jitter, clocks that disagree, clocks that jump.
 
 The steps of a good clock are multiples of one step.  Stamps that a host made of a regular stream
 scatter, and a late stamp makes one step longer and the next shorter: neighbouring steps are

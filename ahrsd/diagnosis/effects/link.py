@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.diagnosis import time_series
-from ahrsd.diagnosis.effects import shapes
-from ahrsd.diagnosis.effects.base import (
+from ahrsd.diagnosis.effects import design_matrix
+from ahrsd.diagnosis.effects.effect import (
     Discrete,
     Effect,
     Linear,
@@ -118,7 +118,7 @@ class NoiseBurst(Scatter):
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """A tenth of the recording, in its middle."""
         length = round(0.1 * float(readings.time_s[-1] - readings.time_s[0]), 3)
-        onset = shapes.middle_s(readings)
+        onset = design_matrix.middle_s(readings)
         return strength * np.array(self.typical), {"onset_s": onset, "length_s": length, "seed": 1}
 
 
@@ -147,7 +147,7 @@ class NoiseLevel(Scatter):
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Normal noise on both sensors."""
         rng = np.random.default_rng(setting["seed"])
-        on = shapes.since(readings, setting)
+        on = design_matrix.since(readings, setting)
         mag, gyro = (rng.standard_normal(readings.mag_b_gauss.shape) * on for _ in range(2))
         return replace(
             readings,
@@ -220,7 +220,7 @@ class StuckMagnetometer(Discrete):
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """Five seconds in the middle."""
-        return strength * np.array(self.typical), {"onset_s": shapes.middle_s(readings)}
+        return strength * np.array(self.typical), {"onset_s": design_matrix.middle_s(readings)}
 
 
 class FrameError(Discrete):
@@ -314,7 +314,7 @@ class OnboardCalibrationActive(Effect):
         first = float(readings.time_s[0])
         return tuple(
             {**onset, "time_constant_s": tau}
-            for onset in ({"onset_s": first}, *shapes.onsets(readings)[::2])
+            for onset in ({"onset_s": first}, *design_matrix.onsets(readings)[::2])
             for tau in _CONVERGED_S
         )
 

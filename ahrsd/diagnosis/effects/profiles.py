@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 import numpy as np
 
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.samples import Array
 
 _LEG_M, _APART_M, _SPEED_M_S = 40.0, 8.0, 0.6

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ahrsd.diagnosis.effects.base import Effect, Readings, Setting
+from ahrsd.diagnosis.effects.effect import Effect, Readings, Setting
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.model import Term
 

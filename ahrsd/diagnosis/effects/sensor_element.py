@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis import time_series
-from ahrsd.diagnosis.effects import shapes
-from ahrsd.diagnosis.effects.base import (
+from ahrsd.diagnosis.effects import design_matrix
+from ahrsd.diagnosis.effects.effect import (
     Clipped,
     Effect,
     Linear,
@@ -46,10 +46,10 @@ class AcInterference(Linear):
     words = "an alternating field: mains, or the harmonics of a motor controller, aliased"
     equation = "m += k_c cos(2 pi f_a t) + k_s sin(2 pi f_a t), f_a = |f - n f_s|"
     parameters = (
-        *shapes.vector("cosine", "gauss", 1.0 * _MG, 50.0 * _MG),
-        *shapes.vector("sine", "gauss", 1.0 * _MG, 50.0 * _MG),
+        *design_matrix.vector("cosine", "gauss", 1.0 * _MG, 50.0 * _MG),
+        *design_matrix.vector("sine", "gauss", 1.0 * _MG, 50.0 * _MG),
     )
-    typical = (*shapes.along(1.0 * _MG), *(0.5 * _MG * part for part in (0.48, 0.6, -0.64)))
+    typical = (*design_matrix.along(1.0 * _MG), *(0.5 * _MG * part for part in (0.48, 0.6, -0.64)))
     signature = "a line in the spectrum of the innovations"
     confusers = (
         ("rotor_field", "it moves with the shaft: change the rpm"),
@@ -73,7 +73,7 @@ class AcInterference(Linear):
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """cos, then sin, on each axis."""
         phase = 2 * np.pi * setting["frequency_hz"] * readings.time_s
-        return Columns(mag=shapes.on_axes(np.column_stack([np.cos(phase), np.sin(phase)])))
+        return Columns(mag=design_matrix.on_axes(np.column_stack([np.cos(phase), np.sin(phase)])))
 
 
 class MagScaleTemperature(Linear):
@@ -84,7 +84,7 @@ class MagScaleTemperature(Linear):
     family = "sensor"
     words = "the magnetometer's sensitivity follows temperature"
     equation = "m_i += k_i (T - T0) x_i, x = A h, A h + b or h"
-    parameters = shapes.vector("gain_per_degree", "1/K", 1e-3, 2e-2)
+    parameters = design_matrix.vector("gain_per_degree", "1/K", 1e-3, 2e-2)
     typical = (1e-3, 0.8e-3, 1.2e-3)
     needs = ("temperature",)
     signature = "the field's size drifts with the warm-up and turns with the heading"
@@ -101,7 +101,7 @@ class MagScaleTemperature(Linear):
         return tuple(
             setting
             for of in ("field", "reading", "outside")
-            for setting in shapes.per_covariate(readings, "temperature", of=of)
+            for setting in design_matrix.per_covariate(readings, "temperature", of=of)
         )
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
@@ -111,7 +111,7 @@ class MagScaleTemperature(Linear):
             seen = readings.field_b @ readings.soft_iron.T
         elif setting["of"] == "outside":
             seen = readings.field_b
-        gain = shapes.course_of(readings, setting) * seen
+        gain = design_matrix.course_of(readings, setting) * seen
         return Columns(mag=np.asarray(gain[:, :, None] * np.eye(3)))
 
 
@@ -164,7 +164,7 @@ class MagNonlinearity(Linear):
     family = "sensor"
     words = "the element's gain depends on the field along it"
     equation = "m_i += k_i (m_i / 0.5 G)^3"
-    parameters = shapes.vector("cubic", "gauss", 1.0 * _MG, 20.0 * _MG)
+    parameters = design_matrix.vector("cubic", "gauss", 1.0 * _MG, 20.0 * _MG)
     typical = (1.5 * _MG, -1.0 * _MG, 1.2 * _MG)
     signature = "grows with the third power of the reading"
     confusers = (("mag_cross_axis", "pitch to 45 degrees"),)

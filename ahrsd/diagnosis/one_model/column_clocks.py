@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.diagnosis.columns.clocks import Late, at_clock, likeliest_clock, suspects
-from ahrsd.diagnosis.effects.shapes import on_axes
+from ahrsd.diagnosis.effects.design_matrix import on_axes
 from ahrsd.diagnosis.model import Columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.candidates import beside

@@ -19,7 +19,7 @@ from ahrsd.diagnosis.answer.confound import separating_manoeuvre
 from ahrsd.diagnosis.answer.diagnosis import Cost, Finding, Share, Unexplained, Value, Where
 from ahrsd.diagnosis.calibration_fit.delay import usual_step
 from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
-from ahrsd.diagnosis.effects.base import Effect, Setting
+from ahrsd.diagnosis.effects.effect import Effect, Setting
 from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.alternatives import (

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 
 from ahrsd.diagnosis.calibration_fit.delay import beyond_the_lag
-from ahrsd.diagnosis.effects.base import ANGLES, SCALES, Effect, Setting
+from ahrsd.diagnosis.effects.effect import ANGLES, SCALES, Effect, Setting
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import (

@@ -18,7 +18,7 @@ from scipy.fft import dct, idct
 from ahrsd.diagnosis.calibration_fit.problem import Problem
 from ahrsd.diagnosis.columns.held_and_noisy import cleaned, drawn_between, held_columns
 from ahrsd.diagnosis.columns.roles import shown
-from ahrsd.diagnosis.effects.base import Effect, Setting
+from ahrsd.diagnosis.effects.effect import Effect, Setting
 from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.one_model import effect_components, priors
 from ahrsd.diagnosis.one_model.candidates import Beside, beside

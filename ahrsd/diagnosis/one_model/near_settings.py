@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.effects.base import ANGLES, SCALES, Setting
+from ahrsd.diagnosis.effects.effect import ANGLES, SCALES, Setting
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.diagnosis.one_model.component import MOMENTS, Component, Fixed
 from ahrsd.samples import Array

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.model import Term
 from ahrsd.samples import Array

@@ -17,7 +17,7 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.diagnosis import time_series
-from ahrsd.diagnosis.effects.base import Effect, Readings, readings_of
+from ahrsd.diagnosis.effects.effect import Effect, Readings, readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation_filter.context import Given, build_context
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, bearings

@@ -12,7 +12,7 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.diagnosis.effects import profiles, request
-from ahrsd.diagnosis.effects.base import Effect, Readings
+from ahrsd.diagnosis.effects.effect import Effect, Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.repaired_model.forward import simulated

@@ -6,7 +6,7 @@ import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Where
 from ahrsd.diagnosis.columns.roles import shown
-from ahrsd.diagnosis.effects.base import Setting
+from ahrsd.diagnosis.effects.effect import Setting
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.where_and_when.intervals import spans
 from ahrsd.diagnosis.where_and_when.locate import segments

@@ -5,15 +5,15 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from ahrsd.diagnosis.effects.effects_text import page
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.effects.reference_page import page
 
 PROJECT = Path(__file__).parents[3]
 
 
 def test_the_page_is_written_from_the_library():
     assert (PROJECT / "docs" / "reference" / "effects.md").read_text() == page(), (
-        "run: python -m ahrsd.diagnosis.effects.effects_text > docs/reference/effects.md"
+        "run: python -m ahrsd.diagnosis.effects.reference_page > docs/reference/effects.md"
     )
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.effects.design_matrix import GRAVITY_M_S2
+from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.effects.shapes import GRAVITY_M_S2
 
 MOUNT = EFFECTS["flexible_mount"]
 

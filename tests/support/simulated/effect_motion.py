@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.model import Context, NullModel
 from ahrsd.diagnosis.track import Track
 

@@ -14,7 +14,7 @@ import numpy as np
 from ahrsd.diagnosis.answer.predictive import usual_noise
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.data_quality.facts import Fact, rounding
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.model import Noise
 from ahrsd.diagnosis.one_model.effect_components import LAG
 from ahrsd.diagnosis.one_model.linearised import Point, added, by_key, moved

@@ -24,7 +24,7 @@ from ahrsd.diagnosis.calibration_fit.gyro_at_rest import HARDLY_TURNED, at_rest
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, baseline
 from ahrsd.diagnosis.data_quality.facts import Fact, around, lost_at, of_fact, rounding
 from ahrsd.diagnosis.data_quality.preparation import Prepared, would_have_shown
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.innovation_filter.noise import level_facts
 from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.one_model import priors

@@ -1,6 +1,6 @@
 """The library of effects as a page.
 
-python -m ahrsd.diagnosis.effects.effects_text > docs/reference/effects.md
+python -m ahrsd.diagnosis.effects.reference_page > docs/reference/effects.md
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from itertools import groupby
 import numpy as np
 
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.effects.base import Effect, Parameter
+from ahrsd.diagnosis.effects.effect import Effect, Parameter
 from ahrsd.diagnosis.effects.library import EFFECTS
 
 _PREFACE = """\
@@ -20,7 +20,7 @@ _PREFACE = """\
 
 Every way in which a recording may depart from the calibration model that `ahrsd diagnose` knows by
 name, and that `ahrsd simulate --effect` and `ahrsd emulate --effect` can put in. Written by
-`python -m ahrsd.diagnosis.effects.effects_text > docs/reference/effects.md` from the code.
+`python -m ahrsd.diagnosis.effects.reference_page > docs/reference/effects.md` from the code.
 
 ```
 m = A h + b + D theta + noise      magnetometer, gauss;  A soft iron, b hard iron

@@ -1,4 +1,4 @@
-"""Pieces of which many effects are made: courses in time on the axes of a frame.
+"""Columns of which many effects are made: courses in time on the axes of a frame.
 
 A course is (N, k): k numbers per sample.  Three parameters (x, y, z) go with each of them, course
 by course.
@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.effects.base import Parameter, Readings, Setting
+from ahrsd.diagnosis.effects.effect import Parameter, Readings, Setting
 from ahrsd.samples import Array
 
 #: An ordinary direction, unit length: no axis of a real disturbance is an axis of the sensor.
