@@ -42,8 +42,7 @@ from ahrsd.diagnosis.one_model.linearised import CALIBRATION, model_of
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space, come_and_gone
 from ahrsd.diagnosis.one_model.near_settings import changed, opened
 from ahrsd.diagnosis.one_model.remainder import GYRO_MATRIX, TURNS, still_spells
-from ahrsd.diagnosis.where_and_when.address import AXES, where_of
-from ahrsd.diagnosis.where_and_when.intervals import departures
+from ahrsd.diagnosis.where_and_when.address import AXES, departures, where_of
 from ahrsd.diagnosis.where_and_when.locate import Frame, single_source, unit_columns
 from ahrsd.samples import Array
 

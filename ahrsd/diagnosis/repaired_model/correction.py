@@ -1,15 +1,24 @@
-"""A recording without what named effects added to it, so that they do not bend its calibration."""
+"""A recording without what named effects added to it, so that they do not bend its calibration.
+
+What a column of the vehicle gives by itself, as a current's field, is known sample by sample
+(`added`): a running daemon takes it out as well.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from ahrsd.diagnosis.effects.effect import Effect
+import numpy as np
+
+from ahrsd.diagnosis.effects.effect import Effect, Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.model import NullModel, Term
 from ahrsd.diagnosis.repaired_model.forward import context_along, contribution
 from ahrsd.diagnosis.track import Track
+from ahrsd.samples import Array
+
+_PROBE = 64
 
 
 def without(
@@ -34,3 +43,41 @@ def without(
         replace(track, mag_b_gauss=track.mag_b_gauss - mag, gyro_b_rad_s=track.gyro_b_rad_s - gyro),
         left,
     )
+
+
+def follows_a_column(term: Term) -> bool:
+    """Whether columns alone give the term's effect, each sample by itself.
+
+    Asked of the effect: readings in which everything but time and columns is unknown must give
+    finite numbers, and the same ones in two halves as in one piece.
+    """
+    name = term.setting.get("covariate")
+    if EFFECTS[term.identifier].kind != "mean" or not isinstance(name, str) or name == "accel":
+        return False
+    time_s = np.arange(_PROBE, dtype=np.float64)
+    dt_s = np.ones(_PROBE)
+    column = np.random.default_rng(1).normal(20.0, 5.0, _PROBE)
+    whole, first, second = (
+        added(term, time_s[rows], dt_s[rows], {name: column[rows]})
+        for rows in (slice(None), slice(_PROBE // 2), slice(_PROBE // 2, None))
+    )
+    joined = np.concatenate([first, second], axis=1)
+    return bool(np.isfinite(whole).all() and np.allclose(joined, whole, rtol=1e-9))
+
+
+def added(term: Term, time_s: Array, dt_s: Array, columns: Mapping[str, Array]) -> Array:
+    """(2, N, 3): what the term adds to field and rate; nan where it needs more than columns."""
+    count, nothing = len(time_s), np.full((len(time_s), 3), np.nan)
+    if term.setting["covariate"] not in columns:
+        return np.full((2, count, 3), np.nan)
+    silent = Readings(
+        time_s=time_s, dt_s=dt_s, mag_b_gauss=np.zeros((count, 3)),
+        gyro_b_rad_s=np.zeros((count, 3)), accel_b_m_s2=nothing, rate_b_rad_s=nothing,
+        field_b=nothing, R_nb=np.full((count, 3, 3), np.nan), soft_iron=np.full((3, 3), np.nan),
+        covariates=dict(columns),
+    )  # fmt: skip
+    try:
+        made = EFFECTS[term.identifier].simulate(silent, term.value, term.setting)
+    except KeyError:  # a setting that this effect needs is not in the file
+        return np.full((2, count, 3), np.nan)
+    return np.stack([made.mag_b_gauss, made.gyro_b_rad_s])

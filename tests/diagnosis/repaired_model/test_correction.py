@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.effects import profiles
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.model import Noise, Term
+from ahrsd.diagnosis.repaired_model import injection
 from ahrsd.diagnosis.repaired_model.correction import without
 from ahrsd.diagnosis.repaired_model.forward import context_along, simulated, truth_along
 from ahrsd.diagnosis.repaired_model.forward import track_of as track_from
@@ -29,7 +29,7 @@ UNDONE = (  # share of the effect that may stay: its contribution is taken along
 
 
 def with_columns(track, names):
-    columns = profiles.columns_for([EFFECTS[name] for name in names], track.time_s, 5)
+    columns = injection.columns_for([EFFECTS[name] for name in names], track.time_s, 5)
     return type(track)(
         track.time_s, track.dt_s, track.mag_b_gauss, track.gyro_b_rad_s,
         track.accel_b_m_s2, columns, track.runs,

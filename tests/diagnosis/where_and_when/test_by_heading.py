@@ -6,7 +6,7 @@ import numpy as np
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
-from ahrsd.diagnosis.where_and_when.by_heading import HARMONICS, heading_columns
+from ahrsd.diagnosis.where_and_when.regime import HARMONICS, heading_columns
 
 
 def test_waves_by_hand() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.where_and_when.intervals import departures
+from ahrsd.diagnosis.where_and_when.address import departures
 
 
 def test_departures_are_from_the_level_that_holds_for_longest():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ahrsd.diagnosis.where_and_when.intervals import reaching, spans
+from ahrsd.diagnosis.where_and_when.address import reaching, spans
 from ahrsd.diagnosis.where_and_when.locate import segments
 
 
