@@ -12,7 +12,7 @@ import pytest
 from browser import BROWSER, look_at
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ahrsd.diagnosis.answer import predictive
+from ahrsd.diagnosis.answer import predictive_checks
 from ahrsd.diagnosis.answer.diagnosis import (
     Baseline,
     Check,
@@ -31,7 +31,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Value,
     Where,
 )
-from ahrsd.diagnosis.answer.spoken import lines
+from ahrsd.diagnosis.answer.text import lines
 from ahrsd.diagnosis.columns.roles import SHOWN_CHARACTERS, shown
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.report import diagnosis_page
@@ -205,7 +205,7 @@ def test_statistics_are_named_in_words(usual):
 
 
 def test_every_statistic_that_is_compared_has_its_words():
-    source = inspect.getsource(predictive.statistics)
+    source = inspect.getsource(predictive_checks.statistics)
     compared = set(re.findall(r'"([a-z_]+)"[:\]]', source))
     assert compared == set(_STATISTICS)
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.special import logsumexp
 
-from ahrsd.diagnosis.answer.confound import separating_manoeuvre
 from ahrsd.diagnosis.answer.diagnosis import Finding, Share, Value, Where
+from ahrsd.diagnosis.answer.text import separating_manoeuvre
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.effects.effect import Effect, Setting
 from ahrsd.diagnosis.innovation_filter.regression_statistics import (

@@ -15,8 +15,8 @@ from typing import cast
 import numpy as np
 
 from ahrsd.diagnosis.answer.added_field import heading_error_deg
-from ahrsd.diagnosis.answer.confound import separating_manoeuvre
 from ahrsd.diagnosis.answer.diagnosis import Cost, Finding, Share, Unexplained, Value, Where
+from ahrsd.diagnosis.answer.text import separating_manoeuvre
 from ahrsd.diagnosis.calibration_fit.delay import usual_step
 from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
 from ahrsd.diagnosis.effects.effect import Effect, Setting

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
-from ahrsd.diagnosis.answer.chance import Answered, beyond_chance
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
+from ahrsd.diagnosis.answer.null_simulations import Answered, beyond_chance
 from ahrsd.diagnosis.calibration_fit.gyro_at_rest import at_rest, resting, told_at_rest
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null
 from ahrsd.diagnosis.calibration_fit.problem import Problem, problem_of

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.answer.chance import (
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Unexplained, Where
+from ahrsd.diagnosis.answer.null_simulations import (
     Answered,
     bent,
     beyond_chance,
@@ -18,8 +19,7 @@ from ahrsd.diagnosis.answer.chance import (
     motion_of,
     times_beyond,
 )
-from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Unexplained, Where
-from ahrsd.diagnosis.answer.spoken import verdict
+from ahrsd.diagnosis.answer.text import verdict
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.limits import LIMITS

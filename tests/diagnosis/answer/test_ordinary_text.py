@@ -14,8 +14,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Unexplained,
     Where,
 )
-from ahrsd.diagnosis.answer.ordinary_text import in_one_sentence, ordinary_left, size_lines
-from ahrsd.diagnosis.answer.spoken import lines, verdict
+from ahrsd.diagnosis.answer.text import in_one_sentence, lines, ordinary_left, size_lines, verdict
 from ahrsd.report.diagnosis_page import write_diagnosis_report
 
 WHY = "beyond the ordinary: a field by attitude, 80 mG where up to 19 mG is ordinary"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from effect_motion import moving
 
-from ahrsd.diagnosis.answer.setting_text import TOLD, UNTOLD, setting_text
+from ahrsd.diagnosis.answer.text import TOLD, UNTOLD, setting_text
 from ahrsd.diagnosis.effects.library import EFFECTS
 
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.answer.predictive import usual_noise
+from ahrsd.diagnosis.answer.predictive_checks import usual_noise
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.data_quality.facts import Fact, rounding
 from ahrsd.diagnosis.effects.effect import Effect

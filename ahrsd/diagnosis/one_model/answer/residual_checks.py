@@ -19,7 +19,7 @@ from scipy import special
 
 from ahrsd.diagnosis.answer.diagnosis import Check, RegimeMap, Whiteness
 from ahrsd.diagnosis.answer.omnibus import omnibus
-from ahrsd.diagnosis.answer.predictive import COPIES, bands, scene_of, statistics
+from ahrsd.diagnosis.answer.predictive_checks import COPIES, bands, scene_of, statistics
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.innovation_filter.noise import freedom_of
 from ahrsd.diagnosis.one_model import priors

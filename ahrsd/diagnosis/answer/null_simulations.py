@@ -37,7 +37,7 @@ import numpy as np
 
 from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.answer.diagnosis import Check, Diagnosis, Finding, Unexplained
-from ahrsd.diagnosis.answer.predictive import beside_refitted, checks, usual_noise
+from ahrsd.diagnosis.answer.predictive_checks import beside_refitted, checks, usual_noise
 from ahrsd.diagnosis.calibration_fit.noise_fit import FLOOR_MAG_GAUSS
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null
 from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate, problem_of

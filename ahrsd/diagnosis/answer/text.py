@@ -1,21 +1,34 @@
-"""A diagnosis in the words of a field engineer."""
+"""A diagnosis in the words of a field engineer.
+
+The whole answer is `lines`, one sentence of it `verdict`; what is left, how large it is, where, and
+what real recordings ordinarily leave is `in_one_sentence` and `size_lines`.  How an effect was read
+is `setting_text`: the parts of a finding's setting that a person can act on.  A column that is
+logged late, a period, a time constant: they were chosen among many and are no coefficients, so that
+they have no deviation of their own.
+
+What would separate two effects that a motion cannot tell apart is `separating_manoeuvre`.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 from ahrsd.diagnosis.answer.diagnosis import (
+    Component,
     Diagnosis,
     Finding,
     Limit,
     OnPriors,
+    Ordinary,
     Unexplained,
     Value,
     Where,
 )
-from ahrsd.diagnosis.answer.ordinary_text import in_one_sentence, ordinary_left, size_lines
-from ahrsd.diagnosis.answer.setting_text import setting_text
 from ahrsd.diagnosis.columns.roles import shown
+from ahrsd.diagnosis.effects.effect import Effect
 
 _FRAMES = {
     "sensor": "turns with the vehicle",
@@ -34,6 +47,8 @@ _SPOKEN_UNITS = {
 }
 _LIMITS_SHOWN = 6
 _FAILED = 1e-4
+#: said of a simulation that leaves what a real recording may
+SIMULATED = "a simulated recording, its truth is beside it: nothing that is left there is ordinary"
 
 
 def lines(found: Diagnosis) -> list[str]:
@@ -198,3 +213,142 @@ def sensitivity(limits: tuple[Limit, ...]) -> str:
     texts = list(seen.values())
     more = f", and {len(texts) - _LIMITS_SHOWN} more" if len(texts) > _LIMITS_SHOWN else ""
     return ", ".join(texts[:_LIMITS_SHOWN]) + more
+
+
+def told_size(size: float, unit: str) -> str:
+    """`9.1 mG`, `620 mrad/s`: two digits."""
+    return f"{float(f'{1e3 * size:.2g}'):g} {'mG' if unit == 'gauss' else 'mrad/s'}"
+
+
+def limit_text(one: Component) -> str:
+    """`up to 72 mG`, or that none is."""
+    return f"up to {told_size(one.up_to, one.unit)}" if one.up_to > 0.0 else "none"
+
+
+def ordinary_left(found: Diagnosis) -> Ordinary | None:
+    """What is left and is ordinary; None where nothing is, or where it is unknown."""
+    left = found.unexplained
+    return left.ordinary if left.ordinary is not None and not left.detected else None
+
+
+def in_one_sentence(one: Ordinary) -> str:
+    """`ordinary for a real recording: 9.1 mG, 1.3 deg of heading (...)`."""
+    gyro = any(part.there and part.unit == "rad/s" for part in one.components)
+    more = f" and {told_size(one.gyro_rad_s, 'rad/s')} of the gyro" if gyro else ""
+    return (
+        f"ordinary for a real recording: {told_size(one.field_gauss, 'gauss')}, "
+        f"{one.heading_deg:.2g} deg of heading{more} (95 % of such recordings leave up to "
+        f"{told_size(one.field_up_to_gauss, 'gauss')}, {one.heading_up_to_deg:.2g} deg; "
+        f"{one.recordings} were measured)"
+    )
+
+
+def component_text(one: Component) -> str:
+    """`a field by attitude: 8.5 mG, 1.3 deg of heading, 130 nats (ordinary: up to 72 mG)`."""
+    heading = "" if one.heading_deg is None else f", {one.heading_deg:.2g} deg of heading"
+    return (
+        f"{one.words}: {told_size(one.size, one.unit)}{heading}, {one.evidence_nats:.0f} nats "
+        f"(ordinary: {limit_text(one)})"
+    )
+
+
+def size_lines(one: Ordinary) -> list[str]:
+    """The components that are there, the surest first; what all are together where none stands."""
+    there = [part for part in one.components if part.there]
+    if not there:
+        return [
+            f"{told_size(one.field_gauss, 'gauss')}, {one.heading_deg:.2g} deg of heading, of no "
+            "one component"
+        ]
+    return [component_text(part) for part in sorted(there, key=lambda part: -part.evidence_nats)]
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """Words of one part of a setting.
+
+    words: with {} for the value, times `times`
+    negative: the words where the value is below zero, with {} for its size
+    """
+
+    words: str
+    times: float = 1.0
+    negative: str = ""
+
+
+#: by key, in the order in which they are told
+TOLD: Mapping[str, Told] = {
+    "covariate": Told("by the column {}"),
+    "late_s": Told("logged {} s late", negative="logged {} s early"),
+    "mean_s": Told("each value the mean of {} s"),
+    "harmonic": Told("{} times a turn of the shaft"),
+    "off_hz": Told("{} Hz faster than the column", negative="{} Hz slower than the column"),
+    "frequency_hz": Told("seen at {} Hz"),
+    "mains_hz": Told("as mains of {} Hz would be"),
+    "period_s": Told("every {} s"),
+    "width_s": Told("for {} s"),
+    "hold_samples": Told("each reading held for {} samples"),
+    "time_constant_s": Told("time constant {} s"),
+    "radius_gauss": Told("half width of the loop {} mG", times=1e3),
+    "shape": Told("course: {}"),
+    "length_s": Told("lasts {} s"),
+    "length_m": Told("falls off within {} m"),
+    "distance_m": Told("its size is that of its field {} m away"),
+}
+
+#: what is not told, and why: it stands elsewhere in the answer, or nobody can act on it
+UNTOLD: Mapping[str, str] = {
+    "onset_s": "the finding's place says when",
+    "end_s": "the finding's place says when",
+    "start_s": "the first reading, or the zero of a phase",
+    "span_s": "the recording's length",
+    "phase_s": "of pulses: their first moment",
+    "phase": "the first sample of those that are held",
+    "turn_deg": "of a wave or a map: what it begins with",
+    "reference": "the value of the column at which nothing is added",
+    "reference_m": "the middle of the way",
+    "place_m": "of an object: in the recording's own metres",
+    "searched": "how many settings it was chosen of",
+    "memory": "what iron had from before the recording",
+    "relaxation_s": "one value for all",
+    "window_s": "one value for all",
+    "mean": "the ordinary shaking",
+    "straight_g": "the mean force, at which a mount was aligned",
+    "unit": "the column's value at which the coefficient counts",
+    "power": "in the equation",
+    "form": "which of the equation's forms",
+    "of": "which of the equation's forms",
+    "products": "which of the equation's forms",
+    "axes": "what the repaired model turns",
+    "signs": "what the repaired model turns",
+    "seed": "of a simulation",
+}
+
+
+def setting_text(setting: Mapping[str, Any]) -> str:
+    """`by the column motor_current_a; logged 0.25 s late`; empty where nothing is to be told."""
+    parts = []
+    for key, told in TOLD.items():
+        value = setting.get(key)
+        if not value:
+            continue
+        if isinstance(value, str):
+            parts.append(told.words.format(shown(value)))
+        elif isinstance(value, (list, tuple)):
+            parts.append(told.words.format(" or ".join(f"{one:.3g}" for one in value)))
+        elif value < 0 and told.negative:
+            parts.append(told.negative.format(f"{-value * told.times:.3g}"))
+        else:
+            parts.append(told.words.format(f"{value * told.times:.3g}"))
+    return "; ".join(parts)
+
+
+def separating_manoeuvre(library: Mapping[str, Effect], name: str, others: Sequence[str]) -> str:
+    """What to drive so that `name` and the likeliest of `others` come apart, in words."""
+    for other in others:
+        for one, two in ((name, other), (other, name)):
+            if one in library:
+                for confuser, words in library[one].confusers:
+                    if confuser == two:
+                        return words
+    return library[name].manoeuvre if name in library else ""
