@@ -45,8 +45,8 @@ COPIES = 16
 _TRIED, _TRIED_ROWS, _TRIAL_SEED = 8, 40_000, 2
 _OUTSIDE = 0.01
 #: deviations beyond the mean of COPIES largest values that one more is below in 999 of 1000 draws,
-#: by Gumbel's law (drawn in tests/diagnosis/answer/test_predictive.py): a thousandth for each
-#: of ten
+#: by Gumbel's law (drawn in tests/diagnosis/answer/test_predictive_checks.py): a thousandth for
+#: each of ten
 _LARGEST_REACH = 6.5
 _SEGMENT_S = 20.0
 _LAGS = 50

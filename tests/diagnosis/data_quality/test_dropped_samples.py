@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from odd_tracks import without_rows
+from told_facts import only, value
 from tracks import experiment, track_of, true_model
 
 from ahrsd.diagnosis.data_quality.dropped_samples import (
@@ -15,7 +17,9 @@ from ahrsd.diagnosis.data_quality.dropped_samples import (
     recovered,
     some_lost,
     surplus,
+    whole_nats,
 )
+from ahrsd.diagnosis.data_quality.preparation import put_right
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 
 GYRO_RAD_S = 2e-4  # of a filter that believes its gyro: what is lost stays with it for long
@@ -154,3 +158,62 @@ def test_a_step_is_not_taken_back_twice() -> None:
     none = np.zeros(5)
     found = _JumpsOfRows(np.full(5, -1), none, np.ones(5, dtype=np.int64), none)
     assert _put_right(lost, found, np.array([1, 3])).tolist() == [0, 0, 0, 0, 0]
+
+
+def test_the_tail_of_noise_is_no_whole_step() -> None:
+    rng = np.random.default_rng(3)
+    scatter = np.full(9, 0.18)
+    whole = 1.0 + 0.18 * rng.standard_normal(9)
+    noise = 0.18 * rng.standard_normal(400_000)
+    tail = noise[noise > 0.7][:9]
+    assert len(tail) == 9
+    assert whole_nats(whole, scatter) > 12.0
+    assert whole_nats(tail, scatter) < 0.0
+    assert whole_nats(np.array([2.0, 1.0]), np.full(2, 0.1)) > whole_nats(
+        np.array([0.75, 0.8]), np.full(2, 0.1)
+    )
+
+
+def test_missing_samples_without_a_gap_in_the_stamps() -> None:
+    made = experiment("mam", samples=6000, seed=3, sigma_mag=5e-4)
+    track = track_of(made)
+    model = replace(true_model(made), sigma_mag_gauss=5e-4)
+    keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.01)
+    cut = without_rows(track, keep, restamp=True)
+    facts = missing_turns(run_filter(cut, model), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
+    fact = only(tuple(facts))
+    assert fact.effect == "dropped_samples"
+    assert 0.004 < value(fact) < 0.02
+    right = put_right(cut, (fact,))
+    turned = np.linalg.norm(right.gyro_b_rad_s, axis=1) / np.linalg.norm(cut.gyro_b_rad_s, axis=1)
+    assert np.count_nonzero(turned > 1.9) == len(fact.where.intervals_s)
+    rate = track.gyro_b_rad_s - model.gyro_bias_rad_s
+    assert missing_turns(run_filter(track, model), rate) == []
+
+
+def test_missing_samples_of_a_slow_motion_are_seen_over_more_samples() -> None:
+    made = experiment("lam", samples=9000, seed=3, sigma_mag=3e-4)
+    track = track_of(made)
+    model = replace(true_model(made), sigma_mag_gauss=3e-4)
+    keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.015)
+    cut = without_rows(track, keep, restamp=True)
+    facts = missing_turns(run_filter(cut, model), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
+    assert abs(value(only(tuple(facts))) - 0.015) < 0.008
+
+
+def test_missing_samples_are_seen_where_whole_seconds_are_missing_too() -> None:
+    """On its way back from a large jump the filter makes many that no lost turn makes."""
+    made = experiment("mam", samples=6000, seed=3, sigma_mag=3e-4)
+    track = track_of(made)
+    model = replace(true_model(made), sigma_mag_gauss=3e-4)
+    rng = np.random.default_rng(5)
+    kept = rng.random(len(track)) > 0.008
+    for first in rng.integers(300, 5600, 8):
+        kept[first : first + 40] = False
+    cut = without_rows(track, np.flatnonzero(kept), restamp=True)
+    # as slow as a filter is that believes its gyro
+    slow = replace(model, sigma_gyro_rad_s=1e-4)
+    facts = missing_turns(run_filter(cut, slow), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
+    fact = only(tuple(facts))
+    assert fact.effect == "dropped_samples"
+    assert 4 <= fact.setting["long"] <= 10

@@ -9,7 +9,12 @@ import pytest
 from tracks import experiment, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.calibration_fit.resampling import thin_factor, thinned, working_factor
+from ahrsd.diagnosis.calibration_fit.resampling import (
+    decimated,
+    thin_factor,
+    thinned,
+    working_factor,
+)
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Track
 
@@ -111,3 +116,34 @@ def test_rows_are_of_so_many_samples_as_stay_white(sigma_gyro: float, samples: i
     """
     made = experiment("mam", motion="slow", samples=3000, sigma_gyro=sigma_gyro)
     assert working_factor(track_of(made), true_model(made)) == samples
+
+
+def test_thinning_composes_rotations_exactly() -> None:
+    track = track_of(experiment("wam", samples=400))
+    coarse = decimated(track, 5)
+    assert len(coarse) == 80
+    by_one = np.eye(3)
+    for k in range(5, 10):
+        by_one = by_one @ so3.exp(track.gyro_b_rad_s[k] * track.dt_s[k])
+    assert np.abs(so3.exp(coarse.gyro_b_rad_s[1] * coarse.dt_s[1]) - by_one).max() < 1e-12
+    assert np.array_equal(coarse.mag_b_gauss[1], track.mag_b_gauss[9])
+    assert np.isnan(coarse.dt_s[0])
+
+
+def test_a_track_with_holes_is_thinned_at_its_readings() -> None:
+    track = track_of(experiment("wam", samples=400))
+    mag = track.mag_b_gauss.copy()
+    mag[np.arange(400) % 4 != 1] = np.nan
+    coarse = decimated(replace(track, mag_b_gauss=mag), 5)
+    assert np.isfinite(coarse.mag_b_gauss).all()
+    # whatever the groups, the whole turn stays
+    whole, composed = np.eye(3), np.eye(3)
+    last = round(float(coarse.time_s[-1] / 0.04)) - 1
+    for k in range(1, last + 1):
+        whole = whole @ so3.exp(track.gyro_b_rad_s[k] * 0.04)
+    first = round(float(coarse.time_s[0] / 0.04)) - 1
+    for k in range(1, first + 1):
+        composed = composed @ so3.exp(track.gyro_b_rad_s[k] * 0.04)
+    for rate, length in zip(coarse.gyro_b_rad_s[1:], coarse.dt_s[1:], strict=True):
+        composed = composed @ so3.exp(rate * length)
+    assert np.abs(whole - composed).max() < 1e-9

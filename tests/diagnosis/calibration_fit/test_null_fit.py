@@ -9,11 +9,9 @@ import pytest
 from scipy import stats
 from tracks import experiment, recorded, track_of, true_model
 
-from ahrsd import so3
-from ahrsd.diagnosis.calibration_fit.noise_fit import WALK_CAP_RAD_S_SQRT_S, noise_of_differences
+from ahrsd.diagnosis.calibration_fit.noise_fit import WALK_CAP_RAD_S_SQRT_S
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null, rate_at_rest
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
-from ahrsd.diagnosis.calibration_fit.resampling import decimated
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.samples import Array
@@ -92,26 +90,6 @@ def test_slow_turns_in_loud_noise_are_no_rest() -> None:
     assert np.max(found / np.sqrt(np.diag(fit.covariance))[8:11]) < 4
 
 
-def test_what_the_spec_says_stays() -> None:
-    track = track_of(experiment(samples=3000))
-    fit = fit_null(track, Spec(sigma_mag_gauss=2e-3, sigma_gyro_rad_s=7e-4))
-    assert fit.model.sigma_mag_gauss == 2e-3
-    assert fit.model.sigma_gyro_rad_s == 7e-4
-    half = fit_null(track, Spec(sigma_gyro_rad_s=7e-4))
-    assert half.model.sigma_gyro_rad_s == 7e-4
-    assert abs(half.model.sigma_mag_gauss / 1e-3 - 1) < 0.06
-
-
-def test_the_gyros_noise_does_not_swallow_a_drift_of_the_gyro() -> None:
-    """Free, sigma_gyro would grow until the drift is noise."""
-    made = experiment(samples=3000)
-    track = track_of(made)
-    ramp = np.linspace(-1, 1, 3000)[:, None] * np.array([3e-3, -2e-3, 4e-3])
-    fit = fit_null(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + ramp))
-    assert fit.model.sigma_gyro_rad_s <= 1.5 * noise_of_differences(track)[1] * 1.01
-    assert fit.model.gyro_walk_rad_s_sqrt_s <= WALK_CAP_RAD_S_SQRT_S * 1.01
-
-
 def test_a_wandering_gyro_bias_is_in_the_null() -> None:
     made = experiment(samples=8000, seed=4)
     track = track_of(made)
@@ -122,43 +100,6 @@ def test_a_wandering_gyro_bias_is_in_the_null() -> None:
     off = _difference(fit, true_model(made))[:8]
     chi2 = float(off @ np.linalg.solve(fit.covariance[:8, :8], off))
     assert stats.chi2.sf(chi2, 8) > 1e-3
-
-
-def test_thinning_composes_rotations_exactly() -> None:
-    track = track_of(experiment("wam", samples=400))
-    coarse = decimated(track, 5)
-    assert len(coarse) == 80
-    by_one = np.eye(3)
-    for k in range(5, 10):
-        by_one = by_one @ so3.exp(track.gyro_b_rad_s[k] * track.dt_s[k])
-    assert np.abs(so3.exp(coarse.gyro_b_rad_s[1] * coarse.dt_s[1]) - by_one).max() < 1e-12
-    assert np.array_equal(coarse.mag_b_gauss[1], track.mag_b_gauss[9])
-    assert np.isnan(coarse.dt_s[0])
-
-
-def test_a_track_with_holes_is_thinned_at_its_readings() -> None:
-    track = track_of(experiment("wam", samples=400))
-    mag = track.mag_b_gauss.copy()
-    mag[np.arange(400) % 4 != 1] = np.nan
-    coarse = decimated(replace(track, mag_b_gauss=mag), 5)
-    assert np.isfinite(coarse.mag_b_gauss).all()
-    # whatever the groups, the whole turn stays
-    whole, composed = np.eye(3), np.eye(3)
-    last = round(float(coarse.time_s[-1] / 0.04)) - 1
-    for k in range(1, last + 1):
-        whole = whole @ so3.exp(track.gyro_b_rad_s[k] * 0.04)
-    first = round(float(coarse.time_s[0] / 0.04)) - 1
-    for k in range(1, first + 1):
-        composed = composed @ so3.exp(track.gyro_b_rad_s[k] * 0.04)
-    for rate, length in zip(coarse.gyro_b_rad_s[1:], coarse.dt_s[1:], strict=True):
-        composed = composed @ so3.exp(rate * length)
-    assert np.abs(whole - composed).max() < 1e-9
-
-
-def test_noise_of_differences() -> None:
-    mag, gyro = noise_of_differences(track_of(experiment("lam", samples=4000, sigma_gyro=2e-3)))
-    assert abs(mag / 1e-3 - 1) < 0.06
-    assert abs(gyro / 2e-3 - 1) < 0.06
 
 
 def test_at_rest_the_gyro_reads_its_bias_and_nothing_runs_away() -> None:
