@@ -2,9 +2,10 @@
 
 In the noise that the answer leaves, its residual is V^-1 y, y of variance V = 1 + X Phi X^T.
 Copies are drawn of that law with the residual's own tails and fitted as the recording was; each
-statistic, chosen before anything is looked at, has the band of its copies (`predictive`).  A bin of
-a regime (heading, tilt, rate, a column) is asked for a field of its own, Z: its score Z^T V^-1 y
-has the variance Z^T V^-1 Z, so half of the square has three halves of a nat where nothing is left.
+statistic, chosen before anything is looked at, has the band of its copies (`predictive_checks`).  A
+bin of a regime (heading, tilt, rate, a column) is asked for a field of its own, Z: its score
+Z^T V^-1 y has the variance Z^T V^-1 Z, so half of the square has three halves of a nat where
+nothing is left.
 
 Before is the calibration alone in the same noise: what was left out would else pass for noise.
 """
