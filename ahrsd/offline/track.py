@@ -17,7 +17,7 @@ from ahrsd.diagnosis.columns.roles import prepared
 from ahrsd.diagnosis.data_quality.axes_and_units import as_recorded, windows
 from ahrsd.diagnosis.data_quality.facts import matters
 from ahrsd.diagnosis.data_quality.preparation import facts_of
-from ahrsd.diagnosis.data_quality.stuck import dead_axes, possible
+from ahrsd.diagnosis.data_quality.stuck import dead_axes, without_impossible
 from ahrsd.diagnosis.data_quality.timestamps import without_jumps
 from ahrsd.diagnosis.effects.design_matrix import GRAVITY_M_S2
 from ahrsd.diagnosis.repaired_model.correction import without
@@ -66,7 +66,7 @@ def track_of(blocks: list[SampleBlock]) -> Track:
 def checked(track: Track) -> tuple[Track, list[str]]:
     """The track without what no sensor gives, and one line for each such thing."""
     track, jumped = without_jumps(track)
-    track, notes = possible(track)
+    track, notes = without_impossible(track)
     accel, said = _acceleration(track)
     return replace(track, accel_b_m_s2=accel), [*jumped, *notes, *dead_axes(track), *said]
 

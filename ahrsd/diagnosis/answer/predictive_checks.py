@@ -22,8 +22,8 @@ from ahrsd.diagnosis.answer.diagnosis import Check
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.calibration_fit.quantisation_noise import (
     before_rounding,
-    bent,
     calibration_covariance,
+    readings_of_drawn_calibration,
 )
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
@@ -33,7 +33,7 @@ from ahrsd.diagnosis.innovation_filter.innovation import (
     run_filter,
     sensitivities,
 )
-from ahrsd.diagnosis.innovation_filter.noise import before, colour_of, freedom_of
+from ahrsd.diagnosis.innovation_filter.noise import colour_before_filter, colour_of, freedom_of
 from ahrsd.diagnosis.innovation_filter.regression_statistics import student_quantile
 from ahrsd.diagnosis.model import Context, Noise, Term
 from ahrsd.diagnosis.repaired_model import forward
@@ -134,7 +134,7 @@ def noise_law(
         truth, unsure = forward.truth_along(fit.context()), calibration_covariance(fit)
 
         def simulate(noise: Noise, seed: int) -> tuple[Array, Array]:
-            known = bent(truth, unsure, seed) if seed else truth
+            known = readings_of_drawn_calibration(truth, unsure, seed) if seed else truth
             made = forward.track_of(forward.simulated(known, terms, noise, seed, library))
             return made.mag_b_gauss, _filtered([made], fit)
 
@@ -151,7 +151,7 @@ def noise_law(
     seen = [_quick(fit, e) if done is quick else replace(done, whitened=e) for e in made]
     stacked = np.concatenate([one.whitened for one in seen])
     found = colour_of(replace(done, whitened=stacked, used=np.tile(done.used, len(seen))))
-    colour, louder = before(colour_of(done), found)
+    colour, louder = colour_before_filter(colour_of(done), found)
     return replace(law, colour=tuple(colour.coefficients.tolist()), level=level * louder)
 
 
@@ -221,7 +221,7 @@ def _innovations(
     truths = [truth] * copies
     if any(term.identifier == _ROUNDED for term in terms):
         unsure = calibration_covariance(fit)
-        truths = [bent(truth, unsure, one) for one in seeds]
+        truths = [readings_of_drawn_calibration(truth, unsure, one) for one in seeds]
     made = [
         _losing(track, forward.track_of(forward.simulated(along, terms, noise, one, library)), one)
         for along, one in zip(truths, seeds, strict=True)

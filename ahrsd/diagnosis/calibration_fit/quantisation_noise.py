@@ -16,7 +16,7 @@ import numpy as np
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.innovation_filter.innovation import nuisance_columns, sensitivities
-from ahrsd.diagnosis.innovation_filter.regression_statistics import colour
+from ahrsd.diagnosis.innovation_filter.regression_statistics import spectral_peak
 from ahrsd.diagnosis.model import Noise
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
@@ -70,12 +70,12 @@ def calibration_covariance(fit: NullFit) -> Array:
     """(11, 11) of the fit's own calibration, in noise of the colour that it leaves."""
     seen = sensitivities(fit.filtered, nuisance_columns(fit.filtered))
     flat = seen.reshape(-1, seen.shape[2])
-    power = colour(fit.filtered.whitened, 1.0 / fit.filtered.track.step_s)
+    power = spectral_peak(fit.filtered.whitened, 1.0 / fit.filtered.track.step_s)
     power *= fit.filtered.normalised_innovation
     return np.asarray(np.linalg.inv(flat.T @ flat) * power)
 
 
-def bent(truth: Readings, covariance: Array, seed: int) -> Readings:
+def readings_of_drawn_calibration(truth: Readings, covariance: Array, seed: int) -> Readings:
     """Readings of a calibration that the fit may as well have found.
 
     What a filter sees of it is linear and taken out again; where on their steps the readings lie

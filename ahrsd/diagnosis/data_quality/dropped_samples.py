@@ -72,7 +72,8 @@ _SHARES = (0.01, 0.03, 0.1)  # of the rows, that a jump is so near that its mean
 _ACROSS_CHI2 = 12.0  # chi square that one in 400 is beyond
 _BESIDE = 0.25  # of a mean's rows: so near to its jump is the step that made it
 _TWICE_NATS = 6.0  # that a step counts twice: one in twenty does, and must be surer than chance
-_EACH = 6.0  # nats that one jump is worth at most: several must say it, not a field that jumps once
+#: that one jump is worth at most: several must say it, not a field that jumps once
+_MOST_EACH_NATS = 6.0
 _PART, _OTHERS = 0.7, (0.3, 1.4)  # of a step, in the mean over the rows that have a part of it
 #: nats by which that must be, less so many times those backward: 3.5 is the most of 370 recordings
 #: with none lost
@@ -379,7 +380,7 @@ def surplus(mean: Means) -> tuple[float, float]:
     z, size = mean.z[like] - scale * mean.size[like], mean.size[like]
 
     def nats(step: float) -> tuple[float, float]:
-        odds = np.exp(np.minimum(step * z - step**2 * size / 2, _EACH)) - 1.0
+        odds = np.exp(np.minimum(step * z - step**2 * size / 2, _MOST_EACH_NATS)) - 1.0
         told = [(float(np.sum(np.log1p(share * odds))), share) for share in _SHARES]
         total, share = max(told)
         return total / mean.length, share * len(z) / mean.length

@@ -42,7 +42,6 @@ _FIELDS = (1e-6, 1e6)
 #: readings so many times the usual field, rates so many times the quickest but for one in a
 #: thousand and beyond what is quick in any unit, are none
 _FAR_FIELD, _FAR_RATE, _QUICK = 100.0, 100.0, 40.0
-_ALL_AXES = ("x", "y", "z")
 #: rows that a stuck reading lasts at least, and so many times as long as a reading usually does
 _STUCK_ROWS, _LONGER = 8, 5.0
 _MOVED = 8.0  # noise levels by which the field must have turned during the repetition
@@ -149,7 +148,7 @@ def _turned_by_field(track: Track, k: int) -> float:
     return float(np.ptp(np.cumsum(turn)))
 
 
-def possible(track: Track) -> tuple[Track, tuple[str, ...]]:
+def without_impossible(track: Track) -> tuple[Track, tuple[str, ...]]:
     """The track without single readings that no sensor gives, and a sentence on each kind.
 
     A wrong reading of the magnetometer becomes nan, behind a wrong rate a new run begins.
@@ -398,7 +397,7 @@ def _stuck(track: Track, again: NDArray[np.bool]) -> tuple[list[Fact], NDArray[n
         Fact(
             "stuck_magnetometer",
             words,
-            Where(tuple(intervals), _ALL_AXES, "sensor"),
+            Where(tuple(intervals), _AXES, "sensor"),
             1.0,
             (Value("length", total, step, "s"),),
             {"onset_s": intervals[0][0]},
@@ -433,7 +432,7 @@ def _held(track: Track, again: NDArray[np.bool], expected: Array) -> list[Fact]:
         Fact(
             "mag_sample_hold",
             words,
-            Where(_whole(track), _ALL_AXES, "sensor"),
+            Where(_whole(track), _AXES, "sensor"),
             1.0,
             (Value("held_part", 1.0, 0.0, "1"),),
             {"hold": usual, "period_s": usual * step},
@@ -480,7 +479,7 @@ def _doubled(track: Track, again: NDArray[np.bool]) -> list[Fact]:
         Fact(
             "dropped_samples",
             f"{counted(count, 'sample')} as the one before, gyro and magnetometer: they came twice",
-            Where(times, _ALL_AXES, "link"),
+            Where(times, _AXES, "link"),
             0.95,
             (Value("part", share, float(np.sqrt(share / len(track))), "1"),),
             {"doubled": True},

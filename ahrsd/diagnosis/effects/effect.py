@@ -277,7 +277,7 @@ def smooth_readings_of(context: Context) -> Readings:
     return replace(readings_of(context), field_b=smooth, mag_b_gauss=mag)
 
 
-def left_over(context: Context) -> Array:
+def residual_gauss(context: Context) -> Array:
     """(N, 3) gauss, readings less what field and calibration make of them; 0 without a reading."""
     model = context.model
     expected = context.smooth_b @ model.soft_iron.T + model.hard_iron_gauss

@@ -16,7 +16,7 @@ from ahrsd.diagnosis.effects.effect import (
     Parameter,
     Readings,
     Setting,
-    left_over,
+    residual_gauss,
 )
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
@@ -62,7 +62,7 @@ class AcInterference(Linear):
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """The two strongest lines."""
-        return lines(left_over(context), context.track.gyro_b_rad_s, context.track.dt_s)
+        return lines(residual_gauss(context), context.track.gyro_b_rad_s, context.track.dt_s)
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The alias of 60 Hz at this rate, or a line in the middle of the band."""

@@ -14,7 +14,13 @@ import numpy as np
 
 from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.effects import design_matrix
-from ahrsd.diagnosis.effects.effect import Linear, Readings, Setting, left_over, readings_of
+from ahrsd.diagnosis.effects.effect import (
+    Linear,
+    Readings,
+    Setting,
+    readings_of,
+    residual_gauss,
+)
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
@@ -156,7 +162,7 @@ class SyncPulses(Linear):
         """One per column of pulses, and the likeliest regular train that nobody logged."""
         track = context.track
         logged = design_matrix.per_covariate(readings_of(context), "ping")
-        return (*logged, *trains(left_over(context), track.time_s, track.step_s))
+        return (*logged, *trains(residual_gauss(context), track.time_s, track.step_s))
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The columns of pulses, else 60 ms every two seconds."""
@@ -295,7 +301,7 @@ class RotorField(Linear):
         A tachometer is right to a few parts in a thousand, and a tenth of a turn a minute is a
         whole turn in ten minutes.
         """
-        readings, left = readings_of(context), left_over(context)
+        readings, left = readings_of(context), residual_gauss(context)
         found = []
         for setting in self.choices(readings):
             phase = setting["harmonic"] * _shaft_phase(readings, setting["covariate"])

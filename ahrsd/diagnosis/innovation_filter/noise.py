@@ -75,7 +75,7 @@ def colour_of(done: Filtered) -> Colour:
     return Colour(best, float(variance))
 
 
-def before(wanted: Colour, found: Colour) -> tuple[Colour, float]:
+def colour_before_filter(wanted: Colour, found: Colour) -> tuple[Colour, float]:
     """The colour that becomes `wanted` where `wanted` became `found`, and its relative deviation.
 
     A filter takes a part of slow noise for motion, so that innovations are whiter than the noise.

@@ -133,7 +133,7 @@ def posterior(
 CLEAR_PEAK = 1.35
 
 
-def colour(innovation: Array, rate_hz: float, reach_s: float = 3.0) -> float:
+def spectral_peak(innovation: Array, rate_hz: float, reach_s: float = 3.0) -> float:
     """Power of whitened innovations (N, 3) where their spectrum is strongest over white noise's.
 
     Bartlett's spectrum over `reach_s`, averaged over the axes, at least 1: correlated noise of a

@@ -14,10 +14,10 @@ from ahrsd.diagnosis.data_quality.preparation import facts_of, put_right
 from ahrsd.diagnosis.data_quality.stuck import (
     dead,
     dead_axes,
-    possible,
     stuck_axes,
     stuck_gyro,
     turned_gauss,
+    without_impossible,
 )
 from ahrsd.diagnosis.track import Track
 
@@ -87,7 +87,7 @@ def test_nothing_is_said_of_sensors_that_work(name: str) -> None:
     real = recorded(name)
     assert dead(real) is None
     assert dead_axes(real) == ()
-    assert possible(real) == (real, ())
+    assert without_impossible(real) == (real, ())
     assert stuck_gyro(real) == []
     assert stuck_axes(real, _no_rows(real)) == []
 
@@ -132,7 +132,7 @@ def test_readings_of_zero_are_none(track: Track) -> None:
 def test_readings_that_no_sensor_gives_are_left_out(track: Track) -> None:
     mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
     mag[50, 0], gyro[70:72, 1] = 1e300, 1e9
-    clean, notes = possible(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro))
+    clean, notes = without_impossible(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro))
     assert [note.split(" beyond")[0] for note in notes] == [
         "1 reading of the magnetometer",
         "2 rates",
