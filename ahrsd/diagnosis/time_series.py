@@ -22,7 +22,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 from scipy.linalg.lapack import dtbtrs
 
 from ahrsd import so3
@@ -296,6 +295,8 @@ def denoised(values: Array) -> Array:
 
     In cosines: no step from the end to the beginning.
     """
+    from scipy import fft  # 5 MB, which a daemon that takes terms out of readings never needs
+
     mean = values.mean(axis=0)
     cosines = fft.dct(values - mean, axis=0, norm="ortho")
     power = cosines**2

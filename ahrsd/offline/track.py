@@ -20,7 +20,7 @@ from ahrsd.diagnosis.data_quality.preparation import facts_of
 from ahrsd.diagnosis.data_quality.stuck import dead_axes, without_impossible
 from ahrsd.diagnosis.data_quality.timestamps import without_jumps
 from ahrsd.diagnosis.effects.design_matrix import GRAVITY_M_S2
-from ahrsd.diagnosis.repaired_model.correction import without
+from ahrsd.diagnosis.repaired_model.forward import without
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
 from ahrsd.diagnosis.track import Track
 from ahrsd.errors import AhrsdError

@@ -17,7 +17,7 @@ from ahrsd.core.column_compensation import VehicleTerms
 from ahrsd.core.core import Core
 from ahrsd.daemon.vehicle_files import ColumnsFile
 from ahrsd.diagnosis.model import Noise, NullModel, Term
-from ahrsd.diagnosis.repaired_model.correction import follows_a_column
+from ahrsd.diagnosis.repaired_model.column_terms import follows_a_column
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, to_text
 from ahrsd.errors import ConfigError
 from ahrsd.inputs import Columns, RegistersKnown, Samples, Stop, TermsKnown

@@ -6,6 +6,9 @@
 The motion is the context's attitude, turned by what brings its smoothed field (over DRIFT_S) to one
 direction of the world: headings are the recording's, each step turns the field exactly as the true
 rate says.  What the gyro's noise did to that attitude counts as motion: a body may shake.
+
+Backwards it is a recording without what named effects added to it (`without`), so that they
+do not bend its calibration.
 """
 
 from __future__ import annotations
@@ -205,3 +208,27 @@ def _coloured(white: Array, colour: tuple[float, ...]) -> Array:
     # a stretch before the first row, so that the noise is settled there
     ahead = np.vstack([white[:_RESPONSE][::-1], white])
     return autoregression(ahead, taps)[-len(white) :] / float(np.linalg.norm(response))
+
+
+def without(
+    track: Track,
+    model: NullModel,
+    terms: Sequence[Term],
+    library: Mapping[str, Effect] = EFFECTS,
+) -> tuple[Track, tuple[str, ...]]:
+    """The track as it would read without the terms, and the effects that no number takes out.
+
+    What an effect adds follows from the model it was fitted with: motion, field and the columns of
+    this track. Noise, coarse steps and lost samples cannot be undone; those come back by name.
+    Raises ValueError where a term needs a column that the track has not.
+    """
+    undone = [term for term in terms if library[term.identifier].kind == "mean"]
+    left = tuple(term.identifier for term in terms if library[term.identifier].kind != "mean")
+    if not undone:
+        return track, left
+    context = context_along(track, model, undone, library)
+    mag, gyro = contribution(context, undone, library)
+    return (
+        replace(track, mag_b_gauss=track.mag_b_gauss - mag, gyro_b_rad_s=track.gyro_b_rad_s - gyro),
+        left,
+    )

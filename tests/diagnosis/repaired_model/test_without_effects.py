@@ -11,8 +11,12 @@ from tracks import experiment, track_of, true_model
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.model import Noise, Term
 from ahrsd.diagnosis.repaired_model import injection
-from ahrsd.diagnosis.repaired_model.correction import without
-from ahrsd.diagnosis.repaired_model.forward import context_along, simulated, truth_along
+from ahrsd.diagnosis.repaired_model.forward import (
+    context_along,
+    simulated,
+    truth_along,
+    without,
+)
 from ahrsd.diagnosis.repaired_model.forward import track_of as track_from
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, to_text
 
