@@ -23,7 +23,7 @@ from ahrsd.inputs import Columns, TermsKnown
 from ahrsd.samples import Array, SampleBlock
 
 if TYPE_CHECKING:
-    from ahrsd.diagnosis.values import Term
+    from ahrsd.diagnosis.model import Term
 
 _KEPT = 256  # instants of a column: some seconds at any rate that a vehicle tells it
 Added = Callable[["Term", Array, Array, Mapping[str, Array]], Array]

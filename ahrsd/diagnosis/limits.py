@@ -29,7 +29,8 @@ class Limits:
                     recording's own fit has to be where nothing is told
     chance_copies:  how many of these are diagnosed at most
     chance_p, chance_early_p: of what chance makes, the part that is told when all of these were
-                    asked, and when so many fewer were that the rest need not be (`chance`)
+                    asked, and when so many fewer were that the rest need not be
+                    (`null_simulations`)
     """
 
     family_p: float = 1e-3

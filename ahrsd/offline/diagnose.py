@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
-from ahrsd.diagnosis.data_quality.aligned import align, differing
+from ahrsd.diagnosis.external_simulation import align, differing
 from ahrsd.diagnosis.one_model.diagnose import diagnose_logged
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, from_text
 from ahrsd.diagnosis.track import Spec, Track

@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.effects import profiles, request
-from ahrsd.diagnosis.repaired_model import forward
+from ahrsd.diagnosis.repaired_model import forward, injection
 from ahrsd.diagnosis.repaired_model.injection import injected, readings_of, terms_json
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
 from ahrsd.diagnosis.track import Track
@@ -27,9 +26,9 @@ def with_effects(
     """The experiment with the wanted effects and the covariates they need, and the terms for the
     truth.  AhrsdError in one line for a request that cannot be."""
     try:
-        requests = [request.parse(text) for text in wanted]
+        requests = [injection.parse_request(text) for text in wanted]
         effects = [one.effect for one in requests]
-        columns = profiles.columns_for(effects, experiment.samples.time_s, seed)
+        columns = injection.columns_for(effects, experiment.samples.time_s, seed)
         readings = readings_of(experiment, columns)
         terms = [one.term(readings) for one in requests]
     except ValueError as error:

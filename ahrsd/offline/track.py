@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.diagnosis.columns.roles import prepared
-from ahrsd.diagnosis.data_quality.dead import dead_axes, possible
+from ahrsd.diagnosis.data_quality.axes_and_units import as_recorded, windows
 from ahrsd.diagnosis.data_quality.facts import matters
-from ahrsd.diagnosis.data_quality.frames import windows
-from ahrsd.diagnosis.data_quality.hygiene import as_recorded, hygiene
-from ahrsd.diagnosis.data_quality.pauses import without_jumps
-from ahrsd.diagnosis.effects.shapes import GRAVITY_M_S2
-from ahrsd.diagnosis.repaired_model.correction import without
+from ahrsd.diagnosis.data_quality.preparation import facts_of
+from ahrsd.diagnosis.data_quality.stuck import dead_axes, without_impossible
+from ahrsd.diagnosis.data_quality.timestamps import without_jumps
+from ahrsd.diagnosis.effects.design_matrix import GRAVITY_M_S2
+from ahrsd.diagnosis.repaired_model.forward import without
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
 from ahrsd.diagnosis.track import Track
 from ahrsd.errors import AhrsdError
@@ -66,7 +66,7 @@ def track_of(blocks: list[SampleBlock]) -> Track:
 def checked(track: Track) -> tuple[Track, list[str]]:
     """The track without what no sensor gives, and one line for each such thing."""
     track, jumped = without_jumps(track)
-    track, notes = possible(track)
+    track, notes = without_impossible(track)
     accel, said = _acceleration(track)
     return replace(track, accel_b_m_s2=accel), [*jumped, *notes, *dead_axes(track), *said]
 
@@ -98,7 +98,7 @@ def faults(blocks: list[SampleBlock]) -> tuple[list[str], list[str]]:
 
     A clock that jumps where a run begins (a restart of the device) is no wrong time.
     """
-    facts = hygiene(without_jumps(track_of(blocks))[0]) if blocks else ()
+    facts = facts_of(without_jumps(track_of(blocks))[0]) if blocks else ()
     wrong = [fact.words for fact in facts if fact.stops]
     return wrong, [fact.words for fact in facts if not fact.stops and matters(fact)]
 

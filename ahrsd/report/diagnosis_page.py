@@ -21,10 +21,19 @@ from ahrsd.diagnosis.answer.diagnosis import (
     RegimeMap,
     Validation,
 )
-from ahrsd.diagnosis.answer.ordinary_text import in_one_sentence, ordinary_left, size_lines
-from ahrsd.diagnosis.answer.setting_text import setting_text
-from ahrsd.diagnosis.answer.spoken import assumed, headline, place, sensitivity, value_text, verdict
-from ahrsd.diagnosis.columns.shown import shown
+from ahrsd.diagnosis.answer.text import (
+    assumed,
+    headline,
+    in_one_sentence,
+    ordinary_left,
+    place,
+    sensitivity,
+    setting_text,
+    size_lines,
+    value_text,
+    verdict,
+)
+from ahrsd.diagnosis.columns.roles import shown
 from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN, legend_above
 from ahrsd.report.template import Picture, number, picture, render
 from ahrsd.samples import Array

@@ -9,8 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ahrsd.diagnosis.answer.diagnosis import Contribution, Diagnosis, Drawn
-from ahrsd.diagnosis.answer.ordinary_text import ordinary_left
-from ahrsd.diagnosis.answer.spoken import headline, lines, place
+from ahrsd.diagnosis.answer.text import headline, lines, ordinary_left, place
 from ahrsd.samples import Array
 from ahrsd.viewer.blueprint import X, Y, Z
 

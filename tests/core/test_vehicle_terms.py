@@ -16,9 +16,9 @@ from ahrsd.config.config import Config, check_config, core_settings, terms_text
 from ahrsd.core.column_compensation import VehicleTerms
 from ahrsd.core.core import Core
 from ahrsd.daemon.vehicle_files import ColumnsFile
+from ahrsd.diagnosis.model import Noise, NullModel, Term
 from ahrsd.diagnosis.repaired_model.column_terms import follows_a_column
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, to_text
-from ahrsd.diagnosis.values import Noise, NullModel, Term
 from ahrsd.errors import ConfigError
 from ahrsd.inputs import Columns, RegistersKnown, Samples, Stop, TermsKnown
 from ahrsd.samples import SampleBlock

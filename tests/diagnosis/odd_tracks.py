@@ -73,3 +73,18 @@ def measured(
     gyro = rate + [2e-3, -1e-3, 1.5e-3] + sigma_gyro * rng.normal(size=(count, 3))
     dt_s = np.r_[np.nan, np.diff(time_s)]
     return Track(time_s, dt_s, mag, gyro, None, {}, (slice(0, count),))
+
+
+def without_rows(track: Track, keep: np.ndarray, *, restamp: bool) -> Track:
+    """The track without rows; restamped: the time stamps do not show it."""
+    time_s = track.time_s[: len(keep)] if restamp else track.time_s[keep]
+    assert track.accel_b_m_s2 is not None
+    return Track(
+        time_s,
+        np.diff(time_s, prepend=np.nan),
+        track.mag_b_gauss[keep],
+        track.gyro_b_rad_s[keep],
+        track.accel_b_m_s2[keep],
+        {},
+        (slice(0, len(keep)),),
+    )

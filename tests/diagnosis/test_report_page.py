@@ -12,7 +12,7 @@ import pytest
 from browser import BROWSER, look_at
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ahrsd.diagnosis.answer import predictive
+from ahrsd.diagnosis.answer import predictive_checks
 from ahrsd.diagnosis.answer.diagnosis import (
     Baseline,
     Check,
@@ -31,9 +31,9 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Value,
     Where,
 )
-from ahrsd.diagnosis.answer.spoken import lines
-from ahrsd.diagnosis.columns.shown import MOST, shown
-from ahrsd.diagnosis.values import NullModel
+from ahrsd.diagnosis.answer.text import lines
+from ahrsd.diagnosis.columns.roles import SHOWN_CHARACTERS, shown
+from ahrsd.diagnosis.model import NullModel
 from ahrsd.report import diagnosis_page
 from ahrsd.report.diagnosis_page import _STATISTICS, write_diagnosis_report
 from ahrsd.viewer.diagnosis import write_rrd
@@ -214,7 +214,7 @@ def test_statistics_are_named_in_words(usual):
 
 
 def test_every_statistic_that_is_compared_has_its_words():
-    source = inspect.getsource(predictive.statistics)
+    source = inspect.getsource(predictive_checks.statistics)
     compared = set(re.findall(r'"([a-z_]+)"[:\]]', source))
     assert compared == set(_STATISTICS)
 
@@ -323,6 +323,6 @@ def test_a_long_name_keeps_its_beginning_and_its_end():
     assert shown("motor_current_a") == "motor_current_a"
     assert shown("a\tb") == "a\\tb"
     long = shown("begin" + "x" * 100 + "_a")
-    assert len(long) == MOST
+    assert len(long) == SHOWN_CHARACTERS
     assert long.startswith("begin")
     assert long.endswith("..." + "x" * 8 + "_a")

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import NullModel
 from ahrsd.recording.table import read_table
 from ahrsd.simulation import Experiment, ScenarioSettings, simulate
 

@@ -47,7 +47,7 @@ def command(
                          diagnosis.json the answer
                          model.json     the repaired model: ahrsd simulate --model
     """
-    from ahrsd.diagnosis.answer.spoken import lines
+    from ahrsd.diagnosis.answer.text import lines
     from ahrsd.offline.diagnose import diagnose_recording
 
     refuse_unwritable(json_path)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.values import Context, NullModel
+from ahrsd.diagnosis.model import Context, NullModel
 from ahrsd.samples import Array
 
 #: where no accelerometer says what is level: the horizontal part of the field at 60 degrees of dip

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ahrsd.diagnosis.values import Noise, NullModel, Term
+from ahrsd.diagnosis.model import Noise, NullModel, Term
 from ahrsd.diagnosis.where_and_when.locate import Located
 from ahrsd.samples import Array
 

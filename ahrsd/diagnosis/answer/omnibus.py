@@ -13,8 +13,12 @@ import numpy as np
 
 from ahrsd.diagnosis.calibration_fit.noise_fit import FLOOR_MAG_GAUSS
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered
-from ahrsd.diagnosis.innovation_filter.probabilities import chi2_above, chi2_below, kolmogorov_above
-from ahrsd.diagnosis.values import Context
+from ahrsd.diagnosis.innovation_filter.regression_statistics import (
+    chi2_above,
+    chi2_below,
+    kolmogorov_above,
+)
+from ahrsd.diagnosis.model import Context
 from ahrsd.samples import Array
 
 #: mean square of the innovations below which an assumed noise is not there; two of the three axes

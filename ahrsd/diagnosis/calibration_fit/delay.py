@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd import so3
-from ahrsd.diagnosis.effects import series
-from ahrsd.diagnosis.effects.base import readings_of
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects.effect import readings_of
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
 #: steps within this part of the middle one are alike, and so many must be
@@ -69,7 +69,7 @@ def after_columns_begin(track: Track) -> Track:
     if not track.covariates:
         return track
     mag = track.mag_b_gauss.copy()
-    for run in series.runs(track.dt_s):
+    for run in time_series.runs(track.dt_s):
         before = track.time_s[run] - track.time_s[run.start] < BEGIN_S
         if np.mean(before) < BEGIN_SHARE:
             mag[run][before] = np.nan
@@ -92,7 +92,7 @@ def usual_step(dt_s: Array) -> float | None:
 
 def earlier(track: Track, values: Array, ago_s: float) -> Array:
     """What was logged beside a track's samples, (N,) or (N, k), as it was `ago_s` before."""
-    return series.earlier(values, track.time_s, track.dt_s, ago_s)
+    return time_series.earlier(values, track.time_s, track.dt_s, ago_s)
 
 
 def delayed_gyro(track: Track, tau_s: float, *, instants: bool = False) -> Track:
@@ -163,7 +163,7 @@ def beyond_the_lag(context: Context, lag_s: float) -> Columns:
     """
     readings = readings_of(context)
     time_s, dt_s = readings.time_s, readings.dt_s
-    second = series.derivative(series.field_dot(readings), time_s, dt_s)
-    third = series.derivative(second, time_s, dt_s)
+    second = time_series.derivative(time_series.field_dot(readings), time_s, dt_s)
+    third = time_series.derivative(second, time_s, dt_s)
     change = lag_s**2 / 2 * second - lag_s**3 / 3 * third
     return Columns(mag=(change @ readings.soft_iron.T)[:, :, None])

@@ -1,4 +1,4 @@
-"""Noise levels by innovation likelihood, on pieces of the track."""
+"""Noise levels by differences of readings, and by innovation likelihood on pieces of the track."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.calibration_fit.coarse import group_size, noise_of, thinned
+from ahrsd.diagnosis.calibration_fit.resampling import decimated, decimation
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
+from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Spec, Track
-from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
 
 #: times the gyro's differenced noise that its noise may be at most
@@ -34,7 +34,7 @@ SAME = 0.02  # relative change of a noise level that changes nothing
 
 def first_guess(track: Track, spec: Spec) -> NullModel:
     """Unit soft iron, and noise from differences where the spec does not say."""
-    mag, gyro = noise_of(track)
+    mag, gyro = noise_of_differences(track)
     return NullModel(
         np.eye(3),
         np.zeros(3),
@@ -65,7 +65,7 @@ def estimated(
 ) -> NullModel:
     """The model of a filter run with its noise estimated anew; what the spec says stays."""
     clean = cleaned(filtered.track, terms_mag, terms_gyro)
-    differenced = spec.shaken_gyro_rad_s or max(noise_of(filtered.track)[1], 1e-9)
+    differenced = spec.shaken_gyro_rad_s or max(noise_of_differences(filtered.track)[1], 1e-9)
     model = _white(pieces(clean), filtered.model, spec, differenced)
     return _walking(clean, model) if walk else replace(model, gyro_walk_rad_s_sqrt_s=0.0)
 
@@ -84,7 +84,7 @@ def rescaled(filtered: Filtered, spec: Spec) -> NullModel:
         return replace(model, sigma_mag_gauss=FLOOR_MAG_GAUSS)
     gyro = model.sigma_gyro_rad_s
     if not spec.sigma_gyro_rad_s:
-        differenced = spec.shaken_gyro_rad_s or noise_of(filtered.track)[1]
+        differenced = spec.shaken_gyro_rad_s or noise_of_differences(filtered.track)[1]
         gyro = float(np.clip(gyro * factor, _FLOOR_GYRO_RAD_S, _cap(differenced)))
     return replace(model, sigma_mag_gauss=mag, sigma_gyro_rad_s=gyro)
 
@@ -204,8 +204,8 @@ def _gyro_alone(track: Track, model: NullModel, differenced: float, below: float
 
 def _walking(track: Track, model: NullModel) -> NullModel:
     """With a random walk of the gyro's bias if that is far more likely than none."""
-    size = group_size(track)
-    coarse = thinned(track, size)
+    size = decimation(track)
+    coarse = decimated(track, size)
     rate = replace(model, sigma_gyro_rad_s=model.sigma_gyro_rad_s / np.sqrt(size))
     still = _likelihood(coarse, rate)
     top = np.log(WALK_CAP_RAD_S_SQRT_S)
@@ -247,3 +247,29 @@ def _parabola(left: float, middle: float, right: float) -> float:
     """Where the parabola through values at -1, 0, 1 is highest, at most 1 away."""
     bend = left - 2 * middle + right
     return 0.0 if bend >= 0 else float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0))
+
+
+def noise_of_differences(track: Track) -> tuple[float, float]:
+    """White noise of one reading, (gauss, rad/s), from third differences.
+
+    Of the middle second and the middle axis: a jolt is short, a propeller shakes one axis.
+    Third differences of white noise have 20 times its variance and take out what is smooth over
+    four samples; what motion is left makes both values too large, never too small.
+    """
+    return _of_differences(track, track.mag_b_gauss), _of_differences(track, track.gyro_b_rad_s)
+
+
+def _of_differences(track: Track, values: Array) -> float:
+    found: list[Array] = []
+    known = track.dt_s[np.isfinite(track.dt_s)]
+    block = max(8, round(1.0 / float(np.median(known)))) if len(known) else 8
+    for run in track.runs or (slice(0, len(track)),):
+        third = np.diff(values[run], 3, axis=0)
+        third = third[np.isfinite(third).all(axis=1)]
+        whole = len(third) // block * block
+        if whole:
+            square = np.mean(np.square(third[:whole]).reshape(-1, block, 3), axis=1)
+            found.append(square / 20.0)
+    if not found:
+        return 0.0
+    return float(np.sqrt(np.median(np.median(np.concatenate(found), axis=0))))

@@ -7,19 +7,23 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ahrsd.diagnosis.calibration_fit.coarse import noise_of
-from ahrsd.diagnosis.calibration_fit.coning import with_delta_angles
 from ahrsd.diagnosis.calibration_fit.delay import (
     after_columns_begin,
     earlier,
     of_magnetometer,
     without_lag,
 )
-from ahrsd.diagnosis.calibration_fit.null import cold_start
-from ahrsd.diagnosis.calibration_fit.shaken import QUIETER, carrying, quieter
-from ahrsd.diagnosis.calibration_fit.thin import thinned, working_factor
+from ahrsd.diagnosis.calibration_fit.gyro_readings import (
+    QUIETER,
+    carrying,
+    quieter,
+    with_delta_angles,
+)
+from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
+from ahrsd.diagnosis.calibration_fit.null_fit import cold_start
+from ahrsd.diagnosis.calibration_fit.resampling import thinned, working_factor
+from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import NothingToFit, Spec, Track
-from ahrsd.diagnosis.values import NullModel
 from ahrsd.samples import Array
 
 MEAN_RATES = (
@@ -109,7 +113,10 @@ def problem_of(track: Track, spec: Spec) -> tuple[Problem, NullModel]:
     known = noise_of_thinned(spec, averaged, m)
     if (found := quieter(track, work, known, start)) is not None:
         known, start = found
-    elif spec.sigma_gyro_rad_s is None and start.sigma_gyro_rad_s < QUIETER * noise_of(work)[1]:
+    elif (
+        spec.sigma_gyro_rad_s is None
+        and start.sigma_gyro_rad_s < QUIETER * noise_of_differences(work)[1]
+    ):
         # the gyro's differences at the working rate are its motion's
         known = replace(known, sigma_gyro_rad_s=start.sigma_gyro_rad_s)
     made = Problem(work, known, track, m, cold, averaged=averaged, notes=notes)

@@ -17,8 +17,8 @@ from typing import Protocol
 import numpy as np
 
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.columns.shown import shown
-from ahrsd.diagnosis.data_quality.aligned import cut
+from ahrsd.diagnosis.columns.roles import shown
+from ahrsd.diagnosis.external_simulation import cut
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.where_and_when.locate import Located
 from ahrsd.samples import Array

@@ -1,6 +1,8 @@
 """What the further columns of a recording are: roles by name and unit, and which can be used.
 
 A column that cannot be used is refused with a sentence, never silently: `prepared` returns them.
+
+Whatever a file calls its columns, a person is shown one short line (`shown`).
 """
 
 from __future__ import annotations
@@ -14,7 +16,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis.columns.shown import shown
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
@@ -30,6 +31,8 @@ _OWN_OUTPUT = re.compile(
     r"^(vn_|est_|dcm|q(uat)?(ernion)?_?[wxyz0-3]|uncomp|delta_|lin_?acc|(mag|gyro|accel)_(?!temp)"
     r"|(yaw|pitch|roll)(_?(angle|rate|std|sigma|uncertainty))?(_(deg|rad)(_s)?)?$)"
 )
+#: characters of a name that are shown
+SHOWN_CHARACTERS = 48
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,3 +257,10 @@ def _longest_on(values: Array) -> int:
     edges = np.diff(np.concatenate([[0], (values != 0).astype(np.int64), [0]]))
     lengths = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
     return int(lengths.max()) if len(lengths) else 0
+
+
+def shown(name: str) -> str:
+    """The name with what is not printable as its escape, and its middle left out if it is long."""
+    if len(name) > SHOWN_CHARACTERS:
+        name = f"{name[: SHOWN_CHARACTERS - 13]}...{name[-10:]}"
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in name)

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding, Unexplained, Value, Where
-from ahrsd.diagnosis.effects.base import Effect
-from ahrsd.diagnosis.values import Term
+from ahrsd.diagnosis.effects.effect import Effect
+from ahrsd.diagnosis.model import Term
 from ahrsd.samples import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fact:
-    """One finding of the hygiene.
+    """One thing that is wrong with a recording.
 
     effect:     identifier of the contract;  words: one line that says it with its numbers
     confidence: of the name, 0..1

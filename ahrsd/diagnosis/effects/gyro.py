@@ -1,4 +1,8 @@
-"""What the gyro makes of a rate: scale, axes, non-linearity, delay, integration, clipping."""
+"""What the gyro makes of a rate, and how its bias moves.
+
+Of the rate: scale, axes, non-linearity, delay, integration, clipping.  Of the bias: temperature,
+time, steps, vibration, start-up.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.effects import series, shapes
-from ahrsd.diagnosis.effects.base import (
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.columns import roles
+from ahrsd.diagnosis.effects import design_matrix
+from ahrsd.diagnosis.effects.effect import (
     Clipped,
     Effect,
     Linear,
@@ -17,11 +23,12 @@ from ahrsd.diagnosis.effects.base import (
     readings_of,
     rowwise_readings_of,
 )
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 #: by which the earth turns among the stars: no axis has more of it
 SIDEREAL_RAD_S = 7.292e-5
+_WALK_MODES = 4
 
 
 class GyroScale(Linear):
@@ -32,7 +39,7 @@ class GyroScale(Linear):
     family = "gyro"
     words = "the gyro's scale factor is off"
     equation = "w_i += s_i w_i"
-    parameters = shapes.vector("scale_error", "1", 0.005, 0.2)
+    parameters = design_matrix.vector("scale_error", "1", 0.005, 0.2)
     typical = (0.005, -0.004, 0.006)
     signature = "grows with the net rotation about an axis"
     confusers = (
@@ -86,7 +93,7 @@ class GyroNonorthogonality(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The off-diagonal symmetric matrices on the rate."""
-        return Columns(gyro=shapes.times_symmetric(readings.rate_b_rad_s)[:, :, 3:])
+        return Columns(gyro=design_matrix.times_symmetric(readings.rate_b_rad_s)[:, :, 3:])
 
 
 class GyroNonlinearity(Linear):
@@ -97,7 +104,7 @@ class GyroNonlinearity(Linear):
     family = "gyro"
     words = "the gyro's scale depends on the rate"
     equation = "w_i += k_i |w_i| w_i, or k_i |w| w_i"
-    parameters = shapes.vector("per_rate", "s/rad", 0.005, 0.2)
+    parameters = design_matrix.vector("per_rate", "s/rad", 0.005, 0.2)
     typical = (0.005, -0.004, 0.006)
     signature = "only at high rates"
     confusers = (("gyro_scale", "turn at two rates"),)
@@ -132,7 +139,7 @@ class GyroGSensitivity(Linear):
     family = "gyro"
     words = "the gyro feels acceleration and tilt"
     equation = "w += G a, a: specific force in g"
-    parameters = shapes.matrix("per_g", "rad/s/g", 5e-4, 0.05)
+    parameters = design_matrix.matrix("per_g", "rad/s/g", 5e-4, 0.05)
     typical = (6e-4, 2e-4, 0.0, -3e-4, 4e-4, 1e-4, 0.0, 2e-4, -5e-4)
     needs = ("accel",)
     signature = "a gyro bias that follows the tilt"
@@ -147,11 +154,11 @@ class GyroGSensitivity(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Nothing to choose, where there is an accelerometer."""
-        return ({},) if shapes.has_accel(readings) else ()
+        return ({},) if design_matrix.has_accel(readings) else ()
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """A matrix on the specific force."""
-        return Columns(gyro=shapes.times_matrix(shapes.specific_force_g(readings)))
+        return Columns(gyro=design_matrix.times_matrix(design_matrix.specific_force_g(readings)))
 
 
 class EarthRotation(Linear):
@@ -211,7 +218,7 @@ class GyroIntegration(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """From the step's mean to the instant."""
-        change = series.instant_rate(readings) - readings.rate_b_rad_s
+        change = time_series.instant_rate(readings) - readings.rate_b_rad_s
         return Columns(gyro=change[:, :, None])
 
 
@@ -244,14 +251,14 @@ class GyroTimeLag(Effect):
     def columns(self, context: Context, setting: Setting) -> Columns:
         """-dw/dt."""
         r = readings_of(context)
-        return Columns(gyro=-series.derivative(r.rate_b_rad_s, r.time_s, r.dt_s)[:, :, None])
+        return Columns(gyro=-time_series.derivative(r.rate_b_rad_s, r.time_s, r.dt_s)[:, :, None])
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """What the gyro would have read `value` seconds ago in place of the present."""
         lag_s = float(value[0])
         others = readings.gyro_b_rad_s - readings.rate_b_rad_s
-        others = series.earlier(others, readings.time_s, readings.dt_s, lag_s)
-        return replace(readings, gyro_b_rad_s=series.delayed_rate(readings, lag_s) + others)
+        others = time_series.earlier(others, readings.time_s, readings.dt_s, lag_s)
+        return replace(readings, gyro_b_rad_s=time_series.delayed_rate(readings, lag_s) + others)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """Ten milliseconds."""
@@ -274,3 +281,193 @@ class GyroSaturation(Clipped):
     manoeuvre = "turn more slowly"
     size = "2000 deg/s range of the VN-100"
     source = "dossier G10"
+
+
+class GyroBiasTemperature(Linear):
+    """G6."""
+
+    identifier = "gyro_bias_temperature"
+    code = "G6"
+    family = "gyro"
+    words = "the gyro bias follows temperature"
+    equation = "w += k (T - T0)"
+    parameters = design_matrix.vector("bias_per_degree", "rad/s/K", 2e-4, 5e-3)
+    typical = design_matrix.along(2e-4)
+    needs = ("temperature",)
+    signature = "follows the warm-up curve"
+    confusers = (
+        ("gyro_bias_drift", "heat it a second time, or log longer"),
+        ("gyro_startup", "switch on again while it is warm"),
+    )
+    manoeuvre = "at rest while it warms and cools"
+    size = "0.001 to 0.05 deg/s/K"
+    source = "dossier G6; the recording F00379"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """One per thermometer."""
+        return design_matrix.per_covariate(readings, "temperature")
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """T - T0 on each axis."""
+        return Columns(gyro=design_matrix.on_axes(design_matrix.course_of(readings, setting)))
+
+
+class GyroBiasDrift(Linear):
+    """G7: the largest modes of a random walk (Karhunen-Loeve), 95 % of its variance."""
+
+    identifier = "gyro_bias_drift"
+    code = "G7"
+    family = "gyro"
+    words = "the gyro bias wanders"
+    equation = "w += sum_j k_j sin((j - 1/2) pi t/T), j = 1 to 4: a random walk's largest modes"
+    parameters = tuple(
+        Parameter(f"mode_{j}_{axis}", "rad/s", 4e-4 / (2 * j - 1), 0.02)
+        for j in range(1, _WALK_MODES + 1)
+        for axis in "xyz"
+    )
+    typical = tuple(
+        size * part
+        for size, parts in (
+            (4e-4, design_matrix.DIRECTION),
+            (-1.3e-4, (0.48, 0.6, -0.64)),
+            (0.8e-4, (-0.64, 0.48, 0.6)),
+            (0.5e-4, design_matrix.DIRECTION),
+        )
+        for part in parts
+    )
+    signature = "a slow course of the gyro error"
+    confusers = (
+        ("gyro_bias_temperature", "log the temperature; heat it a second time"),
+        ("gyro_startup", "switch on again and compare the first minutes"),
+        ("gyro_bias_step", "record longer on both sides"),
+    )
+    manoeuvre = "an hour at rest, for its Allan deviation"
+    size = "5 to 10 deg/h"
+    source = "IEEE 952 (from memory; dossier G7)"
+    course = True
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """The recording's own length."""
+        return (design_matrix.span(readings),)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """The modes on each axis."""
+        order = np.arange(1, _WALK_MODES + 1) - 0.5
+        return Columns(
+            gyro=design_matrix.on_axes(
+                np.sin(np.pi * order * design_matrix.elapsed(readings, setting))
+            )
+        )
+
+
+class GyroBiasStep(Linear):
+    """G8."""
+
+    identifier = "gyro_bias_step"
+    code = "G8"
+    family = "gyro"
+    words = "the gyro bias jumped: a shock, or a new zero set on board"
+    equation = "w += k from t0 on"
+    parameters = design_matrix.vector("step", "rad/s", 1e-3, 0.05)
+    typical = design_matrix.along(1e-3)
+    signature = "one jump of the gyro error"
+    confusers = (
+        ("gyro_bias_drift", "near an end of the recording: record longer"),
+        ("vibration_rectification", "log acceleration or current"),
+    )
+    manoeuvre = "rest before and after"
+    size = "0.005 to 0.2 deg/s"
+    source = "the device's command to set the gyro bias (dossier G8)"
+    recurs = True
+    jumps = True
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """A coarse grid of times."""
+        return design_matrix.onsets(readings)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """1 from the onset on, on each axis."""
+        return Columns(gyro=design_matrix.on_axes(design_matrix.since(readings, setting)))
+
+
+class GyroStartup(Linear):
+    """G14; the recording's first sample counts as the start where nothing says better."""
+
+    identifier = "gyro_startup"
+    code = "G14"
+    family = "gyro"
+    words = "the gyro bias settles after power-on"
+    equation = "w += k exp(-t / tau)"
+    parameters = design_matrix.vector("at_start", "rad/s", 1e-3, 0.02)
+    typical = design_matrix.along(1e-3)
+    signature = "the gyro error dies away in the first minutes"
+    confusers = (
+        ("gyro_bias_temperature", "switch on again while it is warm"),
+        ("gyro_bias_drift", "switch on again and compare the first minutes"),
+    )
+    manoeuvre = "switch off for a second and on again while warm"
+    size = "0.01 to 0.1 deg/s"
+    source = "dossier G14"
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """Time constants a factor of three apart."""
+        start = {"start_s": float(readings.time_s[0])}
+        return tuple({**start, "time_constant_s": tau} for tau in (20.0, 60.0, 180.0))
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """The decay on each axis."""
+        passed = (readings.time_s - setting["start_s"]) / setting["time_constant_s"]
+        return Columns(gyro=design_matrix.on_axes(np.exp(-passed)[:, None]))
+
+
+class VibrationRectification(Linear):
+    """G5.  The course is normalised to its own mean size, so that the parameter is a rate."""
+
+    identifier = "vibration_rectification"
+    code = "G5"
+    family = "gyro"
+    words = "vibration shifts the gyro bias"
+    equation = "w += k v(t), v: variance of the acceleration, I^2, or rpm^2, over its mean"
+    parameters = design_matrix.vector("bias_at_mean", "rad/s", 5e-4, 0.02)
+    typical = design_matrix.along(5e-4)
+    needs = ("accel|current|rpm",)
+    signature = "the gyro bias jumps with the motors"
+    confusers = (
+        ("motor_current_field", "it acts on the magnetometer: pulse the motor at rest"),
+        ("gyro_g_sensitivity", "tilt at rest with the motors off"),
+        ("gyro_bias_step", "switch the motor several times"),
+    )
+    manoeuvre = "run the motor at rest in steps"
+    size = "0.001 to 0.1 deg/s"
+    source = "diydrones on aliasing (dossier G5)"
+    ordinary = 0.6
+
+    def choices(self, readings: Readings) -> tuple[Setting, ...]:
+        """The acceleration's variance over a second, each current and each shaft squared."""
+        found: list[Setting] = []
+        if design_matrix.has_accel(readings) and float(np.mean(_shaking(readings, 1.0))) > 0.0:
+            mean = float(np.mean(_shaking(readings, 1.0)))
+            found.append({"covariate": "accel", "window_s": 1.0, "mean": mean})
+        for role in ("current", "rpm"):
+            for name in roles.named(readings.covariates, role):
+                mean = float(np.mean(readings.covariates[name] ** 2))
+                found.append({"covariate": name, "mean": mean})
+        return tuple(found)
+
+    def terms(self, readings: Readings, setting: Setting) -> Columns:
+        """The vibration's course on each axis."""
+        if setting["covariate"] == "accel":
+            course = _shaking(readings, setting["window_s"])
+        else:
+            course = readings.covariates[setting["covariate"]] ** 2
+        return Columns(gyro=design_matrix.on_axes(np.asarray(course / setting["mean"])[:, None]))
+
+
+def _shaking(readings: Readings, window_s: float) -> Array:
+    """Variance (N,) in g^2 of the specific force about its mean over the window, all axes."""
+    rows = max(round(window_s / time_series.median_step(readings.dt_s)), 3)
+    total = np.zeros(len(readings.time_s))
+    for axis in readings.accel_b_m_s2.T / design_matrix.GRAVITY_M_S2:
+        slow = time_series.moving_mean(axis, readings.dt_s, rows)
+        total += time_series.moving_mean((axis - slow) ** 2, readings.dt_s, rows)
+    return total

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from ahrsd.diagnosis.effects import (
     gyro,
-    gyro_bias,
     link,
     sensor_element,
     sensor_iron,
@@ -12,7 +11,7 @@ from ahrsd.diagnosis.effects import (
     sensor_sources,
     world,
 )
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
 
 _ALL: tuple[Effect, ...] = (
     sensor_iron.HardIronStep(),
@@ -48,15 +47,15 @@ _ALL: tuple[Effect, ...] = (
     gyro.GyroNonorthogonality(),
     sensor_motion.MagGyroMisalignment(),
     gyro.GyroGSensitivity(),
-    gyro_bias.VibrationRectification(),
-    gyro_bias.GyroBiasTemperature(),
-    gyro_bias.GyroBiasDrift(),
-    gyro_bias.GyroBiasStep(),
+    gyro.VibrationRectification(),
+    gyro.GyroBiasTemperature(),
+    gyro.GyroBiasDrift(),
+    gyro.GyroBiasStep(),
     gyro.GyroNonlinearity(),
     gyro.GyroSaturation(),
     gyro.EarthRotation(),
     gyro.GyroIntegration(),
-    gyro_bias.GyroStartup(),
+    gyro.GyroStartup(),
     gyro.GyroTimeLag(),
     link.ClockRate(),
     link.TimestampJitter(),

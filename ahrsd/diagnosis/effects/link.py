@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.effects import series, shapes
-from ahrsd.diagnosis.effects.base import (
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects import design_matrix
+from ahrsd.diagnosis.effects.effect import (
     Discrete,
     Effect,
     Linear,
@@ -18,7 +19,7 @@ from ahrsd.diagnosis.effects.base import (
     readings_of,
     rowwise_readings_of,
 )
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 _MG = 1e-3
@@ -77,7 +78,7 @@ class TimestampJitter(Scatter):
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Stamps off by a normal deviate, never so far that time would go back."""
         draw = np.random.default_rng(setting["seed"]).standard_normal(len(readings.time_s))
-        most = 0.45 * series.median_step(readings.dt_s)
+        most = 0.45 * time_series.median_step(readings.dt_s)
         time_s = readings.time_s + np.clip(float(value[0]) * draw, -most, most)
         step = np.concatenate([[np.nan], np.diff(time_s)])
         return replace(
@@ -117,7 +118,7 @@ class NoiseBurst(Scatter):
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """A tenth of the recording, in its middle."""
         length = round(0.1 * float(readings.time_s[-1] - readings.time_s[0]), 3)
-        onset = shapes.middle_s(readings)
+        onset = design_matrix.middle_s(readings)
         return strength * np.array(self.typical), {"onset_s": onset, "length_s": length, "seed": 1}
 
 
@@ -146,7 +147,7 @@ class NoiseLevel(Scatter):
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Normal noise on both sensors."""
         rng = np.random.default_rng(setting["seed"])
-        on = shapes.since(readings, setting)
+        on = design_matrix.since(readings, setting)
         mag, gyro = (rng.standard_normal(readings.mag_b_gauss.shape) * on for _ in range(2))
         return replace(
             readings,
@@ -183,7 +184,7 @@ class DroppedSamples(Discrete):
         """The rows that are left; never the first."""
         draw = np.random.default_rng(setting["seed"]).random(len(readings.time_s))
         draw[0] = 1.0
-        return series.kept(readings, draw >= float(value[0]))
+        return time_series.kept(readings, draw >= float(value[0]))
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """Two in a hundred."""
@@ -219,7 +220,7 @@ class StuckMagnetometer(Discrete):
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """Five seconds in the middle."""
-        return strength * np.array(self.typical), {"onset_s": shapes.middle_s(readings)}
+        return strength * np.array(self.typical), {"onset_s": design_matrix.middle_s(readings)}
 
 
 class FrameError(Discrete):
@@ -313,7 +314,7 @@ class OnboardCalibrationActive(Effect):
         first = float(readings.time_s[0])
         return tuple(
             {**onset, "time_constant_s": tau}
-            for onset in ({"onset_s": first}, *shapes.onsets(readings)[::2])
+            for onset in ({"onset_s": first}, *design_matrix.onsets(readings)[::2])
             for tau in _CONVERGED_S
         )
 

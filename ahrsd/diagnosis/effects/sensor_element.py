@@ -7,17 +7,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis.effects import series, shapes
-from ahrsd.diagnosis.effects.base import (
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects import design_matrix
+from ahrsd.diagnosis.effects.effect import (
     Clipped,
     Effect,
     Linear,
     Parameter,
     Readings,
     Setting,
-    left_over,
+    residual_gauss,
 )
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 Rows = NDArray[np.intp]
@@ -45,10 +46,10 @@ class AcInterference(Linear):
     words = "an alternating field: mains, or the harmonics of a motor controller, aliased"
     equation = "m += k_c cos(2 pi f_a t) + k_s sin(2 pi f_a t), f_a = |f - n f_s|"
     parameters = (
-        *shapes.vector("cosine", "gauss", 1.0 * _MG, 50.0 * _MG),
-        *shapes.vector("sine", "gauss", 1.0 * _MG, 50.0 * _MG),
+        *design_matrix.vector("cosine", "gauss", 1.0 * _MG, 50.0 * _MG),
+        *design_matrix.vector("sine", "gauss", 1.0 * _MG, 50.0 * _MG),
     )
-    typical = (*shapes.along(1.0 * _MG), *(0.5 * _MG * part for part in (0.48, 0.6, -0.64)))
+    typical = (*design_matrix.along(1.0 * _MG), *(0.5 * _MG * part for part in (0.48, 0.6, -0.64)))
     signature = "a line in the spectrum of the innovations"
     confusers = (
         ("rotor_field", "it moves with the shaft: change the rpm"),
@@ -61,18 +62,18 @@ class AcInterference(Linear):
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """The two strongest lines."""
-        return lines(left_over(context), context.track.gyro_b_rad_s, context.track.dt_s)
+        return lines(residual_gauss(context), context.track.gyro_b_rad_s, context.track.dt_s)
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The alias of 60 Hz at this rate, or a line in the middle of the band."""
-        rate_hz = 1.0 / series.median_step(readings.dt_s)
+        rate_hz = 1.0 / time_series.median_step(readings.dt_s)
         alias = aliased(60.0, rate_hz)
         return ({"frequency_hz": alias if alias > _LOWEST_HZ else 0.31 * rate_hz},)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """cos, then sin, on each axis."""
         phase = 2 * np.pi * setting["frequency_hz"] * readings.time_s
-        return Columns(mag=shapes.on_axes(np.column_stack([np.cos(phase), np.sin(phase)])))
+        return Columns(mag=design_matrix.on_axes(np.column_stack([np.cos(phase), np.sin(phase)])))
 
 
 class MagScaleTemperature(Linear):
@@ -83,7 +84,7 @@ class MagScaleTemperature(Linear):
     family = "sensor"
     words = "the magnetometer's sensitivity follows temperature"
     equation = "m_i += k_i (T - T0) x_i, x = A h, A h + b or h"
-    parameters = shapes.vector("gain_per_degree", "1/K", 1e-3, 2e-2)
+    parameters = design_matrix.vector("gain_per_degree", "1/K", 1e-3, 2e-2)
     typical = (1e-3, 0.8e-3, 1.2e-3)
     needs = ("temperature",)
     signature = "the field's size drifts with the warm-up and turns with the heading"
@@ -100,7 +101,7 @@ class MagScaleTemperature(Linear):
         return tuple(
             setting
             for of in ("field", "reading", "outside")
-            for setting in shapes.per_covariate(readings, "temperature", of=of)
+            for setting in design_matrix.per_covariate(readings, "temperature", of=of)
         )
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
@@ -110,7 +111,7 @@ class MagScaleTemperature(Linear):
             seen = readings.field_b @ readings.soft_iron.T
         elif setting["of"] == "outside":
             seen = readings.field_b
-        gain = shapes.course_of(readings, setting) * seen
+        gain = design_matrix.course_of(readings, setting) * seen
         return Columns(mag=np.asarray(gain[:, :, None] * np.eye(3)))
 
 
@@ -163,7 +164,7 @@ class MagNonlinearity(Linear):
     family = "sensor"
     words = "the element's gain depends on the field along it"
     equation = "m_i += k_i (m_i / 0.5 G)^3"
-    parameters = shapes.vector("cubic", "gauss", 1.0 * _MG, 20.0 * _MG)
+    parameters = design_matrix.vector("cubic", "gauss", 1.0 * _MG, 20.0 * _MG)
     typical = (1.5 * _MG, -1.0 * _MG, 1.2 * _MG)
     signature = "grows with the third power of the reading"
     confusers = (("mag_cross_axis", "pitch to 45 degrees"),)
@@ -295,8 +296,8 @@ def lines(residual: Array, gyro_b_rad_s: Array, dt_s: Array) -> tuple[Setting, .
     None that keeps step with the samples: no source outside the device does.  None where the
     vehicle turns to and fro: whatever the model lacks returns at that rate.
     """
-    run = max(series.runs(dt_s), key=lambda r: int(r.stop - r.start))
-    values, step_s = residual[run] - residual[run].mean(axis=0), series.median_step(dt_s[run])
+    run = max(time_series.runs(dt_s), key=lambda r: int(r.stop - r.start))
+    values, step_s = residual[run] - residual[run].mean(axis=0), time_series.median_step(dt_s[run])
     if len(values) < 64 or not np.any(values):
         return ()
     window = np.hanning(len(values))[:, None]
@@ -313,7 +314,7 @@ def lines(residual: Array, gyro_b_rad_s: Array, dt_s: Array) -> tuple[Setting, .
     found: list[Setting] = []
     for _ in range(_LINES + len(_IN_STEP)):
         at = int(np.argmax(power))
-        best = float(frequency[at] + series.peak(power, at) * frequency[1])
+        best = float(frequency[at] + time_series.peak(power, at) * frequency[1])
         mains = [f for f in _MAINS_HZ if abs(aliased(f, 1 / step_s) - best) < width + 5e-4 * f]
         if mains or min(abs(best * step_s - part) for part in _IN_STEP) > width * step_s / 4:
             found.append({"frequency_hz": best, "searched": len(values) // 2, "mains_hz": mains})
@@ -343,7 +344,7 @@ def _background(power: Array) -> Array:
 def _last_update(dt_s: Array, setting: Setting) -> Rows:
     """Row of the last update for each row, counted within runs."""
     out = np.empty(len(dt_s), dtype=np.intp)
-    for run in series.runs(dt_s):
+    for run in time_series.runs(dt_s):
         row = np.arange(run.stop - run.start)
         back = (row - setting["phase"]) % setting["hold_samples"]
         out[run] = run.start + np.maximum(row - back, 0)

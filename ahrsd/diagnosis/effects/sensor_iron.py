@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.effects import series, shapes
-from ahrsd.diagnosis.effects.base import Linear, Readings, Setting
-from ahrsd.diagnosis.values import Columns
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects import design_matrix
+from ahrsd.diagnosis.effects.effect import Linear, Readings, Setting
+from ahrsd.diagnosis.model import Columns
 
 _MG = 1e-3
 #: time constants of a drift that settles, as a vehicle that warms up does
@@ -21,8 +22,8 @@ class HardIronStep(Linear):
     family = "sensor"
     words = "the hard iron jumped: a payload was moved, a magnet put on or taken off, a shock"
     equation = "m += k from t0 on"
-    parameters = shapes.vector("step", "gauss", 10.0 * _MG, 1000.0 * _MG)
-    typical = shapes.along(5.0 * _MG)
+    parameters = design_matrix.vector("step", "gauss", 10.0 * _MG, 1000.0 * _MG)
+    typical = design_matrix.along(5.0 * _MG)
     signature = "one jump in the sensor frame, the same on every heading"
     confusers = (
         ("soft_iron_step", "its size turns with the heading: all headings before and after"),
@@ -39,11 +40,11 @@ class HardIronStep(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """A coarse grid of times."""
-        return shapes.onsets(readings)
+        return design_matrix.onsets(readings)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """1 from the onset on, on each axis."""
-        return Columns(mag=shapes.on_axes(shapes.since(readings, setting)))
+        return Columns(mag=design_matrix.on_axes(design_matrix.since(readings, setting)))
 
 
 class HardIronDrift(Linear):
@@ -57,8 +58,8 @@ class HardIronDrift(Linear):
         "m += k s, s = t / T, or ln(1 + t/t1) / ln(1 + T/t1), or "
         "(1 - exp(-t/t1)) / (1 - exp(-T/t1)); T: length of the recording"
     )
-    parameters = shapes.vector("change", "gauss", 1.0 * _MG, 50.0 * _MG)
-    typical = shapes.along(2.0 * _MG)
+    parameters = design_matrix.vector("change", "gauss", 1.0 * _MG, 50.0 * _MG)
+    typical = design_matrix.along(2.0 * _MG)
     signature = "a steady course in the sensor frame"
     confusers = (
         ("mag_bias_temperature", "a warm-up is nearly straight in time: heat soak, or run longer"),
@@ -72,7 +73,7 @@ class HardIronDrift(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Straight; fast, then slow; settling, with time constants a factor of two apart."""
-        over = shapes.span(readings)
+        over = design_matrix.span(readings)
         return (
             {**over, "shape": "line"},
             {**over, "shape": "log", "relaxation_s": 10.0},
@@ -81,14 +82,14 @@ class HardIronDrift(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The course from 0 to 1 on each axis."""
-        part = shapes.elapsed(readings, setting)
+        part = design_matrix.elapsed(readings, setting)
         if setting["shape"] == "log":
             ratio = setting["span_s"] / setting["relaxation_s"]
             part = np.log1p(np.maximum(part, 0.0) * ratio) / np.log1p(ratio)
         elif setting["shape"] == "settling":
             ratio = setting["span_s"] / setting["time_constant_s"]
             part = np.expm1(-np.maximum(part, 0.0) * ratio) / np.expm1(-ratio)
-        return Columns(mag=shapes.on_axes(part))
+        return Columns(mag=design_matrix.on_axes(part))
 
 
 class SoftIronStep(Linear):
@@ -99,7 +100,7 @@ class SoftIronStep(Linear):
     family = "sensor"
     words = "the soft iron changed: steel was added, removed or moved"
     equation = "m += dA h from t0 on, dA symmetric"
-    parameters = shapes.symmetric("change", "1", 0.01, 0.3)
+    parameters = design_matrix.symmetric("change", "1", 0.01, 0.3)
     typical = (0.01, -0.006, 0.004, 0.005, -0.004, 0.006)
     signature = "a jump whose size and direction turn with the heading"
     confusers = (
@@ -114,12 +115,12 @@ class SoftIronStep(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """A coarse grid of times."""
-        return shapes.onsets(readings)
+        return design_matrix.onsets(readings)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The symmetric matrices on the field, from the onset on."""
-        on = shapes.since(readings, setting)[:, :, None]
-        return Columns(mag=shapes.times_symmetric(readings.field_b) * on)
+        on = design_matrix.since(readings, setting)[:, :, None]
+        return Columns(mag=design_matrix.times_symmetric(readings.field_b) * on)
 
 
 class Hysteresis(Linear):
@@ -132,8 +133,8 @@ class Hysteresis(Linear):
     equation = "m_i += k_i (play_r[(A h)_i] - (A h)_i) / r"
     # three times the largest that is known: in a spin the field along the axis has no swing but the
     # filter's own noise, of which a width of thirty explains a part of the innovations
-    parameters = shapes.vector("width", "gauss", 2.0 * _MG, 10.0 * _MG)
-    typical = shapes.along(2.0 * _MG)
+    parameters = design_matrix.vector("width", "gauss", 2.0 * _MG, 10.0 * _MG)
+    typical = design_matrix.along(2.0 * _MG)
     signature = "the error depends on the direction of turning, not on its rate"
     confusers = (
         ("eddy_current", "change the turn's rate: eddies scale with it, hysteresis does not"),
@@ -153,7 +154,7 @@ class Hysteresis(Linear):
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """Between -1 and 1 per axis."""
         induced, radius = readings.field_b @ readings.soft_iron.T, setting["radius_gauss"]
-        gap = (series.play(induced, radius, setting.get("memory")) - induced) / radius
+        gap = (time_series.play(induced, radius, setting.get("memory")) - induced) / radius
         return Columns(mag=np.asarray(gap[:, :, None] * np.eye(3)))
 
 
@@ -165,7 +166,7 @@ class ViscousMagnetisation(Linear):
     family = "sensor"
     words = "iron that takes its time to follow a turn"
     equation = "m += dA (LP_tau[h] - h), dA symmetric, LP_tau: first-order low-pass"
-    parameters = shapes.symmetric("lagging_part", "1", 0.005, 0.1)
+    parameters = design_matrix.symmetric("lagging_part", "1", 0.005, 0.1)
     typical = (0.006, 0.004, -0.003, 0.003, 0.002, -0.003)
     signature = "an offset that relaxes for 10 to 120 s after a turn"
     confusers = (
@@ -186,5 +187,5 @@ class ViscousMagnetisation(Linear):
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The symmetric matrices on what trails."""
         tau, memory = setting["time_constant_s"], setting.get("memory")
-        slow = series.low_pass(readings.field_b, readings.dt_s, tau, memory)
-        return Columns(mag=shapes.times_symmetric(slow - readings.field_b))
+        slow = time_series.low_pass(readings.field_b, readings.dt_s, tau, memory)
+        return Columns(mag=design_matrix.times_symmetric(slow - readings.field_b))

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.diagnosis.effects import series, shapes
-from ahrsd.diagnosis.effects.base import (
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects import design_matrix
+from ahrsd.diagnosis.effects.effect import (
     Effect,
     Linear,
     Parameter,
@@ -17,7 +18,7 @@ from ahrsd.diagnosis.effects.base import (
     readings_of,
     smooth_readings_of,
 )
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 
@@ -29,7 +30,7 @@ class EddyCurrent(Linear):
     family = "sensor"
     words = "eddy currents in hull or housing"
     equation = "m += E dh/dt, dh/dt = h x w"
-    parameters = shapes.matrix("eddy", "s", 0.01, 0.2)
+    parameters = design_matrix.matrix("eddy", "s", 0.01, 0.2)
     typical = (0.01, 0.002, 0.0, -0.003, 0.008, 0.001, 0.0, 0.002, 0.014)
     signature = "proportional to the turn's rate, changes sign with its direction"
     confusers = (
@@ -47,7 +48,7 @@ class EddyCurrent(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """A matrix on the field's derivative."""
-        return Columns(mag=shapes.times_matrix(series.field_dot(readings)))
+        return Columns(mag=design_matrix.times_matrix(time_series.field_dot(readings)))
 
 
 class MagTimeLag(Effect):
@@ -82,16 +83,16 @@ class MagTimeLag(Effect):
     def columns(self, context: Context, setting: Setting) -> Columns:
         """-A dh/dt."""
         readings = readings_of(context)
-        change = series.field_dot(readings) @ readings.soft_iron.T
+        change = time_series.field_dot(readings) @ readings.soft_iron.T
         return Columns(mag=-change[:, :, None])
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """What the magnetometer would have read `value` seconds ago in place of the present."""
         lag_s = float(value[0])
         delay_s = np.full(len(readings.time_s), lag_s)
-        field = series.delayed_field(readings, delay_s) @ readings.soft_iron.T
+        field = time_series.delayed_field(readings, delay_s) @ readings.soft_iron.T
         others = readings.mag_b_gauss - readings.field_b @ readings.soft_iron.T
-        others = series.earlier(others, readings.time_s, readings.dt_s, lag_s)
+        others = time_series.earlier(others, readings.time_s, readings.dt_s, lag_s)
         return replace(readings, mag_b_gauss=field + others)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
@@ -134,9 +135,9 @@ class MagLowPass(Linear):
         """What the filter takes away, per second of its time constant."""
         tau0 = setting["time_constant_s"]
         field_b, time_s, dt_s = readings.field_b, readings.time_s, readings.dt_s
-        change = series.low_pass_of_curves(field_b, time_s, dt_s, tau0) - field_b
+        change = time_series.low_pass_of_curves(field_b, time_s, dt_s, tau0) - field_b
         others = readings.mag_b_gauss - field_b @ readings.soft_iron.T
-        change = change @ readings.soft_iron.T + series.low_pass(others, dt_s, tau0) - others
+        change = change @ readings.soft_iron.T + time_series.low_pass(others, dt_s, tau0) - others
         return Columns(mag=np.asarray(change / tau0)[:, :, None])
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
@@ -157,7 +158,7 @@ class FlexibleMount(Effect):
     family = "sensor"
     words = "the magnetometer's mount gives under its weight and acceleration"
     equation = "m = A Exp(C (a - a0)) h + b, a: specific force in g, a0: where it is straight"
-    parameters = shapes.matrix("bend", "rad/g", 0.01, 0.2)
+    parameters = design_matrix.matrix("bend", "rad/g", 0.01, 0.2)
     typical = (0.0, 0.008, 0.002, -0.009, 0.0, 0.001, 0.002, -0.003, 0.0)
     needs = ("accel",)
     signature = "the error follows tilt and thrust"
@@ -178,7 +179,7 @@ class FlexibleMount(Effect):
         """Straight without a load or under the mean one, where there is an accelerometer."""
         if context.track.accel_b_m_s2 is None:
             return ()
-        mean_g = np.mean(shapes.specific_force_g(readings_of(context)), axis=0)
+        mean_g = np.mean(design_matrix.specific_force_g(readings_of(context)), axis=0)
         mean = [round(float(one), 4) for one in mean_g]
         return {}, {"straight_g": mean}
 
@@ -186,7 +187,7 @@ class FlexibleMount(Effect):
         """A ((C (a - a0)) x h)."""
         readings = readings_of(context)
         force = _load_g(readings, setting)
-        turn = readings.soft_iron @ shapes.turned_by(readings.field_b)  # (N, 3, 3)
+        turn = readings.soft_iron @ design_matrix.turned_by(readings.field_b)  # (N, 3, 3)
         return Columns(mag=np.einsum("nka,nb->nkab", turn, force).reshape(len(force), 3, 9))
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
@@ -196,7 +197,7 @@ class FlexibleMount(Effect):
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """About half a degree per g."""
-        if not shapes.has_accel(readings):
+        if not design_matrix.has_accel(readings):
             raise ValueError(f"{self.identifier} needs an accelerometer")
         return strength * np.array(self.typical), {}
 
@@ -204,7 +205,7 @@ class FlexibleMount(Effect):
 def _load_g(readings: Readings, setting: Setting) -> Array:
     """(N, 3) specific force beyond that under which a mount is straight, g."""
     straight_g = np.array(setting.get("straight_g", np.zeros(3)), dtype=np.float64)
-    return np.asarray(shapes.specific_force_g(readings) - straight_g)
+    return np.asarray(design_matrix.specific_force_g(readings) - straight_g)
 
 
 class MagGyroMisalignment(Effect):
@@ -216,8 +217,8 @@ class MagGyroMisalignment(Effect):
     turns_sensors = True
     words = "magnetometer and gyro are not aligned"
     equation = "m = A Exp(phi) h + b; the same as a soft iron that is not symmetric"
-    parameters = shapes.vector("angle", "rad", 0.01, 0.35)
-    typical = shapes.along(0.02)
+    parameters = design_matrix.vector("angle", "rad", 0.01, 0.35)
+    typical = design_matrix.along(0.02)
     signature = "an error that depends on the attitude; a symmetric soft iron cannot hold it"
     confusers = (
         ("flexible_mount", "pitch and roll far, upside down if it can be"),
@@ -234,7 +235,7 @@ class MagGyroMisalignment(Effect):
 
     def columns(self, context: Context, setting: Setting) -> Columns:
         """A (phi x h)."""
-        return Columns(mag=context.model.soft_iron @ shapes.turned_by(context.field_b))
+        return Columns(mag=context.model.soft_iron @ design_matrix.turned_by(context.field_b))
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """The field turned by Exp(phi)."""

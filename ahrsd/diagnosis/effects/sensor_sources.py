@@ -1,19 +1,39 @@
 """Sources on the vehicle whose course somebody logs: currents, temperature, joints, switches.
 
 Each is a field in the sensor frame, straight onto the reading: D = e_i f(covariate).
+
+Of a train of short pulses nobody logs the times: its period, its phase, how long a pulse is are
+sought (`trains`).  Pulses of w seconds every P seconds are lines at all multiples of 1/P up to
+about 1/w, each of them too weak to be seen alone.  Their sum over the multiples shows the period;
+folding the residual at that period shows when in it, and for how long, something is there.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.effects import pulses, series, shapes
-from ahrsd.diagnosis.effects.base import Linear, Readings, Setting, left_over, readings_of
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects import design_matrix
+from ahrsd.diagnosis.effects.effect import (
+    Linear,
+    Readings,
+    Setting,
+    readings_of,
+    residual_gauss,
+)
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 _MG = 1e-3
 _TACHOMETER = 1e-3  # part of its reading by which a shaft's speed may be wrong
+_PERIODS_S = (0.4, 6.0)
+_HIGHEST_HZ = 12.0  # pulses of 40 ms and longer
+_LONGEST_S = 0.25
+_PADDING = 4
+_PERIODS = 4  # of the best by their lines that are folded
+_CLOSER = 6  # steps to either side in which a period is refined
+_BINS, _FINE_BINS = 2, 16  # to a sample, when trains are folded, and when the best is refined
+_FEWEST = 20  # periods in a recording
 
 
 class MotorCurrentField(Linear):
@@ -25,8 +45,8 @@ class MotorCurrentField(Linear):
     rides = True
     words = "the magnetic field of a motor, thruster or battery current"
     equation = "m += k I(t)"
-    parameters = shapes.vector("field_per_ampere", "gauss/A", 1.0 * _MG, 50.0 * _MG)
-    typical = shapes.along(1.0 * _MG)
+    parameters = design_matrix.vector("field_per_ampere", "gauss/A", 1.0 * _MG, 50.0 * _MG)
+    typical = design_matrix.along(1.0 * _MG)
     needs = ("current",)
     signature = "follows the current in the sensor frame, the same on every heading"
     confusers = (
@@ -41,11 +61,11 @@ class MotorCurrentField(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """One per current that was logged."""
-        return shapes.per_covariate(readings, "current")
+        return design_matrix.per_covariate(readings, "current")
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """I on each axis."""
-        return Columns(mag=shapes.on_axes(shapes.course_of(readings, setting)))
+        return Columns(mag=design_matrix.on_axes(design_matrix.course_of(readings, setting)))
 
 
 class CurrentDerivativeField(Linear):
@@ -57,8 +77,10 @@ class CurrentDerivativeField(Linear):
     rides = True
     words = "a field that follows the change of a current: loops and eddies in the frame"
     equation = "m += k dI/dt"
-    parameters = shapes.vector("field_per_ampere_per_second", "gauss s/A", 0.1 * _MG, 10.0 * _MG)
-    typical = shapes.along(0.1 * _MG)
+    parameters = design_matrix.vector(
+        "field_per_ampere_per_second", "gauss s/A", 0.1 * _MG, 10.0 * _MG
+    )
+    typical = design_matrix.along(0.1 * _MG)
     needs = ("current",)
     signature = "spikes at the edges of the current, of opposite sign at opposite edges"
     confusers = (
@@ -70,14 +92,14 @@ class CurrentDerivativeField(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """One per current that was logged."""
-        return shapes.per_covariate(readings, "current")
+        return design_matrix.per_covariate(readings, "current")
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """dI/dt on each axis."""
-        change = series.derivative(
-            shapes.course_of(readings, setting), readings.time_s, readings.dt_s
+        change = time_series.derivative(
+            design_matrix.course_of(readings, setting), readings.time_s, readings.dt_s
         )
-        return Columns(mag=shapes.on_axes(change))
+        return Columns(mag=design_matrix.on_axes(change))
 
 
 class SpeedField(Linear):
@@ -89,8 +111,8 @@ class SpeedField(Linear):
     rides = True
     words = "a field that follows speed or shaft speed"
     equation = "m += k f(v), f = v / 1 m/s, (v / 1 m/s)^2 or rpm / 1000"
-    parameters = shapes.vector("field_per_unit_speed", "gauss", 0.5 * _MG, 200.0 * _MG)
-    typical = shapes.along(1.0 * _MG)
+    parameters = design_matrix.vector("field_per_unit_speed", "gauss", 0.5 * _MG, 200.0 * _MG)
+    typical = design_matrix.along(1.0 * _MG)
     needs = ("speed|rpm",)
     signature = "a constant offset at constant speed, on every heading"
     confusers = (
@@ -106,14 +128,14 @@ class SpeedField(Linear):
         speeds = [
             setting
             for power in (1, 2)
-            for setting in shapes.per_covariate(readings, "speed", power=power, unit=1.0)
+            for setting in design_matrix.per_covariate(readings, "speed", power=power, unit=1.0)
         ]
-        return (*shapes.per_covariate(readings, "rpm", power=1, unit=1e3), *speeds)
+        return (*design_matrix.per_covariate(readings, "rpm", power=1, unit=1e3), *speeds)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """f(v) on each axis."""
-        course = (shapes.course_of(readings, setting) / setting["unit"]) ** setting["power"]
-        return Columns(mag=shapes.on_axes(course))
+        course = (design_matrix.course_of(readings, setting) / setting["unit"]) ** setting["power"]
+        return Columns(mag=design_matrix.on_axes(course))
 
 
 class SyncPulses(Linear):
@@ -124,8 +146,8 @@ class SyncPulses(Linear):
     family = "sensor"
     words = "pulses of a transmitter: sonar, DVL, radio"
     equation = "m += k in the samples that a pulse hits"
-    parameters = shapes.vector("pulse", "gauss", 1.0 * _MG, 100.0 * _MG)
-    typical = shapes.along(2.0 * _MG)
+    parameters = design_matrix.vector("pulse", "gauss", 1.0 * _MG, 100.0 * _MG)
+    typical = design_matrix.along(2.0 * _MG)
     signature = "outliers of one size in one direction, in step with the pings or with themselves"
     confusers = (
         ("switched_device", "pulses last a sample or two, a device stays on"),
@@ -139,20 +161,20 @@ class SyncPulses(Linear):
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """One per column of pulses, and the likeliest regular train that nobody logged."""
         track = context.track
-        logged = shapes.per_covariate(readings_of(context), "ping")
-        return (*logged, *pulses.trains(left_over(context), track.time_s, track.step_s))
+        logged = design_matrix.per_covariate(readings_of(context), "ping")
+        return (*logged, *trains(residual_gauss(context), track.time_s, track.step_s))
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The columns of pulses, else 60 ms every two seconds."""
         start_s = float(readings.time_s[0])
         regular = {"start_s": start_s, "period_s": 2.0, "phase_s": 0.5, "width_s": 0.06}
-        return shapes.per_covariate(readings, "ping") or (regular,)
+        return design_matrix.per_covariate(readings, "ping") or (regular,)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The pulses on each axis."""
         if "covariate" in setting:
-            return Columns(mag=shapes.on_axes(shapes.course_of(readings, setting)))
-        return Columns(mag=shapes.on_axes(pulses.train(readings.time_s, setting)[:, None]))
+            return Columns(mag=design_matrix.on_axes(design_matrix.course_of(readings, setting)))
+        return Columns(mag=design_matrix.on_axes(train(readings.time_s, setting)[:, None]))
 
 
 class MagBiasTemperature(Linear):
@@ -164,8 +186,8 @@ class MagBiasTemperature(Linear):
     rides = True
     words = "an offset of the magnetometer that follows temperature"
     equation = "m += k (T - T0)"
-    parameters = shapes.vector("offset_per_degree", "gauss/K", 0.1 * _MG, 5.0 * _MG)
-    typical = shapes.along(0.2 * _MG)
+    parameters = design_matrix.vector("offset_per_degree", "gauss/K", 0.1 * _MG, 5.0 * _MG)
+    typical = design_matrix.along(0.2 * _MG)
     needs = ("temperature",)
     signature = "follows the warm-up, not the heading"
     confusers = (
@@ -178,11 +200,11 @@ class MagBiasTemperature(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """One per thermometer."""
-        return shapes.per_covariate(readings, "temperature")
+        return design_matrix.per_covariate(readings, "temperature")
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """T - T0 on each axis."""
-        return Columns(mag=shapes.on_axes(shapes.course_of(readings, setting)))
+        return Columns(mag=design_matrix.on_axes(design_matrix.course_of(readings, setting)))
 
 
 class MovingIron(Linear):
@@ -194,10 +216,10 @@ class MovingIron(Linear):
     words = "iron that moves on the vehicle: rudder, manipulator, turret, steering wheel"
     equation = "m += k_c cos(psi) + k_s sin(psi)"
     parameters = (
-        *shapes.vector("cosine", "gauss", 3.0 * _MG, 100.0 * _MG),
-        *shapes.vector("sine", "gauss", 3.0 * _MG, 100.0 * _MG),
+        *design_matrix.vector("cosine", "gauss", 3.0 * _MG, 100.0 * _MG),
+        *design_matrix.vector("sine", "gauss", 3.0 * _MG, 100.0 * _MG),
     )
-    typical = (*shapes.along(2.0 * _MG), *(2.0 * _MG * part for part in (0.48, 0.6, -0.64)))
+    typical = (*design_matrix.along(2.0 * _MG), *(2.0 * _MG * part for part in (0.48, 0.6, -0.64)))
     needs = ("angle",)
     signature = "follows the joint's angle in the sensor frame"
     confusers = (
@@ -210,14 +232,14 @@ class MovingIron(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """One per angle."""
-        return shapes.per_covariate(readings, "angle")
+        return design_matrix.per_covariate(readings, "angle")
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """cos, then sin, on each axis."""
-        angle = shapes.course_of(readings, setting)[:, 0]
+        angle = design_matrix.course_of(readings, setting)[:, 0]
         if setting["covariate"].endswith("_deg"):
             angle = np.radians(angle)
-        return Columns(mag=shapes.on_axes(np.column_stack([np.cos(angle), np.sin(angle)])))
+        return Columns(mag=design_matrix.on_axes(np.column_stack([np.cos(angle), np.sin(angle)])))
 
 
 class SwitchedDevice(Linear):
@@ -229,8 +251,8 @@ class SwitchedDevice(Linear):
     rides = True
     words = "a device that is switched on and off: lamp, gripper, pump"
     equation = "m += k u(t), u = 0 or 1"
-    parameters = shapes.vector("field", "gauss", 3.0 * _MG, 200.0 * _MG)
-    typical = shapes.along(2.0 * _MG)
+    parameters = design_matrix.vector("field", "gauss", 3.0 * _MG, 200.0 * _MG)
+    typical = design_matrix.along(2.0 * _MG)
     needs = ("switch",)
     signature = "jumps to and fro between two values in one direction of the sensor frame"
     confusers = (
@@ -243,11 +265,11 @@ class SwitchedDevice(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """One per switch."""
-        return shapes.per_covariate(readings, "switch")
+        return design_matrix.per_covariate(readings, "switch")
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The switch on each axis."""
-        return Columns(mag=shapes.on_axes(shapes.course_of(readings, setting)))
+        return Columns(mag=design_matrix.on_axes(design_matrix.course_of(readings, setting)))
 
 
 class RotorField(Linear):
@@ -259,10 +281,10 @@ class RotorField(Linear):
     words = "a magnetised rotor that turns with the shaft"
     equation = "m += k_c cos(n phi) + k_s sin(n phi), dphi/dt = 2 pi rpm / 60"
     parameters = (
-        *shapes.vector("cosine", "gauss", 1.0 * _MG, 50.0 * _MG),
-        *shapes.vector("sine", "gauss", 1.0 * _MG, 50.0 * _MG),
+        *design_matrix.vector("cosine", "gauss", 1.0 * _MG, 50.0 * _MG),
+        *design_matrix.vector("sine", "gauss", 1.0 * _MG, 50.0 * _MG),
     )
-    typical = (*shapes.along(1.0 * _MG), *(1.0 * _MG * part for part in (0.48, 0.6, -0.64)))
+    typical = (*design_matrix.along(1.0 * _MG), *(1.0 * _MG * part for part in (0.48, 0.6, -0.64)))
     needs = ("rpm",)
     signature = "a line at the alias of the shaft, two axes a quarter turn apart"
     confusers = (
@@ -279,7 +301,7 @@ class RotorField(Linear):
         A tachometer is right to a few parts in a thousand, and a tenth of a turn a minute is a
         whole turn in ten minutes.
         """
-        readings, left = readings_of(context), left_over(context)
+        readings, left = readings_of(context), residual_gauss(context)
         found = []
         for setting in self.choices(readings):
             phase = setting["harmonic"] * _shaft_phase(readings, setting["covariate"])
@@ -292,14 +314,14 @@ class RotorField(Linear):
         return tuple(
             setting
             for harmonic in (1, 2)
-            for setting in shapes.per_covariate(readings, "rpm", harmonic=harmonic)
+            for setting in design_matrix.per_covariate(readings, "rpm", harmonic=harmonic)
         )
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """cos, then sin, of the shaft's phase on each axis."""
         phase = setting["harmonic"] * _shaft_phase(readings, setting["covariate"])
         phase += 2 * np.pi * setting.get("off_hz", 0.0) * (readings.time_s - readings.time_s[0])
-        return Columns(mag=shapes.on_axes(np.column_stack([np.cos(phase), np.sin(phase)])))
+        return Columns(mag=design_matrix.on_axes(np.column_stack([np.cos(phase), np.sin(phase)])))
 
 
 def _shaft_phase(readings: Readings, name: str) -> Array:
@@ -319,4 +341,104 @@ def _strongest_near(left: Array, phase: Array, time_s: Array) -> tuple[float, in
     sums, middle = np.add.reduceat(turned, starts), since[starts]
     power = np.sum(np.abs(np.exp(-2j * np.pi * np.outer(off_hz, middle)) @ sums) ** 2, axis=1)
     best = int(np.argmax(power))
-    return float(off_hz[best]) + series.peak(power, best) * float(off_hz[1] - off_hz[0]), reach + 1
+    return float(off_hz[best]) + time_series.peak(power, best) * float(
+        off_hz[1] - off_hz[0]
+    ), reach + 1
+
+
+def trains(residual: Array, time_s: Array, step_s: float) -> tuple[Setting, ...]:
+    """The likeliest train of pulses in (N, 3), empty where the recording is too short for one."""
+    start_s, span_s = float(time_s[0]), float(time_s[-1] - time_s[0])
+    longest_s = min(_PERIODS_S[1], span_s / _FEWEST)
+    if longest_s < 2 * _PERIODS_S[0] or len(time_s) < 256:
+        return ()
+    time_s = time_s - start_s
+    quick = _quick(residual, round(0.5 / step_s))
+    periods, tried = _periods(quick, step_s, span_s, longest_s)
+    best = max(
+        (_folded(quick, time_s, period_s, step_s, _BINS) for period_s in periods),
+        key=lambda found: found[0],
+    )
+    for reach in (1.0, 1.0 / _CLOSER):
+        shift = reach * best[1] ** 2 / (_PADDING * span_s * _HIGHEST_HZ) / _CLOSER
+        near = best[1] + shift * np.arange(-_CLOSER, _CLOSER + 1)
+        folded = (_folded(quick, time_s, float(p), step_s, _FINE_BINS) for p in near)
+        best = max(folded, key=lambda found: found[0])
+    _, period_s, phase_s, width_s = best
+    return (
+        {
+            "start_s": start_s,
+            "period_s": round(period_s, 7),
+            "phase_s": round(phase_s, 5),
+            "width_s": round(width_s, 5),
+            "searched": tried * round(_FINE_BINS * period_s / step_s),
+        },
+    )
+
+
+def train(time_s: Array, setting: Setting) -> Array:
+    """1 in the samples that a pulse hits, else 0, (N,)."""
+    since = (time_s - setting["start_s"] - setting["phase_s"]) % setting["period_s"]
+    return np.where(since < setting["width_s"], 1.0, 0.0)
+
+
+def _quick(residual: Array, width: int) -> Array:
+    """What is left of (N, 3) when its mean over `width` samples is taken off."""
+    total = np.vstack([np.zeros(3), np.cumsum(residual - residual.mean(axis=0), axis=0)])
+    rows = np.arange(len(residual))
+    first, last = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(rows))
+    return np.asarray(
+        residual - residual.mean(axis=0) - (total[last] - total[first]) / (last - first)[:, None]
+    )
+
+
+def _periods(quick: Array, step_s: float, span_s: float, longest_s: float) -> tuple[Array, int]:
+    """The periods whose multiples hold most power, and how many were looked at."""
+    count = len(quick)
+    power = np.sum(np.abs(np.fft.rfft(quick, _PADDING * count, axis=0)) ** 2, axis=1)
+    spacing_hz = 1.0 / (_PADDING * count * step_s)
+    top_hz = min(_HIGHEST_HZ, 0.45 / step_s)
+    pieces = np.array_split(power, max(len(power) // 512, 1))
+    usual = np.repeat([max(float(np.median(part)), 1e-300) for part in pieces], [*map(len, pieces)])
+    power = np.minimum(power / usual, 50.0)  # one line is no train, however strong
+    base_hz = np.arange(1.0 / longest_s, 1.0 / _PERIODS_S[0], 1.0 / (_PADDING * span_s * top_hz))
+    score, lines = np.zeros(len(base_hz)), np.floor(top_hz / base_hz)
+    for multiple in range(1, int(lines.max()) + 1):
+        at = np.rint(multiple * base_hz / spacing_hz).astype(np.intp)
+        inside = multiple <= lines
+        score[inside] += power[at[inside]]
+    score = (score - lines * power.mean()) / np.sqrt(np.maximum(lines, 1.0))
+    found = []
+    for _ in range(_PERIODS):
+        best = int(np.argmax(score))
+        found.append(1.0 / base_hz[best])
+        score[np.abs(base_hz - base_hz[best]) < 2.0 / span_s] = -np.inf
+    return np.array(found), len(base_hz)
+
+
+def _folded(
+    quick: Array, time_s: Array, period_s: float, step_s: float, fine: int
+) -> tuple[float, float, float, float]:
+    """Power of the best window of the folded residual: (power, period, its phase, its width).
+
+    fine: bins to a sample; a pulse is a sample at least, or it would hit a few outliers only
+    """
+    bins = max(8, round(fine * period_s / step_s))
+    at = np.minimum((time_s % period_s / period_s * bins).astype(np.intp), bins - 1)
+    count = np.bincount(at, minlength=bins).astype(float)
+    sums = np.stack([np.bincount(at, weights=axis, minlength=bins) for axis in quick.T])
+    # twice around, so that a window may reach over the period's end
+    many = np.concatenate([[0.0], np.cumsum(np.tile(count, 2))])
+    much = np.concatenate([np.zeros((3, 1)), np.cumsum(np.tile(sums, 2), axis=1)], axis=1)
+    best = (-1.0, period_s, 0.0, 0.0)
+    for width in range(fine, max(fine + 1, round(_LONGEST_S * bins / period_s)) + 1):
+        ends = slice(width, width + bins)
+        hit = np.maximum(many[ends] - many[:bins], 1.0)
+        squares = much[:, ends] - much[:, :bins]
+        squares *= squares  # in place: of all that a survey does at the recorded rate, this is most
+        power = (squares[0] + squares[1] + squares[2]) / hit
+        k = int(np.argmax(power))
+        if power[k] > best[0]:
+            wide = period_s / bins
+            best = (float(power[k]), period_s, float(k * wide), float(width * wide))
+    return best

@@ -1,20 +1,25 @@
 """What differs in the world: the field from place to place, from time to time, near iron.
 
 All of them are fields n in the world, seen in the sensor frame: D = A R^T f.
+
+Where a magnetic object is (`found_place`) is told by the size of the field along the way past it.
+The size of the calibrated field does not turn with the sensor.  An object adds to it, nearly, the
+part of its own field along the earth's: u . B(p - p0; k), linear in its moment k for a given place.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from itertools import product
 
 import numpy as np
 
+from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.effects import series, shapes
-from ahrsd.diagnosis.effects.base import Linear, Parameter, Readings, Setting, readings_of
-from ahrsd.diagnosis.effects.dipole import found_place, unit_fields
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.effects import design_matrix
+from ahrsd.diagnosis.effects.effect import Linear, Parameter, Readings, Setting, readings_of
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 _MG = 1e-3
@@ -35,6 +40,16 @@ _HALF_WAVES, _PHASES_DEG = (0.45, 0.7, 1.05), (0.0, 45.0, 90.0, 135.0)
 _DECAYS = (0.15, 0.4, 1.0)
 #: entries of a symmetric traceless matrix; the last diagonal one is minus the sum of the others
 _GRADIENT = ("nn", "ee", "ne", "nd", "ed")
+_REACH_M = 25.0
+_MOST_ROWS = 600
+_STARTS_M = (
+    (0.0, 0.0, 1.0),
+    (0.0, 0.0, 4.0),
+    (1.5, 1.5, 0.5),
+    (-1.5, -1.5, 0.5),
+)
+_TURNS_RAD = (-np.pi / 2, np.pi / 2, np.pi)  # of a frame of positions that is not north's
+_NEAREST_M = 0.2
 
 
 class FieldGradient(Linear):
@@ -102,8 +117,8 @@ class FieldAnomaly(Linear):
     equation = (
         "m += A R^T (3 r (r k) - k) (d/|p - p0|)^3, r = unit(p - p0); or k sin^2(pi (t - t0)/L)"
     )
-    parameters = shapes.vector("field", "gauss", 10 * _MG, 2000 * _MG)
-    typical = shapes.along(15 * _MG)
+    parameters = design_matrix.vector("field", "gauss", 10 * _MG, 2000 * _MG)
+    typical = design_matrix.along(15 * _MG)
     signature = "a bump of seconds, fixed in the world; the field's size changes"
     confusers = (
         ("field_gradient", "a finer grid of passes"),
@@ -135,7 +150,7 @@ class FieldAnomaly(Linear):
         """A dipole below the middle of the way, or a bump in the middle of the recording."""
         place = position_m(readings)
         if place is None:
-            return ({"onset_s": shapes.middle_s(readings), "length_s": 12.0},)
+            return ({"onset_s": design_matrix.middle_s(readings), "length_s": 12.0},)
         return (object_setting(place[len(place) // 2] + [0.0, 0.0, 2.0], 2.0),)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
@@ -143,12 +158,12 @@ class FieldAnomaly(Linear):
         if "onset_s" in setting:
             part = (readings.time_s - setting["onset_s"]) / setting["length_s"]
             bump = np.where((part > 0) & (part < 1), np.sin(np.pi * part) ** 2, 0.0)
-            return Columns(mag=shapes.in_world(readings, bump[:, None]))
+            return Columns(mag=design_matrix.in_world(readings, bump[:, None]))
         place = position_m(readings)
         if place is None:
             raise ValueError(f"{self.identifier} needs position_north_m and position_east_m")
         away = turned_down(place - setting["place_m"], setting.get("turn_deg", 0.0))
-        axes = shapes.world_axes(readings)
+        axes = design_matrix.world_axes(readings)
         return Columns(mag=unit_fields(away, setting["distance_m"], axes))
 
 
@@ -163,8 +178,8 @@ class GeomagneticDrift(Linear):
         "m += A R^T k s(t), s = t/T, sin(pi t/T), or sin(pi (t - T/2)/L + phase); "
         "T: length of the recording"
     )
-    parameters = shapes.vector("change", "gauss", 1.0 * _MG, 50 * _MG)
-    typical = shapes.along(2.0 * _MG)
+    parameters = design_matrix.vector("change", "gauss", 1.0 * _MG, 50 * _MG)
+    typical = design_matrix.along(2.0 * _MG)
     signature = "a trend fixed in the world, the same for all vehicles there"
     confusers = (
         ("mag_scale_temperature", "compare with an observatory (INTERMAGNET)"),
@@ -179,7 +194,7 @@ class GeomagneticDrift(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """There, or there and back, or half a wave or more of any phase: a slow pulsation."""
-        over = shapes.span(readings)
+        over = design_matrix.span(readings)
         waves = tuple(
             {
                 **over,
@@ -193,14 +208,14 @@ class GeomagneticDrift(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The course on each axis of the world."""
-        part = shapes.elapsed(readings, setting)
+        part = design_matrix.elapsed(readings, setting)
         if setting["shape"] == "wave":
             # its phase is that of the middle: there it and the length are known apart
             turns = (part - 0.5) * setting["span_s"] / setting["length_s"]
             course = np.sin(np.pi * turns + np.radians(setting["turn_deg"]))
         else:
             course = part if setting["shape"] == "line" else np.sin(np.pi * np.clip(part, 0, 1))
-        return Columns(mag=shapes.in_world(readings, course))
+        return Columns(mag=design_matrix.in_world(readings, course))
 
 
 class AltitudeField(Linear):
@@ -217,8 +232,8 @@ class AltitudeField(Linear):
         "m += A R^T k f(a), f = a - a0, or with the lowest height a0 (1 - (a0/a)^3) a0/3, "
         "or (1 - exp(-(a - a0)/L)) L"
     )
-    parameters = shapes.vector("per_metre", "gauss/m", 0.5 * _MG, 100 * _MG)
-    typical = shapes.along(0.5 * _MG)
+    parameters = design_matrix.vector("per_metre", "gauss/m", 0.5 * _MG, 100 * _MG)
+    typical = design_matrix.along(0.5 * _MG)
     needs = ("altitude|position",)
     signature = "follows height, fixed in the world"
     confusers = (("field_gradient", "change height at one place"),)
@@ -228,7 +243,7 @@ class AltitudeField(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Straight in each height; as of something close below where the height is over ground."""
-        found = list(shapes.per_covariate(readings, "altitude", shape="line"))
+        found = list(design_matrix.per_covariate(readings, "altitude", shape="line"))
         if "position_down_m" in roles.named(readings.covariates, "position"):
             depth = readings.covariates["position_down_m"]
             line = {"covariate": "position_down_m", "reference": float(depth.mean())}
@@ -245,13 +260,13 @@ class AltitudeField(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """f on each axis of the world."""
-        course = shapes.course_of(readings, setting)
+        course = design_matrix.course_of(readings, setting)
         if setting["shape"] == "near":
             lowest = setting["reference"]
             course = (1 - (lowest / np.maximum(course + lowest, 0.5 * lowest)) ** 3) * lowest / 3
         if setting["shape"] == "decay":
             course = -np.expm1(-course / setting["length_m"]) * setting["length_m"]
-        return Columns(mag=shapes.in_world(readings, course))
+        return Columns(mag=design_matrix.in_world(readings, course))
 
 
 class FieldStep(Linear):
@@ -262,8 +277,8 @@ class FieldStep(Linear):
     family = "world"
     words = "the vehicle left iron behind: calibrated beside it, then moved off"
     equation = "m += A R^T k from t0 on"
-    parameters = shapes.vector("step", "gauss", 10 * _MG, 1000 * _MG)
-    typical = shapes.along(8 * _MG)
+    parameters = design_matrix.vector("step", "gauss", 10 * _MG, 1000 * _MG)
+    typical = design_matrix.along(8 * _MG)
     signature = "one jump, fixed in the world"
     confusers = (
         ("hard_iron_step", "it turns with the vehicle: turn once after the jump"),
@@ -279,11 +294,11 @@ class FieldStep(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """A coarse grid of times."""
-        return shapes.onsets(readings)
+        return design_matrix.onsets(readings)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """1 from the onset on, on each axis of the world."""
-        return Columns(mag=shapes.in_world(readings, shapes.since(readings, setting)))
+        return Columns(mag=design_matrix.in_world(readings, design_matrix.since(readings, setting)))
 
 
 @lru_cache(maxsize=2)
@@ -319,8 +334,8 @@ def size_departure(context: Context) -> Array:
 
 def departures(size: Array, readings: Readings) -> tuple[list[int], int]:
     """Rows where the size departs most, and how many places there were to look at."""
-    rows = max(round(_BUMP_LENGTHS_S[0] / 2 / series.median_step(readings.dt_s)), 1)
-    away = np.abs(series.moving_mean(size, readings.dt_s, rows))
+    rows = max(round(_BUMP_LENGTHS_S[0] / 2 / time_series.median_step(readings.dt_s)), 1)
+    away = np.abs(time_series.moving_mean(size, readings.dt_s, rows))
     found: list[int] = []
     for _ in range(_BUMPS):
         found.append(int(np.argmax(away)))
@@ -358,7 +373,7 @@ def _dipoles(
 
 def _seen(readings: Readings, field_n: Array) -> Array:
     """Fields of the world (N, 3, p) as the magnetometer reads them."""
-    return np.asarray(shapes.world_axes(readings) @ field_n)
+    return np.asarray(design_matrix.world_axes(readings) @ field_n)
 
 
 def object_setting(place: Array, distance: float, turn_deg: float = 0.0) -> Setting:
@@ -368,3 +383,67 @@ def object_setting(place: Array, distance: float, turn_deg: float = 0.0) -> Sett
         "distance_m": round(distance, 3),
         "turn_deg": round(float(turn_deg) % 360.0, 3),
     }
+
+
+def unit_fields(away_m: Array, distance_m: float, axes: Array | None = None) -> Array:
+    """Fields (N, 3, 3) of unit moments at offsets (N, 3) from the object.
+
+    A moment is given as the field that it makes beside itself at `distance_m`.
+    axes: (N, 3, 3) the world's axes as the fields are wanted, the world's own if None
+    """
+    size = np.sqrt(np.einsum("ni,ni->n", away_m, away_m))
+    distance = np.maximum(size, _NEAREST_M / 4)
+    r = away_m / distance[:, None]
+    strength = (distance_m / distance) ** 3
+    seen = r if axes is None else np.einsum("nij,nj->ni", axes, r)
+    fields = (3 * strength[:, None] * seen)[:, :, None] * r[:, None, :]
+    fields -= strength[:, None, None] * (np.eye(3) if axes is None else axes)
+    return np.asarray(fields)
+
+
+def found_place(
+    size_gauss: Array, place_m: Array, field_n: Array, row: int
+) -> tuple[Array, float] | None:
+    """The object's place (3,) that explains the size (N,) near `row` best, and the turn about down
+    (rad) from the frame of the positions to that of the field; None where the way is too short.
+
+    place_m: (N, 3) way of the sensor;  field_n: (3,) the earth's field
+    """
+    near = np.linalg.norm(place_m - place_m[row], axis=1) < _REACH_M
+    rows = np.flatnonzero(near)
+    rows = rows[:: max(len(rows) // _MOST_ROWS, 1)]
+    if len(rows) < 20:
+        return None
+    u = field_n / np.linalg.norm(field_n)
+    way, size = place_m[rows], size_gauss[rows]
+
+    def left(unknown: Array) -> float:
+        place, turn = unknown[:3], float(unknown[3])
+        c, s = np.cos(turn), np.sin(turn)
+        seen = np.array([c * u[0] + s * u[1], c * u[1] - s * u[0], u[2]])
+        columns = np.column_stack([seen @ unit_fields(way - place, 1.0), np.ones(len(way))])
+        columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        right = columns.T @ size
+        ridge = columns.T @ columns + 1e-9 * np.eye(4)
+        outside = max(_NEAREST_M - float(np.linalg.norm(way - place, axis=1).min()), 0.0)
+        return float(size @ size - right @ np.linalg.solve(ridge, right)) * (1 + outside)
+
+    starts = [np.append(place_m[row] + np.array(start), 0.0) for start in _STARTS_M]
+    best = min((_lowest(left, start, 90) for start in starts), key=lambda one: one[0])
+    turned = [_lowest(left, np.append(best[1][:3], best[1][3] + turn), 90) for turn in _TURNS_RAD]
+    best = min((best, *turned), key=lambda one: one[0])
+    found = _lowest(left, best[1], 250)[1]
+    return found[:3], float(found[3])
+
+
+def _lowest(cost: Callable[[Array], float], start: Array, evaluations: int) -> tuple[float, Array]:
+    """The simplex's lowest cost and where it is."""
+    from scipy.optimize import minimize  # dear to import, and seldom needed
+
+    done = minimize(
+        cost,
+        start,
+        method="Nelder-Mead",
+        options={"maxfev": evaluations, "xatol": 0.01, "fatol": 0.0},
+    )
+    return float(done.fun), np.asarray(done.x, dtype=np.float64)

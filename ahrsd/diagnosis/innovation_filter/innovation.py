@@ -26,21 +26,31 @@ of 440 nats in nothing.  There F, and h- in the calibration's columns, are of th
 A run's first row starts the field from its reading (`used` is false there): h+ = A^-1 (m - b).
 Where that row has no reading the field starts from the nominal one, unsure by half of its size: the
 first reading decides.
+
+Columns pass the filter next to each other, many at once (`batches`, `joined`), zeros on no side.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd import so3
-from ahrsd.diagnosis.innovation_filter.blocks import Layout, Recursion, layout_of, products_before
-from ahrsd.diagnosis.innovation_filter.gains import Gains, Linear, gains
-from ahrsd.diagnosis.innovation_filter.recursive import both_ways
+from ahrsd.diagnosis.innovation_filter.parallel_scan import (
+    Gains,
+    Layout,
+    Linear,
+    Recursion,
+    gains,
+    layout_of,
+    products_before,
+)
+from ahrsd.diagnosis.model import Columns, NullModel
+from ahrsd.diagnosis.time_series import both_ways
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Columns, NullModel
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
@@ -410,3 +420,31 @@ def _inverse_root(S: Array) -> Array:
     out[:, 2, 1] = -e / (d * f)
     out[:, 2, 0] = (b * e - c * d) / (a * d * f)
     return out
+
+
+def batches(columns: Sequence[Columns], most: int) -> list[list[int]]:
+    """Numbers of the columns, those of one side together, no more than `most` wide if possible."""
+    out: list[list[int]] = []
+    sides = [(part.mag is None, part.gyro is None) for part in columns]
+    for side in dict.fromkeys(sides):
+        room = 0
+        for number in (k for k, one in enumerate(sides) if one == side):
+            width = columns[number].width
+            if room == 0 or width > room:
+                out.append([])
+                room = most
+            out[-1].append(number)
+            room = max(0, room - width)
+    return out
+
+
+def joined(parts: Sequence[Columns]) -> Columns:
+    """Columns of one batch next to each other."""
+    if len(parts) == 1:
+        return parts[0]
+    mag = [part.mag for part in parts if part.mag is not None]
+    gyro = [part.gyro for part in parts if part.gyro is not None]
+    return Columns(
+        np.concatenate(mag, axis=2) if mag else None,
+        np.concatenate(gyro, axis=2) if gyro else None,
+    )

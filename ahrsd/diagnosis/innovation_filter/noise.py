@@ -18,7 +18,7 @@ from scipy.linalg import solve_toeplitz
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.data_quality.facts import Fact, spans_of
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered
-from ahrsd.diagnosis.innovation_filter.probabilities import student_log_density
+from ahrsd.diagnosis.innovation_filter.regression_statistics import student_log_density
 from ahrsd.samples import Array
 
 _MOST = 12  # order of the autoregression
@@ -75,7 +75,7 @@ def colour_of(done: Filtered) -> Colour:
     return Colour(best, float(variance))
 
 
-def before(wanted: Colour, found: Colour) -> tuple[Colour, float]:
+def colour_before_filter(wanted: Colour, found: Colour) -> tuple[Colour, float]:
     """The colour that becomes `wanted` where `wanted` became `found`, and its relative deviation.
 
     A filter takes a part of slow noise for motion, so that innovations are whiter than the noise.

@@ -13,11 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from ahrsd.diagnosis.model import Columns, Context, directions
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Law, Sized
 from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw, course
-from ahrsd.diagnosis.values import Columns, Context, directions
-from ahrsd.diagnosis.where_and_when.by_heading import heading_columns
+from ahrsd.diagnosis.where_and_when.regime import heading_columns
 from ahrsd.estimator.locked import harmonics, on_each_axis
 from ahrsd.samples import Array
 

@@ -13,14 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.diagnosis.columns.clocks import Late, at_clock, likeliest_clock, suspects
-from ahrsd.diagnosis.effects.shapes import on_axes
+from ahrsd.diagnosis.effects.design_matrix import on_axes
+from ahrsd.diagnosis.model import Columns
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.candidates import beside
 from ahrsd.diagnosis.one_model.component import Component, Sized
 from ahrsd.diagnosis.one_model.evidence import At
 from ahrsd.diagnosis.one_model.linearised import by_key, linearised
 from ahrsd.diagnosis.one_model.rich import RICH_COURSES, Judged, psi_by_key
-from ahrsd.diagnosis.values import Columns
 from ahrsd.diagnosis.where_and_when.locate import Located, segments
 
 _COURSE = RICH_COURSES[0]

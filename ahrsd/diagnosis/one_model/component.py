@@ -15,8 +15,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ahrsd.diagnosis.effects.base import Effect
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.effects.effect import Effect
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.diagnosis.where_and_when.locate import Frame, unit_columns
 from ahrsd.samples import Array
 

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Finding, Unexplained
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
+from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.acceptance import accepted
 from ahrsd.diagnosis.one_model.findings import as_finding, drift_finding, turn_finding
@@ -21,7 +22,6 @@ from ahrsd.diagnosis.one_model.members import coefficients, is_ordinary
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.one_model.remainder import GYRO_MATRIX, TURNS
 from ahrsd.diagnosis.one_model.unexplained import changing_source, left_beyond_ordinary
-from ahrsd.diagnosis.values import Term
 
 
 @dataclass(frozen=True, slots=True, eq=False)

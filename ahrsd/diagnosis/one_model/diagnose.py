@@ -12,16 +12,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
-from ahrsd.diagnosis.answer.chance import Answered, beyond_chance
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
-from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.answer.null_simulations import Answered, beyond_chance
+from ahrsd.diagnosis.calibration_fit.gyro_at_rest import at_rest, resting, told_at_rest
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null
 from ahrsd.diagnosis.calibration_fit.problem import Problem, problem_of
-from ahrsd.diagnosis.calibration_fit.resting import at_rest, resting, told_at_rest
-from ahrsd.diagnosis.columns.logged import with_holes
-from ahrsd.diagnosis.data_quality.missing import differ, lost_turns
-from ahrsd.diagnosis.data_quality.prepared import prepared
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.data_quality.dropped_samples import differ, lost_turns
+from ahrsd.diagnosis.data_quality.preparation import prepared, with_holes
+from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.one_model import rich
 from ahrsd.diagnosis.one_model.answer.whole_answer import whole_answer

@@ -10,7 +10,8 @@ from typing import cast
 import numpy as np
 
 from ahrsd.diagnosis.calibration_fit.delay import beyond_the_lag
-from ahrsd.diagnosis.effects.base import ANGLES, SCALES, Effect, Setting
+from ahrsd.diagnosis.effects.effect import ANGLES, SCALES, Effect, Setting
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import (
     MOMENTS,
@@ -20,7 +21,6 @@ from ahrsd.diagnosis.one_model.component import (
     Sized,
     in_frame,
 )
-from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.diagnosis.where_and_when.locate import Frame
 from ahrsd.samples import Array
 

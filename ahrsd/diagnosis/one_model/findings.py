@@ -9,11 +9,12 @@ from typing import cast
 import numpy as np
 
 from ahrsd.diagnosis.answer.added_field import heading_error_deg
-from ahrsd.diagnosis.answer.confound import separating_manoeuvre
 from ahrsd.diagnosis.answer.diagnosis import Cost, Finding, Share, Value, Where
+from ahrsd.diagnosis.answer.text import separating_manoeuvre
 from ahrsd.diagnosis.calibration_fit.delay import usual_step
-from ahrsd.diagnosis.calibration_fit.prior import prior_of
-from ahrsd.diagnosis.effects.base import Effect, Setting
+from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
+from ahrsd.diagnosis.effects.effect import Effect, Setting
+from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.candidates import beside
 from ahrsd.diagnosis.one_model.effect_components import (
@@ -29,7 +30,6 @@ from ahrsd.diagnosis.one_model.members import added_by, coefficients
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.one_model.near_settings import changed, opened
 from ahrsd.diagnosis.one_model.remainder import GYRO_MATRIX, TURNS
-from ahrsd.diagnosis.values import Term
 from ahrsd.diagnosis.where_and_when.address import where_of
 from ahrsd.samples import Array
 

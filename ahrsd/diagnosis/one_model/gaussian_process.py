@@ -15,9 +15,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, in_frame, log_density, stiff
-from ahrsd.diagnosis.values import Context
 from ahrsd.diagnosis.where_and_when.locate import Frame
 from ahrsd.samples import Array
 

@@ -16,21 +16,22 @@ from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
 
 from ahrsd.diagnosis.calibration_fit import noise_fit
-from ahrsd.diagnosis.calibration_fit.prior import prior_of
+from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
 from ahrsd.diagnosis.calibration_fit.problem import Problem
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import (
     Filtered,
+    batches,
+    joined,
     nuisance_columns,
     regressing,
     run_filter,
     sensitivities,
 )
-from ahrsd.diagnosis.innovation_filter.side_by_side import batches, joined
+from ahrsd.diagnosis.model import Columns, Context, NullModel
 from ahrsd.diagnosis.one_model import noise_model
 from ahrsd.diagnosis.one_model.component import Component, Fixed
 from ahrsd.diagnosis.one_model.evidence import At, Products
-from ahrsd.diagnosis.values import Columns, Context, NullModel
 from ahrsd.diagnosis.where_and_when.narrow_band import BAND_HZ
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array

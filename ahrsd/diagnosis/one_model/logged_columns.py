@@ -16,17 +16,16 @@ import numpy as np
 from scipy.fft import dct, idct
 
 from ahrsd.diagnosis.calibration_fit.problem import Problem
-from ahrsd.diagnosis.columns.held_columns import drawn_between, held_columns
-from ahrsd.diagnosis.columns.logger_noise import cleaned
-from ahrsd.diagnosis.columns.shown import shown
-from ahrsd.diagnosis.effects.base import Effect, Setting
+from ahrsd.diagnosis.columns.held_and_noisy import cleaned, drawn_between, held_columns
+from ahrsd.diagnosis.columns.roles import shown
+from ahrsd.diagnosis.effects.effect import Effect, Setting
+from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.one_model import effect_components, priors
 from ahrsd.diagnosis.one_model.candidates import Beside, beside
 from ahrsd.diagnosis.one_model.effect_components import LATE_STEP_S
 from ahrsd.diagnosis.one_model.evidence import At
 from ahrsd.diagnosis.one_model.linearised import Linearised
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Context
 from ahrsd.samples import Array
 
 #: rounds in which the likeliest mean is sought more finely

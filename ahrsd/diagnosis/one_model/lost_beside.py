@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from ahrsd.diagnosis.data_quality.dropped_samples import missing_turns, price
 from ahrsd.diagnosis.data_quality.facts import Fact
-from ahrsd.diagnosis.data_quality.missing import missing_turns, price
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.linearised import Point, moved
 from ahrsd.diagnosis.one_model.recorded_rate import Quick, at_recorded_rate

@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.effects.base import ANGLES, SCALES, Setting
+from ahrsd.diagnosis.effects.effect import ANGLES, SCALES, Setting
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.diagnosis.one_model.component import MOMENTS, Component, Fixed
-from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
 #: changes of which slopes are made: part of the recording, part of a scale, degrees, s, part of

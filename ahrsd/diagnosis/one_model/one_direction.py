@@ -15,11 +15,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.fft import dct
 
+from ahrsd.diagnosis.model import Columns, Context, directions
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.gaussian_process import CourseLaw
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis
-from ahrsd.diagnosis.values import Columns, Context, directions
 from ahrsd.diagnosis.where_and_when.locate import Frame, unit_columns
 from ahrsd.samples import Array
 

@@ -15,7 +15,7 @@ import numpy as np
 from ahrsd.diagnosis.answer.diagnosis import Unexplained
 from ahrsd.diagnosis.calibration_fit.delay import without_lag
 from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 from ahrsd.diagnosis.one_model import decision, noise_model, priors, rich
 from ahrsd.diagnosis.one_model.component import Component

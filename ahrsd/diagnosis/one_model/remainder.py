@@ -11,10 +11,10 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component, Fixed, Sized
 from ahrsd.diagnosis.one_model.gaussian_process import course
-from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.estimator.locked import harmonics, of_change, on_each_axis, squares
 from ahrsd.samples import Array
 

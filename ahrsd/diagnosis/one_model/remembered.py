@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.effects.base import Setting
+from ahrsd.diagnosis.effects.effect import Setting
 from ahrsd.diagnosis.one_model.candidates import Beside
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.near_settings import changed, opened

@@ -16,7 +16,7 @@ import numpy as np
 
 from ahrsd.diagnosis.calibration_fit.delay import of_magnetometer, usual_step
 from ahrsd.diagnosis.calibration_fit.problem import Problem
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.component import Component

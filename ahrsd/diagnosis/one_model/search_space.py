@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from ahrsd.diagnosis.effects.base import Effect, Setting
+from ahrsd.diagnosis.effects.effect import Effect, Setting
 from ahrsd.diagnosis.one_model.candidates import Beside
 from ahrsd.diagnosis.one_model.component import Component
 from ahrsd.diagnosis.one_model.effect_components import (

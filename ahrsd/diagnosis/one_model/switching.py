@@ -24,12 +24,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.candidates import beside
 from ahrsd.diagnosis.one_model.component import Component, Sized, in_frame, log_density
 from ahrsd.diagnosis.one_model.evidence import At
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis
-from ahrsd.diagnosis.values import Context
 from ahrsd.diagnosis.where_and_when.locate import (
     Frame,
     frame_columns,

@@ -18,8 +18,7 @@ from ahrsd.diagnosis.one_model.members import (
     size_of,
 )
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis, Space
-from ahrsd.diagnosis.where_and_when.address import AXES
-from ahrsd.diagnosis.where_and_when.intervals import departures
+from ahrsd.diagnosis.where_and_when.address import AXES, departures
 from ahrsd.diagnosis.where_and_when.locate import Frame, single_source, unit_columns
 from ahrsd.samples import Array
 

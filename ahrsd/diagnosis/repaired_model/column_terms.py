@@ -1,4 +1,7 @@
-"""Terms that a column of the vehicle gives by itself, sample by sample: a current's field."""
+"""Terms that a column of the vehicle gives by itself, sample by sample: a current's field.
+
+Apart from the forward model, which a running daemon that takes such terms out does not load.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.values import Term
+from ahrsd.diagnosis.model import Term
 from ahrsd.samples import Array
 
 _PROBE = 64

@@ -6,6 +6,9 @@
 The motion is the context's attitude, turned by what brings its smoothed field (over DRIFT_S) to one
 direction of the world: headings are the recording's, each step turns the field exactly as the true
 rate says.  What the gyro's noise did to that attitude counts as motion: a body may shake.
+
+Backwards it is a recording without what named effects added to it (`without`), so that they
+do not bend its calibration.
 """
 
 from __future__ import annotations
@@ -16,15 +19,15 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.diagnosis.effects import series
-from ahrsd.diagnosis.effects.base import Effect, Readings, readings_of
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.effects.effect import Effect, Readings, readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation_filter.context import Given, build_context
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, bearings
 from ahrsd.diagnosis.innovation_filter.noise import colour_of
-from ahrsd.diagnosis.innovation_filter.recursive import autoregression, both_ways
+from ahrsd.diagnosis.model import Context, Noise, NullModel, Term
+from ahrsd.diagnosis.time_series import autoregression, both_ways
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Context, Noise, NullModel, Term
 from ahrsd.samples import Array
 
 DRIFT_S = 3.0  # shorter follows the field, longer the gyro; a gyro sampled at 10 Hz needs 3 s
@@ -88,7 +91,7 @@ def truth_along(context: Context) -> Readings:
     seen = np.einsum("nij,nj->ni", start.R_nb, start.field_b)
     direction = seen.mean(axis=0) / np.linalg.norm(seen.mean(axis=0))
     R_nb, rate = start.R_nb.copy(), start.rate_b_rad_s.copy()
-    for run in series.runs(start.dt_s):
+    for run in time_series.runs(start.dt_s):
         slow = _both_ways(seen[run], DRIFT_S, start.time_s[run])
         R_nb[run] = _smallest_turn(slow, direction) @ start.R_nb[run]
         rate[run] = _mean_rate(R_nb[run], start.time_s[run], rate[run])
@@ -141,7 +144,7 @@ def track_of(readings: Readings, like: Track | None = None) -> Track:
         gyro_b_rad_s=readings.gyro_b_rad_s,
         accel_b_m_s2=accel,
         covariates={**others, **readings.covariates},
-        runs=tuple(series.runs(readings.dt_s)),
+        runs=tuple(time_series.runs(readings.dt_s)),
     )
 
 
@@ -205,3 +208,27 @@ def _coloured(white: Array, colour: tuple[float, ...]) -> Array:
     # a stretch before the first row, so that the noise is settled there
     ahead = np.vstack([white[:_RESPONSE][::-1], white])
     return autoregression(ahead, taps)[-len(white) :] / float(np.linalg.norm(response))
+
+
+def without(
+    track: Track,
+    model: NullModel,
+    terms: Sequence[Term],
+    library: Mapping[str, Effect] = EFFECTS,
+) -> tuple[Track, tuple[str, ...]]:
+    """The track as it would read without the terms, and the effects that no number takes out.
+
+    What an effect adds follows from the model it was fitted with: motion, field and the columns of
+    this track. Noise, coarse steps and lost samples cannot be undone; those come back by name.
+    Raises ValueError where a term needs a column that the track has not.
+    """
+    undone = [term for term in terms if library[term.identifier].kind == "mean"]
+    left = tuple(term.identifier for term in terms if library[term.identifier].kind != "mean")
+    if not undone:
+        return track, left
+    context = context_along(track, model, undone, library)
+    mag, gyro = contribution(context, undone, library)
+    return (
+        replace(track, mag_b_gauss=track.mag_b_gauss - mag, gyro_b_rad_s=track.gyro_b_rad_s - gyro),
+        left,
+    )

@@ -1,25 +1,43 @@
 """Effects in a simulated experiment, and in an emulated device along its own motion.
 
-What the sensor would have sent with them in.
+What the sensor would have sent with them in.  A person asks for them (`Request`) by ID, ID=STRENGTH
+or ID=name=value,name=value.  STRENGTH is a multiple of the effect's typical size.  A name is a
+parameter (the others are then 0) or a part of the setting (`onset_s`, `time_constant_s`, ...).
+
+Effects that follow a column have those of an ordinary working vehicle (`columns_for`), one or more
+per role:
+
+current, rpm, speed   levels that change every 10 to 40 s, rounded off
+temperature           a warm-up of 8 K with a time constant of 5 minutes
+position              a lawn-mower pattern, legs of 40 m, 8 m apart, at 0.6 m/s
+angle                 a rudder that is put over now and then;  switch, ping: on and off
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import difflib
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.diagnosis.effects import profiles, request
-from ahrsd.diagnosis.effects.base import Effect, Readings
+from ahrsd.diagnosis.columns import roles
+from ahrsd.diagnosis.effects.effect import Effect, Readings, Setting
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.repaired_model.forward import simulated
-from ahrsd.diagnosis.values import Term
 from ahrsd.samples import Array
 from ahrsd.simulation import Experiment
 from drivers.vn100.emulator.physics import GRAVITY_M_S2, matrices, quaternions
 from drivers.vn100.emulator.scenarios import Setup, hidden
+
+_LEG_M, _APART_M, _SPEED_M_S = 40.0, 8.0, 0.6
+_PING_S = 1.7
+_FAR = 12.0  # roundings after which a change of level is over to the last digit but three
+
+LoggedColumns = dict[str, Array]
 
 
 def readings_of(experiment: Experiment, covariates: Mapping[str, Array]) -> Readings:
@@ -118,7 +136,7 @@ class EmulatedEffects:
 
     def __init__(self, setup: Setup, wanted: Sequence[str]) -> None:
         _, self._truth, self._motion = hidden(setup)
-        requests = [request.parse(text) for text in wanted]
+        requests = [parse_request(text) for text in wanted]
         for one in requests:
             if one.effect.kind != "mean" or one.effect.after_noise:
                 known = ", ".join(
@@ -128,7 +146,7 @@ class EmulatedEffects:
                     f"{one.effect.identifier} cannot be emulated; there are {known}, and faults"
                 )
         grid = np.arange(0.0, HORIZON_S, 1.0 / _COLUMNS_HZ)
-        self._columns = profiles.columns_for([one.effect for one in requests], grid, setup.seed)
+        self._columns = columns_for([one.effect for one in requests], grid, setup.seed)
         whole = self._readings(np.arange(0.0, HORIZON_S, 1.0))
         self._terms = tuple(one.term(whole) for one in requests)
         self._pieces: dict[int, tuple[Array, Array, Array]] = {}
@@ -190,3 +208,176 @@ class EmulatedEffects:
             warmth = 1 - np.exp(-time_s / 600.0)
             out["temperature_c"] = self._truth.temperature_c + self._truth.warming_c * warmth
         return out
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """An effect that a person wants: its size as a multiple, or value by name."""
+
+    effect: Effect
+    strength: float = 1.0
+    given: Mapping[str, str] = field(default_factory=dict)
+
+    def term(self, readings: Readings) -> Term:
+        """The effect's value and setting on those readings.
+
+        Raises ValueError in one line for an unknown name, a value that does not fit, or readings
+        that lack what the effect needs.
+        """
+        value, setting = self.effect.example(readings, self.strength)
+        names = [parameter.name for parameter in self.effect.parameters]
+        if any(name in names for name in self.given):
+            value = np.zeros(len(names))
+        for name, text in self.given.items():
+            if name in names:
+                value[names.index(name)] = _number(text, name, self.effect)
+            elif name in setting:
+                setting = {**setting, name: _alike(setting, name, text, self.effect)}
+            else:
+                known = ", ".join([*names, *setting])
+                raise ValueError(f"{self.effect.identifier} has no {name}; it has {known}")
+        return Term(self.effect.identifier, value, np.zeros(len(names)), setting)
+
+
+def parse_request(text: str, library: Mapping[str, Effect] = EFFECTS) -> Request:
+    """The request in the text.  ValueError in one line."""
+    identifier, _, rest = text.partition("=")
+    if identifier not in library:
+        close = difflib.get_close_matches(identifier, library, n=1)
+        hint = f"; is {close[0]} meant?" if close else "; docs/reference/effects.md lists them"
+        raise ValueError(f"no effect {identifier!r}{hint}")
+    effect, strength = library[identifier], 1.0
+    given: dict[str, str] = {}
+    for position, part in enumerate(rest.split(",") if rest else []):
+        name, equals, value = part.partition("=")
+        if equals:
+            given[name.strip()] = value
+        elif position == 0:
+            strength = _number(part, "strength", effect)
+        else:
+            raise ValueError(f"{identifier}: {part!r} is neither a strength nor name=value")
+    if strength < 0:
+        raise ValueError(f"{identifier}: the strength {strength:g} is negative")
+    return Request(effect, strength, given)
+
+
+def _alike(setting: Setting, name: str, text: str, effect: Effect) -> object:
+    """The text as the kind of value that the setting has there."""
+    present = setting[name]
+    if isinstance(present, str):
+        return text
+    if isinstance(present, bool) or not isinstance(present, int | float):
+        raise ValueError(f"{effect.identifier}: {name} cannot be given here")
+    number = _number(text, name, effect)
+    return round(number) if isinstance(present, int) else number
+
+
+def _number(text: str, name: str, effect: Effect) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{effect.identifier}: {name} is {text!r}, a number is needed")
+    return number
+
+
+def columns_for(effects: Iterable[Effect], time_s: Array, seed: int) -> LoggedColumns:
+    """The columns that the effects need, on the times (N,); the same seed gives the same columns.
+
+    Where one of several roles will do, the first that is a column of its own is made.
+    """
+    wanted: dict[str, None] = {}
+    for effect in effects:
+        for need in effect.needs:
+            made = [role for role in need.split("|") if role not in roles.SENSORS]
+            wanted.update(dict.fromkeys(made[:1]))
+    out: LoggedColumns = {}
+    for role in wanted:
+        number = list(roles.ROLES).index(role)
+        out |= PROFILES[role](time_s - time_s[0], np.random.default_rng([seed, 11, number]))
+    return out
+
+
+def _levels(
+    time_s: Array, rng: np.random.Generator, span: tuple[float, float], rounding_s: float
+) -> Array:
+    """Levels within the span that hold for 10 to 40 s, passed from one to the next smoothly."""
+    length = float(time_s[-1]) + 1.0
+    starts = np.cumsum(rng.uniform(10.0, 40.0, int(length / 10.0) + 2))
+    values = rng.uniform(*span, len(starts) + 1)
+    out = values[np.searchsorted(starts, time_s, side="right")]
+    for start, step in zip(starts, np.diff(values), strict=True):
+        near = slice(
+            *np.searchsorted(time_s, (start - _FAR * rounding_s, start + _FAR * rounding_s))
+        )
+        apart = (time_s[near] - start) / rounding_s
+        out[near] += step * (0.5 + 0.5 * np.tanh(apart) - (apart >= 0))
+    return np.asarray(out)
+
+
+def _current(time_s: Array, rng: np.random.Generator) -> LoggedColumns:
+    return {"motor_current_a": _levels(time_s, rng, (0.5, 12.0), 0.4)}
+
+
+def _temperature(time_s: Array, rng: np.random.Generator) -> LoggedColumns:
+    return {"temperature_c": rng.uniform(12.0, 24.0) + 8.0 * (1 - np.exp(-time_s / 300.0))}
+
+
+def _position(time_s: Array, rng: np.random.Generator) -> LoggedColumns:
+    """Along, across, along back; corners are rounded over about two seconds."""
+    way = _SPEED_M_S * time_s
+    lap, along = np.divmod(way, _LEG_M + _APART_M)
+    there = np.minimum(along, _LEG_M)
+    north = np.where(lap % 2 == 0, there, _LEG_M - there)
+    east = _APART_M * lap + np.maximum(along - _LEG_M, 0.0)
+    return {
+        "position_north_m": _rounded(north, time_s),
+        "position_east_m": _rounded(east, time_s),
+        "position_down_m": _levels(time_s, rng, (4.0, 7.0), 5.0),
+    }
+
+
+def _rounded(values: Array, time_s: Array) -> Array:
+    rows = max(round(2.0 / float(np.median(np.diff(time_s)))), 1)
+    padded = np.pad(values, (rows, rows), mode="reflect", reflect_type="odd")
+    return np.convolve(padded, np.hanning(2 * rows + 3)[1:-1] / (rows + 1), mode="valid")
+
+
+def _altitude(time_s: Array, rng: np.random.Generator) -> LoggedColumns:
+    return {"altitude_m": _levels(time_s, rng, (2.0, 9.0), 4.0)}
+
+
+def _angle(time_s: Array, rng: np.random.Generator) -> LoggedColumns:
+    return {"rudder_angle_rad": _levels(time_s, rng, (-0.6, 0.6), 1.0)}
+
+
+def _speed(time_s: Array, rng: np.random.Generator) -> LoggedColumns:
+    return {"speed_m_s": _levels(time_s, rng, (0.2, 2.0), 3.0)}
+
+
+def _rpm(time_s: Array, rng: np.random.Generator) -> LoggedColumns:
+    return {"shaft_rpm": _levels(time_s, rng, (500.0, 1400.0), 1.0)}
+
+
+def _ping(time_s: Array, rng: np.random.Generator) -> LoggedColumns:
+    count = np.floor((time_s + rng.uniform(0, _PING_S)) / _PING_S)
+    return {"sonar_ping": np.diff(count, prepend=count[0])}
+
+
+def _switch(time_s: Array, rng: np.random.Generator) -> LoggedColumns:
+    flips = np.cumsum(rng.uniform(10.0, 40.0, int(float(time_s[-1]) / 10.0) + 2))
+    return {"lamp_on": np.searchsorted(flips, time_s).astype(np.float64) % 2}
+
+
+PROFILES: Mapping[str, Callable[[Array, np.random.Generator], LoggedColumns]] = {
+    "current": _current,
+    "temperature": _temperature,
+    "position": _position,
+    "altitude": _altitude,
+    "angle": _angle,
+    "speed": _speed,
+    "rpm": _rpm,
+    "ping": _ping,
+    "switch": _switch,
+}

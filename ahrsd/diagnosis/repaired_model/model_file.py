@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.model import Noise, NullModel, Term
 from ahrsd.diagnosis.repaired_model.forward import noise_of
-from ahrsd.diagnosis.values import Noise, NullModel, Term
 from ahrsd.samples import Array
 
 SCHEMA = "ahrsd.model/1"

@@ -16,8 +16,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Columns, Context
 from ahrsd.samples import Array
 
 Frame = Literal["sensor", "world", "gyro"]

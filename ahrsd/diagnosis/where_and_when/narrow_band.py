@@ -11,7 +11,7 @@ import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Unexplained, Where
 from ahrsd.diagnosis.data_quality.facts import spans_of
-from ahrsd.diagnosis.values import Context
+from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.where_and_when.locate import Frame
 from ahrsd.samples import Array
 

@@ -3,6 +3,12 @@
 Each quantity is cut into bins with equally many samples; a field in sensor axes per bin is one
 group of columns.  What follows the heading but not the time is a misfit of the calibration's form;
 what follows a logged column is a hint at that column.
+
+A field on the vehicle may be a function of the heading (`heading_columns`): harmonics, of which no
+name has all.  A turret that keeps its direction, a crane, a boom that swings back turn against the
+vehicle: iron that turns with the heading, once or several times.  In time it comes and goes with
+every turn, within seconds, and is no one source, so that it counts as the colour of the noise.  By
+heading it is the same each time.  The calibration takes what soft iron does.
 """
 
 from __future__ import annotations
@@ -12,14 +18,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis.columns.shown import shown
-from ahrsd.diagnosis.values import Columns, Context
+from ahrsd.diagnosis.columns.roles import shown
+from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 BINS = {"heading_deg": 12}
 OTHER_BINS = 6
 #: log of the relevant quantity must move at least this much to be binned
 MINIMUM_RANGE = {"heading_deg": 60.0, "pitch_deg": 10.0, "roll_deg": 10.0, "rate_rad_s": 0.05}
+#: waves in a turn, at most; the variance of each falls with the square of its number
+HARMONICS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,3 +88,12 @@ def _binned(name: str, values: Array) -> Regime | None:
         return None
     index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
     return Regime(name, edges, np.where(known, index, -1))
+
+
+def heading_columns(context: Context) -> Columns:
+    """A field in the sensor's axes, 3 columns a wave, wave-major, each of its prior deviation."""
+    order = np.arange(1, HARMONICS + 1)
+    phase = context.heading_rad[:, None] * order
+    waves = np.concatenate([np.cos(phase) / order, np.sin(phase) / order], axis=1)
+    axes = np.eye(3)
+    return Columns(mag=np.einsum("nj,ki->nkji", waves, axes).reshape(len(phase), 3, -1))

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from ahrsd.diagnosis.data_quality.prepared import prepared
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.data_quality.preparation import prepared
+from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.one_model import priors, rich
 from ahrsd.diagnosis.one_model.candidates import beside

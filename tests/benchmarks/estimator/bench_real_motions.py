@@ -23,9 +23,9 @@ sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 from mismatch_trials import covariates
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
-from ahrsd.diagnosis.calibration_fit.coarse import noise_of
+from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
-from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import Spec, Track
@@ -114,7 +114,7 @@ def noise_over_truth(track: Track) -> tuple[float, float]:
     """The gyro's noise by its differences, and as it is worked with, both over the truth."""
     problem, start = problem_of(track, Spec())
     worked = start.sigma_gyro_rad_s * float(np.sqrt(problem.thin))
-    return noise_of(track)[1] / SIGMA_GYRO, worked / SIGMA_GYRO
+    return noise_of_differences(track)[1] / SIGMA_GYRO, worked / SIGMA_GYRO
 
 
 def said(found: Diagnosis) -> str:

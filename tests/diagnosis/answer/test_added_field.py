@@ -12,8 +12,8 @@ from ahrsd.diagnosis.answer.added_field import (
     heading_off_deg,
     less_calibration,
 )
-from ahrsd.diagnosis.calibration_fit.null import fit_null
-from ahrsd.diagnosis.values import Context
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
+from ahrsd.diagnosis.model import Context
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ from scipy import stats
 from tracks import experiment, track_of, true_model
 
 from ahrsd.diagnosis.answer.omnibus import Test, omnibus, variance_test
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
 from ahrsd.diagnosis.calibration_fit.noise_fit import FLOOR_MAG_GAUSS
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
-from ahrsd.diagnosis.values import Context
+from ahrsd.diagnosis.model import Context
 from ahrsd.samples import Array
 
 

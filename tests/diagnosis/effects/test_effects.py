@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ahrsd import so3
+from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.repaired_model.forward import contribution
-from ahrsd.diagnosis.values import Term
 
 CONTRACT = Path(__file__).parents[3] / ".." / "shared" / "reference" / "contract.md"
 MEAN = [name for name, effect in EFFECTS.items() if effect.kind == "mean"]
@@ -175,7 +175,7 @@ def test_an_effect_does_not_reach_over_a_gap():
     """What stands behind a gap is the same whatever went before it."""
     _, readings = moving(7, rows=200, gap_at=100)
     rows = np.arange(200) >= 100
-    alone = series.kept(readings, rows)
+    alone = time_series.kept(readings, rows)
     for name in ("eddy_current", "viscous_magnetisation", "mag_time_lag", "mag_low_pass",
                  "gyro_time_lag", "gyro_integration", "current_derivative_field",
                  "mag_sample_hold"):  # fmt: skip

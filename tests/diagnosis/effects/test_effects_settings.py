@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from effect_motion import FIELD_N, SOFT_IRON, moving
 
-from ahrsd import so3
-from ahrsd.diagnosis.effects import series
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.effects.sensor_element import aliased, lines
 
@@ -17,59 +15,6 @@ from ahrsd.diagnosis.effects.sensor_element import aliased, lines
 def seen(context, mag):
     """The context with other readings of the magnetometer."""
     return replace(context, track=replace(context.track, mag_b_gauss=mag))
-
-
-def test_play_follows_at_a_distance_and_rests_when_it_turns_round():
-    values = np.array([0.0, 1.0, 2.0, 1.5, 0.5, -1.0])[:, None]
-    assert series.play(values, 0.5)[:, 0].tolist() == [0.0, 0.5, 1.5, 1.5, 1.0, -0.5]
-
-
-def test_a_low_pass_trails_a_ramp_by_its_time_constant():
-    dt_s = np.full(400, 0.05)
-    dt_s[0] = np.nan
-    ramp = 0.05 * np.arange(400)[:, None]
-    out = series.low_pass(ramp, dt_s, 0.8)
-    assert out[-1] == pytest.approx(ramp[-1] - 0.8, abs=1e-8)
-    response = 0.05 * np.arange(400) - 0.8 * (1 - np.exp(-0.05 * np.arange(400) / 0.8))
-    assert out[:, 0] == pytest.approx(response, abs=1e-12)
-
-
-def test_uneven_steps_give_the_same_filter():
-    rng = np.random.default_rng(0)
-    time_s = np.cumsum(rng.uniform(0.02, 0.08, 500))
-    dt_s = np.concatenate([[np.nan], np.diff(time_s)])
-    out = series.low_pass(time_s[:, None] - time_s[0], dt_s, 0.8)[:, 0]
-    passed = time_s - time_s[0]
-    assert out == pytest.approx(passed - 0.8 * (1 - np.exp(-passed / 0.8)), abs=1e-12)
-
-
-@pytest.mark.parametrize("tau_s", [0.013, 0.1])
-def test_a_low_pass_quicker_than_the_samples_is_exact_on_a_curve(tau_s):
-    """Straight lines between the samples would put half a step's bend into it."""
-    time_s = 0.04 * np.arange(1000)
-    dt_s = np.diff(time_s, prepend=np.nan)
-    wave = np.sin(3.0 * time_s)[:, None]
-    expected = np.imag(np.exp(3j * time_s) / (1 + 3j * tau_s))
-    out = series.low_pass_of_curves(wave, time_s, dt_s, tau_s)[:, 0]
-    straight = series.low_pass(wave, dt_s, tau_s)[:, 0]
-    inner = slice(50, -1)
-    assert np.abs(out - expected)[inner].max() < 2e-5
-    assert np.abs(straight - expected)[inner].max() > 1e-3
-    jittered = np.sort(time_s + np.random.default_rng(0).uniform(-0.01, 0.01, 1000))
-    uneven = np.sin(3.0 * jittered)[:, None]
-    steps = np.diff(jittered, prepend=np.nan)
-    out = series.low_pass_of_curves(uneven, jittered, steps, tau_s)[:, 0]
-    expected = np.imag(np.exp(3j * jittered) / (1 + 3j * tau_s))
-    assert np.abs(out - expected)[inner].max() < 1e-3
-
-
-def test_a_delay_of_whole_steps_is_an_earlier_row():
-    _, readings = moving(1, rows=200)
-    back = series.delayed_field(readings, np.full(200, 0.15))
-    assert back[3:] == pytest.approx(readings.field_b[:-3], abs=1e-12)
-    half = series.delayed_field(readings, np.full(200, 0.075))
-    between = so3.exp(readings.rate_b_rad_s[5] * 0.025) @ readings.field_b[5]
-    assert half[6] == pytest.approx(between, abs=1e-12)
 
 
 def test_a_line_is_found_where_it_is():

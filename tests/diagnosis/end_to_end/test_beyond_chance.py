@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.answer.spoken import lines, verdict
+from ahrsd.diagnosis.answer.text import lines, verdict
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.simulation import Experiment
 
@@ -54,7 +54,7 @@ def test_where_no_simulation_can_be_fitted_neither_yes_nor_no_is_said(monkeypatc
     def no_end(*_, **__):
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
-    monkeypatch.setattr("ahrsd.diagnosis.answer.chance.fit_null", no_end)
+    monkeypatch.setattr("ahrsd.diagnosis.answer.null_simulations.fit_null", no_end)
     found = diagnose(stepped)
     assert found.findings == ()
     assert verdict(found) == (

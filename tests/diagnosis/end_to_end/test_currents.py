@@ -9,12 +9,12 @@ import pytest
 from scipy.signal import lfilter
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.calibration_fit.thin import thinned
+from ahrsd.diagnosis.calibration_fit.resampling import thinned
+from ahrsd.diagnosis.model import Noise, Term
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.repaired_model.forward import simulated
 from ahrsd.diagnosis.repaired_model.injection import readings_of
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Noise, Term
 from ahrsd.samples import Array
 
 #: gauss per ampere

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 
 SAMPLES = 5000

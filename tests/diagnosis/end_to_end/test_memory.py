@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.calibration_fit.null import fit_null
-from ahrsd.diagnosis.effects import series
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
+from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.repaired_model.forward import contribution
-from ahrsd.diagnosis.values import Term
 
 
 def test_play_begins_where_it_was_left() -> None:
     values = np.array([[0.0], [0.2], [-0.3], [-0.8], [1.0], [0.9]])
-    middle = series.play(values, 0.5, (1.0,))[:, 0]
+    middle = time_series.play(values, 0.5, (1.0,))[:, 0]
     np.testing.assert_allclose(middle, [0.5, 0.5, 0.2, -0.3, 0.5, 0.5], atol=1e-12)
-    assert series.play(values, 0.5, (0.0,)).tolist() == series.play(values, 0.5).tolist()
+    assert time_series.play(values, 0.5, (0.0,)).tolist() == time_series.play(values, 0.5).tolist()
 
 
 @pytest.mark.slow
@@ -40,7 +40,7 @@ def test_the_memory_is_found_and_nothing_else_is_named(memory) -> None:
 def test_a_low_pass_begins_where_it_was_left() -> None:
     values = np.array([[1.0], [1.0], [1.0], [2.0], [2.0]])
     dt_s = np.array([np.nan, 0.5, 0.5, np.nan, 0.5])  # the second run begins settled
-    slow = series.low_pass(values, dt_s, 2.0, (0.3,))[:, 0]
+    slow = time_series.low_pass(values, dt_s, 2.0, (0.3,))[:, 0]
     expected = [1.3, 1 + 0.3 * np.exp(-0.25), 1 + 0.3 * np.exp(-0.5), 2.0, 2.0]
     np.testing.assert_allclose(slow, expected, atol=1e-12)
 

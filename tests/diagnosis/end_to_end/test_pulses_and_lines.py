@@ -9,8 +9,8 @@ import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd import so3
-from ahrsd.diagnosis.calibration_fit.null import fit_null
-from ahrsd.diagnosis.calibration_fit.resting import at_rest
+from ahrsd.diagnosis.calibration_fit.gyro_at_rest import at_rest
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 

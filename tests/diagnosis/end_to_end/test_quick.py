@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.calibration_fit.null import cold_start, fit_null
-from ahrsd.diagnosis.calibration_fit.thin import working_factor
-from ahrsd.diagnosis.effects.base import readings_of
+from ahrsd.diagnosis.calibration_fit.null_fit import cold_start, fit_null
+from ahrsd.diagnosis.calibration_fit.resampling import working_factor
+from ahrsd.diagnosis.effects.effect import readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.effects.pulses import train, trains
+from ahrsd.diagnosis.effects.sensor_sources import train, trains
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import Spec, Track
 

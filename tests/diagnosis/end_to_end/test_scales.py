@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.calibration_fit.null import fit_null
-from ahrsd.diagnosis.effects.base import Readings, Setting, readings_of
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
+from ahrsd.diagnosis.effects.effect import Readings, Setting, readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import Track

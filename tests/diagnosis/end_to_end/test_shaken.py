@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from odd_tracks import SIGMA_GYRO, SIGMA_MAG, shaking
 
+from ahrsd.diagnosis.calibration_fit.gyro_readings import shaken
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
-from ahrsd.diagnosis.calibration_fit.shaken import shaken
 from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.track import Spec
 

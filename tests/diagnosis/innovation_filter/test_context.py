@@ -1,4 +1,4 @@
-"""The context: attitude, field and rates against the simulation's truth."""
+"""The context: attitude, field, rates and force against the simulation's truth."""
 
 from __future__ import annotations
 
@@ -11,18 +11,21 @@ from scipy.spatial.transform import Rotation
 from tracks import experiment, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.innovation_filter.context import (
     bandwidth_hz,
     build_context,
+    force_without_noise,
     rate_by_others,
     smoothed_rate,
 )
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
+from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Context
 from ahrsd.samples import Array
 from ahrsd.simulation import Experiment
+
+RATE_HZ = 50.0
 
 
 def _context(track: Track, made: Experiment) -> Context:
@@ -192,3 +195,35 @@ def test_an_axis_that_does_not_turn_keeps_its_mean_row_by_row() -> None:
 def test_quick_rates_are_not_taken_from_their_neighbours() -> None:
     rate = np.random.default_rng(1).standard_normal((100, 3))
     assert rate_by_others(rate, rate, 1.0) is rate
+
+
+def swaying(count: int = 8000) -> np.ndarray:
+    t = np.arange(count) / RATE_HZ
+    x = 1.8 * np.sin(2 * np.pi * 0.11 * t + 0.3) + 0.3 * np.sin(2 * np.pi * 0.37 * t)
+    return np.column_stack([x, 0.4 * np.cos(2 * np.pi * 0.07 * t), -9.8 + 0.2 * np.sin(t)])
+
+
+def test_a_slow_force_is_kept_and_the_noise_is_not() -> None:
+    force = swaying()
+    noise = 0.2 * np.random.default_rng(1).standard_normal(force.shape)
+    found = force_without_noise(force + noise, [slice(0, len(force))])
+    assert np.sqrt(np.mean((found - force) ** 2)) < 0.25 * 0.2
+    # nothing of the force has gone with the noise (the third axis sways no more than the noise)
+    along = np.sum((found - found.mean(0)) * (force - force.mean(0)), axis=0)
+    np.testing.assert_allclose(along / np.sum((found - found.mean(0)) ** 2, axis=0), 1.0, atol=0.03)
+
+
+def test_at_rest_there_is_one_force() -> None:
+    noise = 0.2 * np.random.default_rng(2).standard_normal((4000, 3))
+    found = force_without_noise(np.array([0.1, -0.2, -9.8]) + noise, [slice(0, 4000)])
+    assert found.std(axis=0).max() < 0.01
+
+
+def test_runs_are_apart_and_what_is_short_or_has_holes_is_as_it_was() -> None:
+    force = swaying(600)
+    force[400:] += 50.0
+    runs = [slice(0, 400), slice(400, 450), slice(450, 600)]
+    force[500, 1] = np.nan
+    found = force_without_noise(force, runs)
+    np.testing.assert_array_equal(found[400:], force[400:])
+    np.testing.assert_allclose(found[:400], force[:400], atol=0.02)

@@ -1,4 +1,7 @@
-"""The filter: equal to the plain loop, exact sensitivities, white on nulls, none of the traps."""
+"""The filter: equal to the plain loop, exact sensitivities, white on nulls, none of the traps.
+
+Columns that pass the filter together, and the small inverse of its gains.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +13,19 @@ from scipy import stats
 from tracks import experiment, moved_model, track_of, true_model
 
 from ahrsd import so3
-from ahrsd.diagnosis.innovation_filter.blocks import NARROW, layout_of
 from ahrsd.diagnosis.innovation_filter.innovation import (
     Filtered,
+    batches,
     bearings,
+    joined,
     nuisance_columns,
     regressing,
     run_filter,
     sensitivities,
 )
+from ahrsd.diagnosis.innovation_filter.parallel_scan import NARROW
+from ahrsd.diagnosis.model import Columns, NullModel
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Columns, NullModel
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
@@ -307,13 +312,34 @@ def test_trap_d_a_direction_without_information_has_none() -> None:
     assert np.isfinite(scaled).all()
 
 
-def test_layout_covers_every_row_once() -> None:
-    layout = layout_of((slice(0, 7), slice(7, 8), slice(8, 500)))
-    rows = layout.rows[layout.rows < 500]
-    assert np.array_equal(np.sort(rows), np.arange(500))
-    assert layout.starts[layout.opens].tolist() == [0, 7, 8]
-
-
 def test_traceless_directions_keep_the_trace() -> None:
     assert np.abs(np.trace(TRACELESS, axis1=1, axis2=2)).max() == 0
     assert np.linalg.matrix_rank(TRACELESS.reshape(5, 9)) == 5
+
+
+def of(mag: int = 0, gyro: int = 0) -> Columns:
+    rng = np.random.default_rng(mag + 10 * gyro)
+    sides = [rng.normal(size=(5, 3, width)) if width else None for width in (mag, gyro)]
+    return Columns(*sides)
+
+
+def test_batches_are_of_one_side_and_no_wider_than_wanted() -> None:
+    columns = [
+        of(mag=3),
+        of(gyro=2),
+        of(mag=4),
+        of(mag=2, gyro=2),
+        of(mag=9),
+        of(gyro=5),
+        of(mag=1),
+    ]
+    found = batches(columns, 7)
+    assert found == [[0, 2], [4], [6], [1, 5], [3]]
+    for batch in found:
+        together = joined([columns[k] for k in batch])
+        for part, k in ((together.mag, "mag"), (together.gyro, "gyro")):
+            own = [getattr(columns[number], k) for number in batch]
+            if part is None:
+                assert own == [None] * len(batch)
+            else:
+                np.testing.assert_array_equal(part, np.concatenate(own, axis=2))

@@ -12,7 +12,7 @@ from tracks import experiment, track_of, true_model
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
 from ahrsd.diagnosis.innovation_filter.noise import (
     Colour,
-    before,
+    colour_before_filter,
     colour_of,
     freedom_of,
     level_facts,
@@ -186,11 +186,11 @@ def test_a_slow_field_is_no_noise() -> None:
 def test_the_colour_before_a_filter_is_told_from_what_the_filter_made_of_it():
     wanted = Colour(np.array([0.6]), 1.0)
     found = Colour(np.array([0.3]), 0.9)
-    colour, louder = before(wanted, found)
+    colour, louder = colour_before_filter(wanted, found)
     expected = wanted.power**2 / found.power
     np.testing.assert_allclose(colour.power, expected, rtol=0.02)
     # variances are the means of the densities
     assert louder**2 == pytest.approx(expected.mean() / wanted.power.mean(), rel=0.01)
-    same, factor = before(wanted, wanted)
+    same, factor = colour_before_filter(wanted, wanted)
     np.testing.assert_allclose(same.power, wanted.power, rtol=1e-4)
     assert factor == pytest.approx(1.0, abs=1e-5)

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.signal import lfilter
 
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.innovation_filter.evidence import SIZES, log_bayes, posterior
-from ahrsd.diagnosis.innovation_filter.score import solve, total_score
+from ahrsd.diagnosis.innovation_filter import regression_statistics
+from ahrsd.diagnosis.innovation_filter.regression_statistics import (
+    SIZES,
+    log_bayes,
+    posterior,
+    solve,
+    total_score,
+)
+
+VALUES = np.random.default_rng(0).standard_normal((500, 3))
 
 
 def test_a_direction_counts_where_one_prior_deviation_would_show():
@@ -73,3 +82,24 @@ def test_a_coefficient_pays_nothing_for_its_unit():
     usual = scored(X, e, np.full(3, 0.1))
     assert small.value == pytest.approx(usual.value)
     assert log_bayes(small) == pytest.approx(log_bayes(usual), abs=0.6)
+
+
+def test_probabilities_are_those_of_the_distributions():
+    assert regression_statistics.chi2_above(7.3, 4) == pytest.approx(
+        stats.chi2.sf(7.3, 4), rel=1e-12
+    )
+    assert regression_statistics.chi2_below(7.3, 4) == pytest.approx(
+        stats.chi2.cdf(7.3, 4), rel=1e-12
+    )
+    above = stats.kstwobign.sf(1.1)
+    assert regression_statistics.kolmogorov_above(1.1) == pytest.approx(above, rel=1e-9)
+    quantile = stats.t.ppf(0.9995, 15)
+    assert regression_statistics.student_quantile(0.9995, 15) == pytest.approx(quantile, rel=1e-9)
+
+
+def test_student_of_variance_one():
+    for freedom in (2.2, 5.0, 60.0):
+        scale = np.sqrt((freedom - 2) / freedom)
+        expected = stats.t.logpdf(VALUES, freedom, scale=scale)
+        found = regression_statistics.student_log_density(VALUES, freedom)
+        np.testing.assert_allclose(found, expected, rtol=1e-10)

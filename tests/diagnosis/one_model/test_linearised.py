@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
+from ahrsd.diagnosis.model import Columns
 from ahrsd.diagnosis.one_model import priors, rich
 from ahrsd.diagnosis.one_model.candidates import beside
 from ahrsd.diagnosis.one_model.component import Component, Fixed
@@ -30,7 +31,6 @@ from ahrsd.diagnosis.one_model.linearised import added as added_by
 from ahrsd.diagnosis.one_model.remainder import ordinary_remainder, still_spells
 from ahrsd.diagnosis.one_model.sampled_turns import broken_where_unsampled
 from ahrsd.diagnosis.track import Spec, Track
-from ahrsd.diagnosis.values import Columns
 
 
 def richest(track: Track) -> rich.Judged:

@@ -11,7 +11,7 @@ from tracks import experiment, track_of
 
 from ahrsd.diagnosis.answer.added_field import calibration_of, deviation, less_calibration
 from ahrsd.diagnosis.answer.diagnosis import Assumed, Finding, Heldout, OnPriors, Where
-from ahrsd.diagnosis.calibration_fit.null import fit_null
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.one_model import priors, rich

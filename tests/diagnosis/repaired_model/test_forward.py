@@ -12,9 +12,9 @@ from effect_motion import HARD_IRON, SOFT_IRON, moving
 from ahrsd import so3
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
+from ahrsd.diagnosis.model import Noise, Term
 from ahrsd.diagnosis.repaired_model import forward
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, from_text, to_text
-from ahrsd.diagnosis.values import Noise, Term
 
 
 def terms(readings, *names):

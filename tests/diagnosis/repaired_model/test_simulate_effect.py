@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.model import NullModel, Term
 from ahrsd.diagnosis.repaired_model import forward
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, to_text
-from ahrsd.diagnosis.values import NullModel, Term
 from ahrsd.recording.table import read_table
 from ahrsd.simulation import ScenarioSettings, simulate
 

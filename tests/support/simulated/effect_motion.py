@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd import so3
-from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.effects.effect import Readings
+from ahrsd.diagnosis.model import Context, NullModel
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.values import Context, NullModel
 
 SOFT_IRON = np.array([[1.05, 0.08, 0.03], [0.08, 0.9, 0.02], [0.03, 0.02, 1.05]])
 HARD_IRON = np.array([0.03, -0.12, 0.09])

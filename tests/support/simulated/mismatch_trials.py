@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ahrsd.diagnosis.effects.base import Readings
+from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.track import Track
 from ahrsd.simulation import ScenarioSettings, simulate

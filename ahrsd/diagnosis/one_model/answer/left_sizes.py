@@ -20,7 +20,7 @@ from ahrsd.diagnosis.answer.added_field import (
     less_calibration,
 )
 from ahrsd.diagnosis.answer.diagnosis import Component, Ordinary, Unexplained
-from ahrsd.diagnosis.answer.ordinary_text import SIMULATED
+from ahrsd.diagnosis.answer.text import SIMULATED
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.alternatives import BY_HEADING, BY_RATE, BY_TILT, QUICK, form_keys
 from ahrsd.diagnosis.one_model.candidates import beside

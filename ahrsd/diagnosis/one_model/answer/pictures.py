@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Contribution, Drawn
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.one_model.answer.visibility import Seen
 from ahrsd.diagnosis.one_model.decision import Answer
 from ahrsd.diagnosis.one_model.linearised import moved

@@ -11,15 +11,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from ahrsd.diagnosis.answer.predictive import usual_noise
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
+from ahrsd.diagnosis.answer.predictive_checks import usual_noise
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.data_quality.facts import Fact, rounding
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
+from ahrsd.diagnosis.model import Noise
 from ahrsd.diagnosis.one_model.effect_components import LAG
 from ahrsd.diagnosis.one_model.linearised import Point, added, by_key, moved
 from ahrsd.diagnosis.one_model.recorded_rate import Quick, at_recorded_rate
 from ahrsd.diagnosis.one_model.search_rounds import Searched
-from ahrsd.diagnosis.values import Noise
 
 
 def repaired_noise(

@@ -2,9 +2,10 @@
 
 In the noise that the answer leaves, its residual is V^-1 y, y of variance V = 1 + X Phi X^T.
 Copies are drawn of that law with the residual's own tails and fitted as the recording was; each
-statistic, chosen before anything is looked at, has the band of its copies (`predictive`).  A bin of
-a regime (heading, tilt, rate, a column) is asked for a field of its own, Z: its score Z^T V^-1 y
-has the variance Z^T V^-1 Z, so half of the square has three halves of a nat where nothing is left.
+statistic, chosen before anything is looked at, has the band of its copies (`predictive_checks`).  A
+bin of a regime (heading, tilt, rate, a column) is asked for a field of its own, Z: its score
+Z^T V^-1 y has the variance Z^T V^-1 Z, so half of the square has three halves of a nat where
+nothing is left.
 
 Before is the calibration alone in the same noise: what was left out would else pass for noise.
 """
@@ -19,8 +20,8 @@ from scipy import special
 
 from ahrsd.diagnosis.answer.diagnosis import Check, RegimeMap, Whiteness
 from ahrsd.diagnosis.answer.omnibus import omnibus
-from ahrsd.diagnosis.answer.predictive import COPIES, bands, scene_of, statistics
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
+from ahrsd.diagnosis.answer.predictive_checks import COPIES, bands, scene_of, statistics
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.innovation_filter.noise import freedom_of
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.answer.white_rows import Fit, WhiteRows

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis.answer.diagnosis import Limit
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.candidates import beside
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Names, Space

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.fft import idct
 
-from ahrsd.diagnosis.innovation_filter.innovation import sensitivities
-from ahrsd.diagnosis.innovation_filter.side_by_side import batches, joined
+from ahrsd.diagnosis.innovation_filter.innovation import batches, joined, sensitivities
+from ahrsd.diagnosis.model import Columns
 from ahrsd.diagnosis.one_model.linearised import Linearised, by_frequency
 from ahrsd.diagnosis.one_model.model_search import Hypotheses, Hypothesis
-from ahrsd.diagnosis.values import Columns
 from ahrsd.samples import Array
 
 #: relative: columns that are alike but for rounding would else leave no root

@@ -20,14 +20,13 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Suspect,
     Unexplained,
 )
-from ahrsd.diagnosis.calibration_fit.descent import NullFit
-from ahrsd.diagnosis.calibration_fit.null import baseline
-from ahrsd.diagnosis.calibration_fit.resting import HARDLY_TURNED, at_rest
+from ahrsd.diagnosis.calibration_fit.gyro_at_rest import HARDLY_TURNED, at_rest
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, baseline
 from ahrsd.diagnosis.data_quality.facts import Fact, around, lost_at, of_fact, rounding
-from ahrsd.diagnosis.data_quality.hygiene import would_have_shown
-from ahrsd.diagnosis.data_quality.prepared import Prepared
-from ahrsd.diagnosis.effects.base import Effect
+from ahrsd.diagnosis.data_quality.preparation import Prepared, would_have_shown
+from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.innovation_filter.noise import level_facts
+from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.one_model import priors
 from ahrsd.diagnosis.one_model.answer import pictures, residual_checks, support, visibility
 from ahrsd.diagnosis.one_model.answer.held_out import HeldOut
@@ -38,7 +37,6 @@ from ahrsd.diagnosis.one_model.logged_columns import as_recorded
 from ahrsd.diagnosis.one_model.members import nats_of_remainder
 from ahrsd.diagnosis.one_model.recorded_rate import Quick
 from ahrsd.diagnosis.one_model.search_rounds import Searched
-from ahrsd.diagnosis.values import Term
 from ahrsd.diagnosis.where_and_when import locate
 
 #: what has a setting

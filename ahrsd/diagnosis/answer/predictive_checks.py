@@ -1,0 +1,435 @@
+"""Posterior predictive checks: does the recording look like what its model simulates?
+
+The fitted model is simulated along the recording's own motion, covariates and gaps, some copies,
+and all of them go through its filter as the recording did.  They have the fit's noise, in which
+anything slow that was left out is held as noise.
+Every statistic below is chosen before anything is looked at.  Its band covers a simulation with
+99 % for all statistics together (Bonferroni; normal in the logarithm, the copies' own mean and
+deviation, Student's t).  What looks for the largest of many differences follows Gumbel's law, and
+has a band from zero on: that less is to be seen than in a simulation is no difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis.answer.diagnosis import Check
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
+from ahrsd.diagnosis.calibration_fit.quantisation_noise import (
+    before_rounding,
+    calibration_covariance,
+    readings_of_drawn_calibration,
+)
+from ahrsd.diagnosis.effects.effect import Effect
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.innovation_filter.innovation import (
+    Filtered,
+    nuisance_columns,
+    run_filter,
+    sensitivities,
+)
+from ahrsd.diagnosis.innovation_filter.noise import colour_before_filter, colour_of, freedom_of
+from ahrsd.diagnosis.innovation_filter.regression_statistics import student_quantile
+from ahrsd.diagnosis.model import Context, Noise, Term
+from ahrsd.diagnosis.repaired_model import forward
+from ahrsd.diagnosis.track import Track
+from ahrsd.samples import Array
+
+COPIES = 16
+# simulations by which the noise's colour is found, and how many rows are enough
+_TRIED, _TRIED_ROWS, _TRIAL_SEED = 8, 40_000, 2
+_OUTSIDE = 0.01
+#: deviations beyond the mean of COPIES largest values that one more is below in 999 of 1000 draws,
+#: by Gumbel's law (drawn in tests/diagnosis/answer/test_predictive_checks.py): a thousandth for
+#: each of ten
+_LARGEST_REACH = 6.5
+_SEGMENT_S = 20.0
+_LAGS = 50
+_LEAST = 1e-12
+_TWO_SIDED = ("normalised_innovation", "autocorrelation", "tail")
+_ROUNDED = "mag_quantisation"
+_ACROSS = 2.0 / 3.0  # of an innovation's three parts are across the field
+_QUIETEST = 1e-3  # of an innovation's deviation: the least that the magnetometer scatters by
+_BEYOND = 2.0  # times what noise has in means over segments
+
+
+def checks(null: NullFit) -> dict[str, Check]:
+    """The statistics of what a calibration alone leaves, beside the band of its simulations.
+
+    Deterministic.
+    """
+    context = null.context()
+    scene, found = scene_of(context), _Fitted.of(null)
+    value = statistics(found.left(null.filtered.whitened), scene)
+    made = _innovations(null, noise_law(null), (), EFFECTS, COPIES, 0)
+    expected = bands([statistics(found.left(e), scene) for e in made])
+    return {
+        name: Check(value[name], band, inside := _inside(value[name], band), inside)
+        for name, band in expected.items()
+    }
+
+
+def beside_refitted(null: NullFit, refitted: Sequence[NullFit]) -> tuple[dict[str, Check], float]:
+    """The statistics of what a calibration alone leaves, beside those of simulations of it.
+
+    refitted: fits of simulations of the calibration, each made as `null` was made of the recording:
+    their bands hold where a fit is not linear in the readings, as beside a loud gyro, and are of
+    factors: what the error of a fit leaves is as large as that error.  Two or more.
+    Also the probability that one of the statistics is as far out, by its ranks (Bonferroni).
+    """
+    found = [_of_fit(one) for one in refitted]
+    value, expected = _of_fit(null), bands(found, by_factor=True)
+    ranks = []
+    for name in expected:
+        above = sum(one[name] >= value[name] for one in found)
+        below = len(found) - above
+        ranks.append(2 * min(above, below) if name in _TWO_SIDED else above)
+    out = {
+        name: Check(value[name], band, inside := _inside(value[name], band), inside)
+        for name, band in expected.items()
+    }
+    return out, min(1.0, len(ranks) * (1 + min(ranks)) / (1 + len(found)))
+
+
+def _of_fit(fit: NullFit) -> dict[str, float]:
+    """The statistics of what a fit leaves."""
+    return statistics(_Fitted.of(fit).left(fit.filtered.whitened), scene_of(fit.context()))
+
+
+def noise_law(
+    fit: NullFit,
+    loud: Sequence[tuple[float, float]] = (),
+    terms: Sequence[Term] = (),
+    library: Mapping[str, Effect] = EFFECTS,
+) -> Noise:
+    """The noise of a fit as it is: levels, colour, and Student's tails where they are heavy.
+
+    loud: spans in seconds that have a level of their own, each relative to the filter's.
+    Readings in coarse steps (a term) are rounded after the noise.
+    What stays for 20 s in the sensor's axes or the world's, more than the colour of the rest makes
+    of it, is no noise and left out.  The colour is such that innovations of simulations have the
+    recording's.
+    """
+    done, quick = fit.filtered, _quick(fit, fit.filtered.whitened)
+    slow = done.normalised_innovation - quick.normalised_innovation
+    if slow > _BEYOND * _slow_power(quick, segments_of(done.track)):
+        done = quick
+    within = np.zeros(len(done.track), dtype=bool)
+    for begin, end in loud:
+        within |= (done.track.time_s >= begin) & (done.track.time_s <= end)
+    law = forward.noise_of(fit.model, done)
+    steps = [float(term.value[0]) for term in terms if term.identifier == _ROUNDED]
+    of_gyro = 0.0 if steps else _of_gyro(fit, law, terms, library, quick=done is quick)
+    level = np.ones(len(within))
+    for rows in (within, ~within):
+        if np.any(rows & done.used):
+            of_mag = float(np.mean(done.whitened[rows & done.used] ** 2)) - of_gyro
+            level[rows] = np.sqrt(max(of_mag, _QUIETEST**2) / (1.0 - of_gyro))
+    if steps:
+        truth, unsure = forward.truth_along(fit.context()), calibration_covariance(fit)
+
+        def simulate(noise: Noise, seed: int) -> tuple[Array, Array]:
+            known = readings_of_drawn_calibration(truth, unsure, seed) if seed else truth
+            made = forward.track_of(forward.simulated(known, terms, noise, seed, library))
+            return made.mag_b_gauss, _filtered([made], fit)
+
+        return before_rounding(fit, replace(law, colour=(), level=level), steps[0], simulate)
+    law = replace(law, level=level)
+    if done.track.lost_turns is None:  # else what is lost makes the tails, and is simulated
+        law = replace(
+            law, freedom=freedom_of(replace(done, whitened=done.whitened / level[:, None]))
+        )
+    if not law.colour:
+        return law
+    tried = int(np.clip(_TRIED_ROWS // len(level), 1, _TRIED))
+    made = _innovations(fit, law, terms, library, tried, _TRIAL_SEED)
+    seen = [_quick(fit, e) if done is quick else replace(done, whitened=e) for e in made]
+    stacked = np.concatenate([one.whitened for one in seen])
+    found = colour_of(replace(done, whitened=stacked, used=np.tile(done.used, len(seen))))
+    colour, louder = colour_before_filter(colour_of(done), found)
+    return replace(law, colour=tuple(colour.coefficients.tolist()), level=level * louder)
+
+
+def _of_gyro(
+    fit: NullFit,
+    law: Noise,
+    terms: Sequence[Term],
+    library: Mapping[str, Effect],
+    *,
+    quick: bool,
+) -> float:
+    """Mean square of whitened innovations that the gyro's noise alone makes, two thirds at most.
+
+    The rest is the magnetometer's: along the field the gyro moves nothing.
+    """
+    silent = replace(law, mag_gauss=0.0, colour=())
+    (made,) = _innovations(fit, silent, terms, library, 1, _TRIAL_SEED)
+    seen = _quick(fit, made).whitened if quick else made
+    return min(float(np.mean(seen[fit.filtered.used] ** 2)), _ACROSS)
+
+
+def usual_noise(
+    fit: NullFit,
+    loud: Sequence[tuple[float, float]] = (),
+    terms: Sequence[Term] = (),
+    library: Mapping[str, Effect] = EFFECTS,
+) -> Noise:
+    """The noise law of a fit at one level, that of most rows."""
+    law = noise_law(fit, loud, terms, library)
+    usual = 1.0 if law.level is None else float(np.median(law.level))
+    return replace(law, mag_gauss=law.mag_gauss * usual, level=None)
+
+
+def _quick(fit: NullFit, whitened: Array) -> Filtered:
+    """Whitened innovations (N, 3) less their means over segments, in both frames."""
+    context, used = fit.context(), fit.filtered.used
+    segment = segments_of(context.track)
+    count = np.maximum(np.bincount(segment, weights=used), 1.0)[:, None]
+
+    def centred(values: Array) -> Array:
+        means = np.column_stack([np.bincount(segment, weights=column) for column in values.T])
+        return np.where(used[:, None], values - (means / count)[segment], 0.0)
+
+    in_world = np.einsum("nij,nj->ni", context.R_nb, centred(whitened))
+    left = np.einsum("nji,nj->ni", context.R_nb, centred(in_world))
+    return replace(fit.filtered, whitened=left)
+
+
+def _slow_power(quick: Filtered, segment: NDArray[np.intp]) -> float:
+    """Mean square that the means over segments take of noise of this colour, in both frames."""
+    colour = colour_of(quick)
+    density = colour.variance / max(1.0 - float(colour.coefficients.sum()), _LEAST) ** 2
+    return 2.0 * density * len(np.unique(segment)) / max(int(np.count_nonzero(quick.used)), 1)
+
+
+def _innovations(
+    fit: NullFit,
+    noise: Noise,
+    terms: Sequence[Term],
+    library: Mapping[str, Effect],
+    copies: int,
+    seed: int,
+) -> list[Array]:
+    """Whitened innovations (N, 3) of simulations along the recording's motion."""
+    truth, track = forward.truth_along(fit.context()), fit.filtered.track
+    seeds = [1000 * seed + k for k in range(copies)]
+    truths = [truth] * copies
+    if any(term.identifier == _ROUNDED for term in terms):
+        unsure = calibration_covariance(fit)
+        truths = [readings_of_drawn_calibration(truth, unsure, one) for one in seeds]
+    made = [
+        _losing(track, forward.track_of(forward.simulated(along, terms, noise, one, library)), one)
+        for along, one in zip(truths, seeds, strict=True)
+    ]
+    whole = [track for track in made if len(track) == len(fit.filtered.track)]
+    return np.split(_filtered(whole, fit), len(whole))
+
+
+def _losing(track: Track, made: Track, seed: int) -> Track:
+    """A simulation that loses as many turns as the recording is expected to have lost unseen.
+
+    They are put right on average: a step that loses n of them, where so many are expected, turned
+    by n less those more than its gyro says.
+    """
+    expected = track.lost_turns
+    if expected is None or len(made) != len(track):
+        return made
+    lost = np.random.default_rng([seed, len(made)]).poisson(expected)
+    short = track.step_share * (lost - expected)
+    gyro = made.gyro_b_rad_s * (1.0 - short)[:, None]
+    return replace(made, gyro_b_rad_s=gyro, lost_turns=expected, step_share=track.step_share)
+
+
+def _inside(value: float, band: tuple[float, float]) -> bool:
+    return band[0] <= value <= band[1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fitted:
+    """The whitened columns (3 N, 11) of the calibration, orthonormal."""
+
+    columns: Array
+
+    @staticmethod
+    def of(fit: NullFit) -> _Fitted:
+        """Of a fit, whose filter is `sensitive`."""
+        flat = sensitivities(fit.filtered, nuisance_columns(fit.filtered)).reshape(-1, 11)
+        return _Fitted(np.linalg.svd(flat / np.linalg.norm(flat, axis=0), full_matrices=False)[0])
+
+    def left(self, whitened: Array) -> Array:
+        """Whitened innovations (N, 3) with the columns taken out."""
+        flat = whitened.ravel()
+        return np.asarray((flat - self.columns @ (self.columns.T @ flat)).reshape(-1, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What innovations are compared with: directions, segments and courses of unit length.
+
+    unit_b (N, 3): direction of the field;  R_nb (N, 3, 3);  segment (N,): number of the 20 s piece
+    time (N, 1), heading (N, 4), columns (N, c): centred;  columns may have no column
+    """
+
+    unit_b: Array
+    R_nb: Array
+    segment: NDArray[np.intp]
+    time: Array
+    heading: Array
+    columns: Array
+
+
+def scene_of(context: Context) -> Scene:
+    """The scene of a recording."""
+    track = context.track
+    return Scene(
+        unit_b=context.field_b
+        / np.maximum(np.linalg.norm(context.field_b, axis=1, keepdims=True), 1e-300),
+        R_nb=context.R_nb,
+        segment=segments_of(track),
+        time=_courses([track.time_s]),
+        heading=_courses([f(n * context.heading_rad) for n in (1, 2) for f in (np.cos, np.sin)]),
+        columns=_courses(
+            [
+                course
+                for values in track.covariates.values()
+                if np.isfinite(values).all() and np.ptp(values) > 0
+                for course in (values, time_series.derivative(values, track.time_s, track.dt_s))
+            ]
+        ).reshape(len(track), -1),
+    )
+
+
+def segments_of(track: Track) -> NDArray[np.intp]:
+    """(N,) number of the 20 s piece that a row is in, of those that have a row."""
+    piece = (track.time_s - track.time_s[0]) // _SEGMENT_S
+    return np.asarray(np.unique(piece, return_inverse=True)[1], dtype=np.intp)
+
+
+def statistics(e: Array, scene: Scene) -> dict[str, float]:
+    """What is compared, of whitened innovations (N, 3) in a scene.
+
+    normalised_innovation   mean square
+    autocorrelation         portmanteau over the first 50 lags, 1 for white noise
+    shift_sensor, _world    largest mean of a 20 s segment in the frame, in deviations of noise
+    shift_turn              the same of the part that a wrong rate leaves: h x e
+    field_size              the same of the part along the field, or its trend
+    heading                 largest first or second harmonic of heading, in deviations
+    tail                    the 99.9 % quantile of the size of a component
+    line                    highest line of the periodogram over its mean
+    covariates              largest correlation with a column or its derivative, in deviations
+    """
+    seen = e[np.any(e != 0.0, axis=1)]
+    along = np.sum(e * scene.unit_b, axis=1)[:, None]
+    power = np.abs(np.fft.rfft(e, axis=0)[1:]) ** 2
+    out = {
+        "normalised_innovation": float(np.mean(seen**2)),
+        "autocorrelation": _portmanteau(e),
+        "shift_sensor": _shift(e, scene),
+        "shift_world": _shift(np.einsum("nij,nj->ni", scene.R_nb, e), scene),
+        "shift_turn": _shift(np.cross(scene.unit_b, e), scene),
+        "field_size": max(_shift(along, scene), _follows(along, scene.time)),
+        "heading": _follows(e, scene.heading),
+        "tail": float(np.quantile(np.abs(seen), 0.999)),
+        "line": float((power / power.mean(axis=0)).max()),
+    }
+    if scene.columns.shape[1]:
+        out["covariates"] = _follows(e, scene.columns)
+    return out
+
+
+def _filtered(tracks: Sequence[Track], fit: NullFit) -> Array:
+    """Whitened innovations of tracks of the fit's own length, its terms taken out as in its run.
+
+    Each has gains and nominal field of its own, as the recording has: by another field's direction
+    a loud gyro's noise would be laid to the field's size.
+    """
+    count = len(tracks)
+    mag, gyro = (
+        None if part is None else np.tile(part, (count, 1))
+        for part in (fit.terms_mag, fit.terms_gyro)
+    )
+    blind = np.tile(np.isnan(fit.filtered.track.mag_b_gauss).any(axis=1), count)
+    joined = _joined(tracks)
+    joined.mag_b_gauss[blind] = np.nan
+    return run_filter(joined, fit.model, mag, gyro, sensitive=False).whitened
+
+
+def _joined(tracks: Sequence[Track]) -> Track:
+    """Tracks one behind the other, each with runs of its own: the filter takes them all at once."""
+    first = tracks[0]
+    length = first.duration_s + 10.0
+    dt_s = np.concatenate([track.dt_s for track in tracks])
+    lost = [track.lost_turns for track in tracks if track.lost_turns is not None]
+    return replace(
+        first,
+        time_s=np.concatenate([track.time_s + k * length for k, track in enumerate(tracks)]),
+        dt_s=dt_s,
+        mag_b_gauss=np.vstack([track.mag_b_gauss for track in tracks]),
+        gyro_b_rad_s=np.vstack([track.gyro_b_rad_s for track in tracks]),
+        accel_b_m_s2=None,
+        covariates={},
+        runs=tuple(time_series.runs(dt_s)),
+        lost_turns=np.concatenate(lost) if lost else None,
+    )
+
+
+def bands(
+    found: Sequence[Mapping[str, float]], *, by_factor: bool = False
+) -> dict[str, tuple[float, float]]:
+    """Where one more simulation would be, for every statistic.
+
+    by_factor: whether the largest of many differences are spread in the logarithm as well
+    """
+    count, names = len(found), list(found[0])
+    outside = _OUTSIDE / len(names)
+    two_sided = student_quantile(1 - outside / 2, count - 1) * np.sqrt(1 + 1 / count)
+    out = {}
+    for name in names:
+        values = np.array([one[name] for one in found])
+        logs = np.log(np.maximum(values, _LEAST))
+        middle, spread = float(np.mean(logs)), float(np.std(logs, ddof=1))
+        if name in _TWO_SIDED:
+            width = two_sided * spread
+            out[name] = (float(np.exp(middle - width)), float(np.exp(middle + width)))
+        elif by_factor:
+            out[name] = (0.0, float(np.exp(middle + _LARGEST_REACH * spread)))
+        else:
+            out[name] = (0.0, float(values.mean() + _LARGEST_REACH * values.std(ddof=1)))
+    return out
+
+
+def _portmanteau(e: Array) -> float:
+    """Sum of squared autocorrelations times their number, over the number of lags."""
+    count, axes = e.shape
+    flat = e.ravel()
+    most = min(_LAGS, count - 1)
+    lags = [float(flat[: flat.size - k * axes] @ flat[k * axes :]) for k in range(most + 1)]
+    return float(np.mean((np.array(lags[1:]) / max(lags[0], _LEAST)) ** 2) * 3 * count)
+
+
+def _shift(values: Array, scene: Scene) -> float:
+    """Largest |mean| of a segment (N, k), in standard deviations of a mean of unit noise."""
+    count = np.bincount(scene.segment, weights=np.any(values != 0.0, axis=1))
+    kept = count > 0.3 * count.max()
+    sums = np.column_stack([np.bincount(scene.segment, weights=column) for column in values.T])
+    means = np.abs(sums[kept] / np.sqrt(count[kept])[:, None])
+    return float(means.max(initial=0.0))
+
+
+def _follows(values: Array, courses: Array) -> float:
+    """Largest correlation of a column (N, k) with a course (N, c), in deviations of unit noise."""
+    return float(np.abs(values.T @ courses).max())
+
+
+def _courses(values: Sequence[Array]) -> Array:
+    """Courses (N,) side by side, centred and of unit length; those that do not change are 0."""
+    if not values:
+        return np.zeros((0, 0))
+    centred = np.column_stack([value - value.mean() for value in values])
+    size = np.linalg.norm(centred, axis=0)
+    return np.asarray(centred / np.where(size > 0, size, 1.0))

@@ -1,0 +1,354 @@
+"""A diagnosis in the words of a field engineer.
+
+The whole answer is `lines`, one sentence of it `verdict`; what is left, how large it is, where, and
+what real recordings ordinarily leave is `in_one_sentence` and `size_lines`.  How an effect was read
+is `setting_text`: the parts of a finding's setting that a person can act on.  A column that is
+logged late, a period, a time constant: they were chosen among many and are no coefficients, so that
+they have no deviation of their own.
+
+What would separate two effects that a motion cannot tell apart is `separating_manoeuvre`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ahrsd.diagnosis.answer.diagnosis import (
+    Component,
+    Diagnosis,
+    Finding,
+    Limit,
+    OnPriors,
+    Ordinary,
+    Unexplained,
+    Value,
+    Where,
+)
+from ahrsd.diagnosis.columns.roles import shown
+from ahrsd.diagnosis.effects.effect import Effect
+
+_FRAMES = {
+    "sensor": "turns with the vehicle",
+    "world": "stays in the world",
+    "gyro": "in the gyro",
+    "link": "on the link",
+    "noise": "in the noise",
+}
+_MG = 1e3
+#: units in which a person thinks of small effects, of those in which they are reckoned
+_SPOKEN_UNITS = {
+    "gauss": ("mG", 1e3),
+    "s": ("ms", 1e3),
+    "rad": ("deg", 180 / math.pi),
+    "1": ("%", 100.0),
+}
+_LIMITS_SHOWN = 6
+_FAILED = 1e-4
+#: said of a simulation that leaves what a real recording may
+SIMULATED = "a simulated recording, its truth is beside it: nothing that is left there is ordinary"
+
+
+def lines(found: Diagnosis) -> list[str]:
+    """The whole answer, for a terminal."""
+    out = [f"{found.recording}: {verdict(found)}"]
+    for number, finding in enumerate(found.findings, start=1):
+        out += ["", f"{number}. {headline(finding)}", *_finding_lines(finding)]
+    if found.unexplained.detected:
+        out += ["", "not in the library:", *_unexplained_lines(found.unexplained)]
+    elif ordinary_left(found) is not None:
+        out += ["", "left, and ordinary:", *_unexplained_lines(found.unexplained)]
+    if not found.mismatch and found.undecided is None and found.sensitivity:
+        out += ["", f"this recording would have shown: {sensitivity(found.sensitivity)}"]
+    failed = found.failed_checks
+    if found.posterior_predictive:
+        count = len(found.posterior_predictive)
+        state = f"fails {', '.join(failed)}" if failed else "passes all of them"
+        out += ["", f"checks: {count} statistics; the repaired model {state}"]
+    if found.omnibus:
+        out.append(f"innovations: {_whiteness(found)}")
+    return out + [f"note: {note}" for note in found.notes]
+
+
+def _whiteness(found: Diagnosis) -> str:
+    """Which of the omnibus tests the model failed, and which the repaired one still fails."""
+    before = [name for name, test in found.omnibus.items() if test.p_before < _FAILED]
+    after = [name for name, test in found.omnibus.items() if test.p_after < _FAILED]
+    if not before and not after:
+        return "white, Gaussian and even"
+    left = f"still {', '.join(after)}" if after else "nothing with the repaired model"
+    return f"fail {', '.join(before) or 'nothing'} before; {left}"
+
+
+def verdict(found: Diagnosis) -> str:
+    """One sentence."""
+    names = len(found.findings)
+    failed, ordinary = found.failed_checks, ordinary_left(found)
+    said = "" if ordinary is None else in_one_sentence(ordinary)
+    if found.undecided is not None:
+        return f"nothing can be told: {found.undecided}"
+    if not found.mismatch and said:
+        return (
+            f"nothing beyond the ordinary: what is left is {said}; it is there "
+            f"(p = {found.p_value:.1g} that nothing is)"
+        )
+    if not found.mismatch and failed:
+        return f"nothing was found, and yet they differ in: {', '.join(failed)} (see the checks)"
+    if not found.mismatch:
+        return "recording and model agree"
+    parts = []
+    if names:
+        parts.append(f"{names} effect{'s' if names > 1 else ''} left out")
+    if found.unexplained.detected:
+        parts.append("something that the library has no name for")
+    text = " and ".join(parts) or "recording and simulation differ (see the notes)"
+    rest = f"; what else is left is {said}" if said else ""
+    return f"MISMATCH: {text} (p = {found.p_value:.1g}){rest}"
+
+
+def headline(finding: Finding) -> str:
+    """What it is and how sure that is."""
+    return f"{finding.words or finding.effect} ({finding.effect}), {finding.confidence:.1%} sure"
+
+
+def _finding_lines(finding: Finding) -> list[str]:
+    held, cost = finding.heldout, finding.cost_if_left_out
+    out = [
+        f"   where      {place(finding.where)}",
+        *(
+            f"   {'size' if k == 0 else '':<10} {value_text(v)}"
+            for k, v in enumerate(finding.parameters)
+        ),
+        f"   read as    {read}" if (read := setting_text(finding.setting)) else "",
+        f"   left out   {finding.equation}" if finding.equation else "",
+    ]
+    if cost is not None:
+        out.append(
+            f"   without it hard iron off by {cost.hard_iron_shift_gauss * _MG:.2f} mG, heading by "
+            f"{cost.heading_error_deg:.2f} deg"
+        )
+    if held is not None:
+        out.append(
+            f"   held out   {held.nll_gain_per_sample:+.4f} nats/sample (moved in time: at most "
+            f"{held.placebo_gain:+.4f})"
+        )
+    if finding.priors is not None:
+        out.append(f"   assumed    {assumed(finding.priors)}")
+    if finding.alternatives:
+        rest = ", ".join(f"{a.effect} {a.confidence:.1%}" for a in finding.alternatives)
+        out.append(f"   or else    {rest}")
+    if finding.separate_from:
+        out.append(f"   to be sure {finding.separate_from}")
+    return [line for line in out if line]
+
+
+def assumed(one: OnPriors) -> str:
+    """`95 nats of odds (3 are asked), 94 at least with half or twice of what was assumed`."""
+    least = min(nats for each in one.assumed for nats in (each.half_nats, each.double_nats))
+    return (
+        f"{one.log_odds:.0f} nats of odds ({one.asked:.0f} are asked), {least:.0f} at least with "
+        "half or twice of what was assumed"
+    )
+
+
+def place(where: Where) -> str:
+    """When, on which axes, in which frame, under which condition."""
+    spans = ", ".join(f"{a:.1f}-{b:.1f} s" for a, b in where.intervals_s[:5])
+    more = f" and {len(where.intervals_s) - 5} more" if len(where.intervals_s) > 5 else ""
+    parts = [
+        spans + more or "whole recording",
+        f"axes {' '.join(where.axes)}" if where.axes else "",
+    ]
+    parts += [_FRAMES.get(where.frame, where.frame), where.regime or ""]
+    if where.band_hz is not None:
+        parts.append(f"{where.band_hz[0]:.3g}-{where.band_hz[1]:.3g} Hz")
+    return "; ".join(part for part in parts if part)
+
+
+def value_text(value: Value) -> str:
+    """`field_per_ampere_y = 1.30e-03 +- 4e-05 gauss/A`."""
+    return f"{value.name} = {value.value:.3g} +- {value.std:.1g} {value.unit}"
+
+
+def _unexplained_lines(left: Unexplained) -> list[str]:
+    out = [] if left.where is None else [f"   where      {place(left.where)}"]
+    if left.size is not None:
+        out.append(f"   size       {left.size:.3g} {left.unit}")
+    if left.ordinary is not None:
+        out += [f"   part       {text}" for text in size_lines(left.ordinary)]
+        out += [f"   yardstick  {left.ordinary.why}"] if left.ordinary.why else []
+    if left.single_source_share is not None and left.single_source_share > 0.8:
+        out.append(
+            f"   one source of fixed direction explains {left.single_source_share:.0%} of it"
+        )
+    out += [
+        f"   moves with {shown(one.channel)} (correlation {one.correlation:+.2f}, "
+        f"p = {one.p_value:.1g})"
+        for one in left.follows
+    ]
+    if left.priors is not None:
+        out.append(f"   assumed    {assumed(left.priors)}")
+    if left.heldout is not None:
+        out.append(
+            f"   held out   {left.heldout.nll_gain_per_sample:+.4f} nats/sample if drawn freely"
+        )
+    return out
+
+
+def _small(value: float, unit: str) -> str:
+    """`1.5 ms` for 0.0015 s, `0.3 mG/A` for 3e-4 gauss/A, `0.69 %` for 0.0069."""
+    first, *rest = unit.split("/")
+    spoken, factor = _SPOKEN_UNITS.get(first, (first, 1.0))
+    return f"{value * factor:.2g} {'/'.join([spoken, *rest])}"
+
+
+def sensitivity(limits: tuple[Limit, ...]) -> str:
+    """The smallest effects that would have been seen, one parameter an effect."""
+    seen: dict[str, str] = {}
+    for limit in limits:
+        if limit.smallest is not None and limit.effect not in seen:
+            seen[limit.effect] = f"{limit.effect} above {_small(limit.smallest, limit.unit)}"
+    texts = list(seen.values())
+    more = f", and {len(texts) - _LIMITS_SHOWN} more" if len(texts) > _LIMITS_SHOWN else ""
+    return ", ".join(texts[:_LIMITS_SHOWN]) + more
+
+
+def told_size(size: float, unit: str) -> str:
+    """`9.1 mG`, `620 mrad/s`: two digits."""
+    return f"{float(f'{1e3 * size:.2g}'):g} {'mG' if unit == 'gauss' else 'mrad/s'}"
+
+
+def limit_text(one: Component) -> str:
+    """`up to 72 mG`, or that none is."""
+    return f"up to {told_size(one.up_to, one.unit)}" if one.up_to > 0.0 else "none"
+
+
+def ordinary_left(found: Diagnosis) -> Ordinary | None:
+    """What is left and is ordinary; None where nothing is, or where it is unknown."""
+    left = found.unexplained
+    return left.ordinary if left.ordinary is not None and not left.detected else None
+
+
+def in_one_sentence(one: Ordinary) -> str:
+    """`ordinary for a real recording: 9.1 mG, 1.3 deg of heading (...)`."""
+    gyro = any(part.there and part.unit == "rad/s" for part in one.components)
+    more = f" and {told_size(one.gyro_rad_s, 'rad/s')} of the gyro" if gyro else ""
+    return (
+        f"ordinary for a real recording: {told_size(one.field_gauss, 'gauss')}, "
+        f"{one.heading_deg:.2g} deg of heading{more} (95 % of such recordings leave up to "
+        f"{told_size(one.field_up_to_gauss, 'gauss')}, {one.heading_up_to_deg:.2g} deg; "
+        f"{one.recordings} were measured)"
+    )
+
+
+def component_text(one: Component) -> str:
+    """`a field by attitude: 8.5 mG, 1.3 deg of heading, 130 nats (ordinary: up to 72 mG)`."""
+    heading = "" if one.heading_deg is None else f", {one.heading_deg:.2g} deg of heading"
+    return (
+        f"{one.words}: {told_size(one.size, one.unit)}{heading}, {one.evidence_nats:.0f} nats "
+        f"(ordinary: {limit_text(one)})"
+    )
+
+
+def size_lines(one: Ordinary) -> list[str]:
+    """The components that are there, the surest first; what all are together where none stands."""
+    there = [part for part in one.components if part.there]
+    if not there:
+        return [
+            f"{told_size(one.field_gauss, 'gauss')}, {one.heading_deg:.2g} deg of heading, of no "
+            "one component"
+        ]
+    return [component_text(part) for part in sorted(there, key=lambda part: -part.evidence_nats)]
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """Words of one part of a setting.
+
+    words: with {} for the value, times `times`
+    negative: the words where the value is below zero, with {} for its size
+    """
+
+    words: str
+    times: float = 1.0
+    negative: str = ""
+
+
+#: by key, in the order in which they are told
+TOLD: Mapping[str, Told] = {
+    "covariate": Told("by the column {}"),
+    "late_s": Told("logged {} s late", negative="logged {} s early"),
+    "mean_s": Told("each value the mean of {} s"),
+    "harmonic": Told("{} times a turn of the shaft"),
+    "off_hz": Told("{} Hz faster than the column", negative="{} Hz slower than the column"),
+    "frequency_hz": Told("seen at {} Hz"),
+    "mains_hz": Told("as mains of {} Hz would be"),
+    "period_s": Told("every {} s"),
+    "width_s": Told("for {} s"),
+    "hold_samples": Told("each reading held for {} samples"),
+    "time_constant_s": Told("time constant {} s"),
+    "radius_gauss": Told("half width of the loop {} mG", times=1e3),
+    "shape": Told("course: {}"),
+    "length_s": Told("lasts {} s"),
+    "length_m": Told("falls off within {} m"),
+    "distance_m": Told("its size is that of its field {} m away"),
+}
+
+#: what is not told, and why: it stands elsewhere in the answer, or nobody can act on it
+UNTOLD: Mapping[str, str] = {
+    "onset_s": "the finding's place says when",
+    "end_s": "the finding's place says when",
+    "start_s": "the first reading, or the zero of a phase",
+    "span_s": "the recording's length",
+    "phase_s": "of pulses: their first moment",
+    "phase": "the first sample of those that are held",
+    "turn_deg": "of a wave or a map: what it begins with",
+    "reference": "the value of the column at which nothing is added",
+    "reference_m": "the middle of the way",
+    "place_m": "of an object: in the recording's own metres",
+    "searched": "how many settings it was chosen of",
+    "memory": "what iron had from before the recording",
+    "relaxation_s": "one value for all",
+    "window_s": "one value for all",
+    "mean": "the ordinary shaking",
+    "straight_g": "the mean force, at which a mount was aligned",
+    "unit": "the column's value at which the coefficient counts",
+    "power": "in the equation",
+    "form": "which of the equation's forms",
+    "of": "which of the equation's forms",
+    "products": "which of the equation's forms",
+    "axes": "what the repaired model turns",
+    "signs": "what the repaired model turns",
+    "seed": "of a simulation",
+}
+
+
+def setting_text(setting: Mapping[str, Any]) -> str:
+    """`by the column motor_current_a; logged 0.25 s late`; empty where nothing is to be told."""
+    parts = []
+    for key, told in TOLD.items():
+        value = setting.get(key)
+        if not value:
+            continue
+        if isinstance(value, str):
+            parts.append(told.words.format(shown(value)))
+        elif isinstance(value, (list, tuple)):
+            parts.append(told.words.format(" or ".join(f"{one:.3g}" for one in value)))
+        elif value < 0 and told.negative:
+            parts.append(told.negative.format(f"{-value * told.times:.3g}"))
+        else:
+            parts.append(told.words.format(f"{value * told.times:.3g}"))
+    return "; ".join(parts)
+
+
+def separating_manoeuvre(library: Mapping[str, Effect], name: str, others: Sequence[str]) -> str:
+    """What to drive so that `name` and the likeliest of `others` come apart, in words."""
+    for other in others:
+        for one, two in ((name, other), (other, name)):
+            if one in library:
+                for confuser, words in library[one].confusers:
+                    if confuser == two:
+                        return words
+    return library[name].manoeuvre if name in library else ""

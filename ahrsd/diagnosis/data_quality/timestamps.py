@@ -1,0 +1,220 @@
+"""What the time stamps say: missing samples, jitter, clocks that disagree, clocks that jump.
+
+The steps of a good clock are multiples of one step.  Stamps that a host made of a regular stream
+scatter, and a late stamp makes one step longer and the next shorter: neighbouring steps are
+correlated by -1/2.  So are those of samples that were taken early and late and stamped well: there
+the field turns by the rate times the step as stamped, elsewhere by the rate times the usual step.
+
+A clock that jumps is no time that passed: breaks of a recording are made short (`without_jumps`).
+A host's clock that is set while it records, from 1970 to today, an hour on, two seconds back,
+leaves two stretches with decades between them or one on top of the other.  Everything that is cut
+by time (a drift, blocks, pieces of twenty seconds) would have nothing but the two, and grids that
+grow with the span no memory.  So no break is longer than a recording's own length, and time always
+goes on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.diagnosis.answer.diagnosis import Value, Where
+from ahrsd.diagnosis.data_quality.facts import Fact
+from ahrsd.diagnosis.track import Track
+from ahrsd.printable import counted
+from ahrsd.samples import Array, in_periods
+
+_MISSING_SHARE = 1e-3
+#: of the step, from which on scatter is jitter unless the field says that the steps are as stamped;
+#: below, only where the field says that they are even
+_JITTER = 0.03
+_PIECE = 30  # rows over which a host's clock is straight
+_OPPOSED = -0.25  # correlation of neighbouring steps
+_TRUE_NATS = 5.0  # for steps as stamped, against steps of a regular clock, or the reverse
+_OUTLIER = 5.0  # deviations
+_CLOCK = 2e-4  # relative rate between two clocks that is worth a word
+#: other clocks that a recording may carry
+CLOCKS = ("host_time_s", "host_s", "time_host_s", "device_time_s", "time_startup_s", "time_gps_s")
+#: a break that is believed whatever the recording's length, and what is left of one that is not
+BELIEVED_S, LEFT_S = 60.0, 10.0
+
+
+def stamps(track: Track) -> list[Fact]:
+    """Facts of the time column."""
+    return _backwards(track) + _missing(track) + _jitter(track) + _clocks(track)
+
+
+def _backwards(track: Track) -> list[Fact]:
+    steps = np.diff(track.time_s)
+    wrong = np.flatnonzero(~(steps > 0))
+    if not len(wrong):
+        return []
+    times = tuple((float(track.time_s[k]), float(track.time_s[k + 1])) for k in wrong[:50])
+    words = (
+        f"time does not increase at {counted(len(wrong), 'sample')}, first at row {wrong[0] + 1}"
+    )
+    value = float(np.max(np.abs(steps[wrong])))
+    parameters = (Value("jitter", value, 0.0, "s"),)
+    return [Fact("timestamp_jitter", words, Where(times, (), "link"), 0.9, parameters, stops=True)]
+
+
+def _missing(track: Track) -> list[Fact]:
+    """Steps that are whole multiples of the usual one."""
+    steps = np.diff(track.time_s)
+    if len(steps) < 50 or np.any(steps <= 0):
+        return []
+    periods = in_periods(steps)
+    if periods is None:
+        return []
+    whole = np.rint(periods)
+    long = (whole >= 2) & (np.abs(periods - whole) < 0.25 + 0.02 * whole)
+    lost = int(np.sum(whole[long] - 1))
+    share = lost / (lost + len(track))
+    if share < _MISSING_SHARE or np.count_nonzero(long) < 2:
+        return []
+    where = Where(
+        tuple((float(track.time_s[k]), float(track.time_s[k + 1])) for k in np.flatnonzero(long)),
+        (),
+        "link",
+    )
+    words = f"missing: {counted(lost, 'sample')} at {counted(int(np.count_nonzero(long)), 'place')}"
+    deviation = float(np.sqrt(share * (1 - share) / len(track)))
+    parameters = (Value("part", share, deviation, "1"),)
+    return [Fact("dropped_samples", words, where, 0.99, parameters)]
+
+
+def _jitter(track: Track) -> list[Fact]:
+    steps = track.dt_s[np.isfinite(track.dt_s)]
+    if len(steps) < 100:
+        return []
+    usual, jitter = _clock(track)
+    off = np.clip(steps - usual, -0.6 * usual, 0.6 * usual)
+    off = off - off.mean()
+    variance = float(np.mean(off**2))
+    if variance == 0.0:
+        return []
+    opposed = float(np.mean(off[1:] * off[:-1])) / variance
+    # scatter that is small for a clock is large beside a gyro that turns quickly
+    asked = -_TRUE_NATS if jitter < _JITTER * usual else _TRUE_NATS
+    if opposed > _OPPOSED or _stamped_well(track) > asked:
+        return []
+    where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), (), "link")
+    words = f"the time stamps scatter by {1e3 * jitter:.2g} ms about a regular clock"
+    deviation = jitter / float(np.sqrt(len(steps)))
+    parameters = (Value("jitter", jitter, deviation, "s"),)
+    return [Fact("timestamp_jitter", words, where, 0.99, parameters, {"step_s": usual})]
+
+
+def _clock(track: Track) -> tuple[float, float]:
+    """Step of the regular clock behind the stamps, and their usual scatter about it, seconds.
+
+    Over pieces of `_PIECE` rows, most of which have no sample missing: of stamps that come in
+    bunches the median step is that within a bunch.
+    """
+    runs = [track.time_s[run] for run in track.runs or (slice(0, len(track)),)]
+    length = min(_PIECE, max(map(len, runs)))
+    pieces = [time_s[: len(time_s) // length * length].reshape(-1, length) for time_s in runs]
+    stamps_s = np.concatenate(pieces)
+    stamps_s = stamps_s - stamps_s.mean(axis=1, keepdims=True)
+    index = np.arange(length) - (length - 1) / 2
+    step_s = stamps_s @ index / np.sum(index**2)
+    off = stamps_s - step_s[:, None] * index
+    scatter = np.sqrt(np.sum(off**2, axis=1) / max(length - 2, 1))
+    return float(np.median(step_s)), float(np.median(scatter))
+
+
+def _stamped_well(track: Track) -> float:
+    """Nats for the field's changes over steps as stamped, against steps of a regular clock.
+
+    A change is -A (w x h) dt, with h = C (m - b): linear in rate x reading, rate and reading, in
+    any units and axes.
+    """
+    stamped = track.dt_s
+    even = np.where(np.isnan(stamped), np.nan, np.diff(regular(track), prepend=np.nan))
+    change = np.diff(track.mag_b_gauss, axis=0, prepend=np.nan)
+    middle = track.mag_b_gauss - change / 2
+    rate = track.gyro_b_rad_s
+    both = (rate[:, :, None] * middle[:, None, :]).reshape(len(rate), 9)
+    known = np.isfinite(change).all(axis=1) & np.isfinite(stamped)
+    moved = np.concatenate([both, rate, middle], axis=1)[known]
+
+    def rest(step_s: Array) -> Array:
+        columns = moved * step_s[known, None]
+        fitted = np.linalg.lstsq(columns, change[known], rcond=None)[0]
+        return np.asarray(change[known] - columns @ fitted)
+
+    first, second = rest(stamped), rest(even)
+    size = np.maximum(np.abs(first), np.abs(second))
+    usual = 1.4826 * np.median(np.abs(first), axis=0)
+    quiet = (size <= _OUTLIER * usual).all(axis=1)
+    if np.count_nonzero(quiet) < 100:
+        return 0.0
+    # neighbouring differences share a reading: half of what they say is said twice
+    ratio = np.sum(second[quiet] ** 2, axis=0) / np.maximum(
+        np.sum(first[quiet] ** 2, axis=0), 1e-300
+    )
+    return float(np.count_nonzero(quiet) / 4 * np.sum(np.log(np.maximum(ratio, 1e-300))))
+
+
+def regular(track: Track) -> Array:
+    """(N,) stamps of the regular clock behind jittering ones: a line through each run."""
+    out = track.time_s.copy()
+    for run in track.runs or (slice(0, len(track)),):
+        mine = track.time_s[run]
+        if len(mine) > 20:
+            index = np.arange(len(mine), dtype=float)
+            out[run] = np.polynomial.polynomial.Polynomial.fit(index, mine, 1)(index)
+    return out
+
+
+def _clocks(track: Track) -> list[Fact]:
+    """The rate of the recording's clock against another one that it carries."""
+    out = []
+    for name in CLOCKS:
+        other = track.covariates.get(name)
+        if other is None or not np.isfinite(other).all() or np.ptp(other) <= 0:
+            continue
+        mine = track.time_s - track.time_s[0]
+        theirs = other - other[0]
+        slope = float(np.polyfit(mine, theirs, 1)[0])
+        if abs(slope - 1) > 0.1:
+            continue  # another unit or another meaning
+        rest = theirs - slope * mine
+        deviation = float(np.std(rest) / np.std(mine) / np.sqrt(len(mine) / 10))
+        error = slope - 1
+        if abs(error) < max(_CLOCK, 5 * deviation):
+            continue
+        words = (
+            f"time_s runs {1e6 * abs(error):.0f} ppm {'slow' if error > 0 else 'fast'} on {name}"
+        )
+        where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), (), "link")
+        parameters = (Value("rate_error", error, deviation, "1"),)
+        out.append(Fact("clock_rate", words, where, 0.95, parameters, {"clock": name}))
+    return out
+
+
+def without_jumps(track: Track) -> tuple[Track, tuple[str, ...]]:
+    """The track with the jumps of its clock closed, and a sentence on the first of them.
+
+    Rows stay as they are; the times behind a jump are moved.  Only where a run begins: a step back
+    within one is no break.
+    """
+    starts = np.array([run.start for run in track.runs[1:]], dtype=np.intp)
+    if not len(starts):
+        return track, ()
+    breaks_s = track.time_s[starts] - track.time_s[starts - 1]
+    passed_s = sum(float(track.time_s[r.stop - 1] - track.time_s[r.start]) for r in track.runs)
+    jumps = (breaks_s <= 0.0) | (breaks_s > max(BELIEVED_S, passed_s))
+    if not jumps.any():
+        return track, ()
+    moved = np.zeros(len(track))
+    moved[starts[jumps]] = LEFT_S - breaks_s[jumps]
+    first = int(np.argmax(jumps))
+    others = f" (and {np.count_nonzero(jumps) - 1} more)" if np.count_nonzero(jumps) > 1 else ""
+    at_s = float(track.time_s[starts[first] - 1])
+    words = (
+        f"the clock jumps by {breaks_s[first]:+.6g} s behind {at_s:.13g} s{others}: "
+        f"taken as a break of {LEFT_S:g} s; times behind it are told as if no more had passed"
+    )
+    return replace(track, time_s=track.time_s + np.cumsum(moved)), (words,)

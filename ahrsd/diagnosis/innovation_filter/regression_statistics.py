@@ -1,0 +1,150 @@
+"""Statistics of a regression on innovations: tail probabilities, scores, Bayes factors.
+
+Tail probabilities are special functions: importing scipy's statistics costs more time than a short
+recording's search for names.
+
+A score (`Score`) is that of one group of columns, everything else projected out.  In units of one
+prior deviation per parameter (theta = scale * phi) the projected information is diagonalised, G = V
+diag(l) V^T; directions that one prior deviation would not show (l < 1) are left out, so what is
+said has the degrees of freedom that the motion offers and no others.
+
+A Bayes factor (`log_bayes`) is against the calibration alone.  A group with information l_i and
+score s_i in its observable directions, in prior deviations, and prior N(0, k^2) has
+
+    log BF(k) = 1/2 sum_i s_i^2 / (l_i + k^-2) - 1/2 sum_i log(1 + k^2 l_i)
+
+averaged over the sizes k of `SIZES`: how large an effect is on a given vehicle is hardly known.
+The same field may be a hundredth of a usual coefficient per ampere (the motor draws fifty) and a
+third of one per turn of its shaft; the sizes reach far enough down that neither pays for its unit.
+The second sum is the price of a parameter, by which the one-parameter time lag beats nine
+eddy-current coefficients that contain it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from ahrsd.samples import Array
+
+#: Directions with less information than this share of the group's own are dropped: not observable.
+_RANK_SHARE = 1e-7
+SIZES = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
+
+
+def chi2_above(value: float, freedom: float) -> float:
+    """Probability that a chi-square of `freedom` is larger."""
+    return float(special.chdtrc(freedom, value))
+
+
+def chi2_below(value: float, freedom: float) -> float:
+    """Probability that a chi-square of `freedom` is smaller."""
+    return float(special.chdtr(freedom, value))
+
+
+def kolmogorov_above(value: float) -> float:
+    """Probability that Kolmogorov's distance, times the root of the number, is larger."""
+    return float(special.kolmogorov(value))
+
+
+def student_quantile(share: float, freedom: float) -> float:
+    """What a Student-t of `freedom` is below with this probability."""
+    return float(special.stdtrit(freedom, share))
+
+
+def student_log_density(values: Array, freedom: float) -> Array:
+    """Log density of a Student-t that is scaled to variance 1; freedom > 2."""
+    scale2 = freedom - 2.0
+    half = (freedom + 1) / 2
+    constant = special.gammaln(half) - special.gammaln(freedom / 2) - 0.5 * np.log(np.pi * scale2)
+    return np.asarray(constant - half * np.log1p(values**2 / scale2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Score:
+    """What the data say on one group; r observable directions of its p parameters.
+
+    basis:       (p, r) theta = basis @ z, z in prior deviations
+    information: (r,) of z;  score: (r,)
+    """
+
+    basis: Array
+    information: Array
+    score: Array
+
+    @property
+    def rank(self) -> int:
+        """Observable directions."""
+        return len(self.information)
+
+    @property
+    def value(self) -> Array:
+        """(p,) least-squares parameters, zero in unobservable directions."""
+        return np.asarray(self.basis @ (self.score / self.information))
+
+
+def total_score(G: Array, s: Array, information: Array, scale: Array) -> Score:
+    """The score of one group from its projected information (p, p) and score (p,).
+
+    information: (p,) before anything was projected out
+    """
+    whole = G * scale[:, None] * scale
+    values, vectors = np.linalg.eigh((whole + whole.T) / 2)
+    before = float(np.sum(information * scale**2))
+    kept = values > max(1.0, _RANK_SHARE * before)
+    V = vectors[:, kept]
+    return Score(scale[:, None] * V, values[kept], (s * scale) @ V)
+
+
+def solve(G: Array, right: Array) -> Array:
+    """G^+ right for a positive semi-definite G, columns scaled to one unit of information."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(G * scale[:, None] * scale)
+    kept = values > _RANK_SHARE * 1e-3 * len(values)
+    basis = vectors[:, kept]
+    inner = (basis.T @ (scale[:, None] * right)) / values[kept][:, None]
+    return np.asarray(scale[:, None] * (basis @ inner))
+
+
+def log_bayes(what: Score) -> float:
+    """Log Bayes factor of the group against its absence, nats."""
+    if what.rank == 0:
+        return 0.0
+    l, s = what.information, what.score  # noqa: E741
+    k2 = np.square(np.asarray(SIZES))[:, None]
+    terms = 0.5 * np.sum(s**2 / (l + 1.0 / k2), axis=1) - 0.5 * np.sum(np.log1p(k2 * l), axis=1)
+    return float(np.logaddexp.reduce(terms) - np.log(len(SIZES)))
+
+
+def posterior(
+    log_evidence: Mapping[str, float], log_prior: Mapping[str, float]
+) -> dict[str, float]:
+    """Probabilities of the hypotheses; they sum to 1.  A missing prior is log 1."""
+    names = list(log_evidence)
+    values = np.array([log_evidence[name] + log_prior.get(name, 0.0) for name in names])
+    share = np.exp(values - np.max(values, initial=-np.inf))
+    return dict(zip(names, (share / share.sum()).tolist(), strict=True))
+
+
+#: peaks of the smoothed spectrum below this are its own scatter
+CLEAR_PEAK = 1.35
+
+
+def spectral_peak(innovation: Array, rate_hz: float, reach_s: float = 3.0) -> float:
+    """Power of whitened innovations (N, 3) where their spectrum is strongest over white noise's.
+
+    Bartlett's spectrum over `reach_s`, averaged over the axes, at least 1: correlated noise of a
+    second or so counts in full, the slow and small traces of an effect near its limit hardly do.
+    The filter takes the slowest noise away, so the peak is seldom at zero frequency.
+    """
+    reach = min(max(1, round(reach_s * rate_hz)), len(innovation) // 4)
+    size = 1 << (len(innovation) + reach).bit_length()
+    spectrum = np.abs(np.fft.rfft(innovation - innovation.mean(axis=0), n=size, axis=0)) ** 2
+    lags = np.fft.irfft(spectrum.mean(axis=1), n=size)[: reach + 1] / len(innovation)
+    tapered = lags * (1.0 - np.arange(reach + 1) / (reach + 1))
+    density = np.fft.rfft(np.concatenate([tapered, tapered[:0:-1]])).real
+    peak = float(density.max())
+    return max(1.0, float(density[0]), peak if peak > CLEAR_PEAK else 1.0)

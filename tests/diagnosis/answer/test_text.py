@@ -1,0 +1,172 @@
+"""Words: what is left, ordinary or beyond that, and how an effect was read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_motion import moving
+
+from ahrsd.diagnosis.answer.diagnosis import (
+    Component,
+    Diagnosis,
+    Finding,
+    Ordinary,
+    Unexplained,
+    Where,
+)
+from ahrsd.diagnosis.answer.text import (
+    TOLD,
+    UNTOLD,
+    in_one_sentence,
+    lines,
+    ordinary_left,
+    setting_text,
+    size_lines,
+    verdict,
+)
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.report.diagnosis_page import write_diagnosis_report
+
+WHY = "beyond the ordinary: a field by attitude, 80 mG where up to 19 mG is ordinary"
+
+
+def part(name: str, words: str, size: float, there: bool = True) -> Component:
+    nats = 100.0 if there else 0.0
+    return Component(name, words, "sensor", size, 19e-3, "gauss", 100.0 * size, nats, there)
+
+
+def left(attitude: float, *, within: bool = True, there: bool = True) -> Ordinary:
+    """A field by attitude, and one of 10 mG by place."""
+    field = float(np.hypot(attitude, 10e-3))
+    return Ordinary(
+        within=within,
+        why=None if within else WHY,
+        field_gauss=field,
+        field_up_to_gauss=27e-3,
+        heading_deg=100.0 * field,
+        heading_up_to_deg=2.6,
+        gyro_rad_s=0.0,
+        gyro_up_to_rad_s=0.01,
+        recordings=20,
+        components=(
+            part("by_direction", "a field by attitude", attitude, there),
+            part("world_course", "a field by place", 10e-3, there),
+        ),
+    )
+
+
+def found(one: Ordinary, *findings: Finding) -> Diagnosis:
+    """A diagnosis that leaves this in the world."""
+    unknown = Unexplained(
+        detected=not one.within,
+        where=Where(((0.0, 100.0),), ("x", "y"), "world"),
+        size=0.03,
+        unit="gauss",
+        evidence_nats=120.0,
+        ordinary=one,
+    )
+    something = bool(findings) or unknown.detected
+    return Diagnosis("walk.csv", None, something, 1e-20, findings, unknown, {})
+
+
+def test_what_is_ordinary_is_no_mismatch_and_is_not_silent():
+    one = found(left(8e-3))
+    told = one.to_json()["unexplained"]
+    assert told["where"]["frame"] == "world"
+    assert told["evidence_nats"] == 120.0
+    assert told["ordinary"]["within"] is True
+    said = verdict(one)
+    assert "agree" not in said
+    assert said.startswith(
+        "nothing beyond the ordinary: what is left is ordinary for a real recording: 13 mG, "
+        "1.3 deg of heading (95 % of such recordings leave up to "
+    )
+    assert said.endswith("it is there (p = 1e-20 that nothing is)")
+    assert "left, and ordinary:" in lines(one)
+    assert "not in the library:" not in lines(one)
+
+
+def test_a_name_beside_what_is_ordinary_is_a_mismatch():
+    lag = Finding(
+        "mag_time_lag", 0.99, (), Where((), (), "link"), (), None, None, None, words="it is late"
+    )
+    one = found(left(8e-3), lag)
+    assert verdict(one).startswith("MISMATCH: 1 effect left out (p = 1e-20); what else is left is")
+    assert ordinary_left(one) is one.unexplained.ordinary
+
+
+def test_what_is_beyond_is_unknown_and_says_by_how_much():
+    one = found(left(80e-3, within=False))
+    assert ordinary_left(one) is None
+    said = "\n".join(lines(one))
+    assert "something that the library has no name for" in said
+    assert "part       a field by attitude: 80 mG, 8 deg of heading, 100 nats" in said
+    assert "yardstick  beyond the ordinary: a field by attitude, 80 mG where up to" in said
+
+
+def test_the_page_says_which_of_both_it_is(tmp_path):
+    page = tmp_path / "report.html"
+    write_diagnosis_report(page, found(left(8e-3)), "ahrsd diagnose walk.csv")
+    said = page.read_text(encoding="utf-8")
+    assert "Left, and ordinary" in said
+    assert "13 mG, 1.3 deg of heading" in said
+    assert "a field by attitude: 8 mG, 0.8 deg of heading, 100 nats (ordinary: up to " in said
+    assert "Unknown, here" not in said
+    write_diagnosis_report(page, found(left(80e-3, within=False)), "ahrsd diagnose walk.csv")
+    said = page.read_text(encoding="utf-8")
+    assert "Unknown, here" in said
+    assert WHY in said
+    assert "Left, and ordinary" not in said
+
+
+def test_what_no_component_holds_is_told_as_a_whole():
+    one = replace(left(0.0, there=False), field_gauss=3e-3, heading_deg=0.4)
+    assert size_lines(one) == ["3 mG, 0.4 deg of heading, of no one component"]
+    assert "3 mG, 0.4 deg of heading" in in_one_sentence(one)
+
+
+@pytest.mark.parametrize("name", list(EFFECTS))
+def test_each_part_of_a_setting_is_told_or_left_out_for_a_reason(name):
+    context, readings = moving(5)
+    settings = [*EFFECTS[name].settings(context), EFFECTS[name].example(readings, 1.0)[1]]
+    keys = {key for setting in settings for key in setting}
+    assert keys <= TOLD.keys() | UNTOLD.keys()
+    assert not TOLD.keys() & UNTOLD.keys()
+
+
+@pytest.mark.parametrize(
+    ("setting", "text"),
+    [
+        ({}, ""),
+        ({"onset_s": 12.5, "searched": 40}, ""),
+        (
+            {"covariate": "motor_current_a", "reference": 0.2, "late_s": 0.2375, "mean_s": 0.4},
+            "by the column motor_current_a; logged 0.237 s late; each value the mean of 0.4 s",
+        ),
+        (
+            {"late_s": -0.05, "covariate": "heater"},
+            "by the column heater; logged 0.05 s early",
+        ),
+        ({"covariate": "i_a", "late_s": 0.0, "mean_s": 0.0}, "by the column i_a"),
+        (
+            {"start_s": 3.0, "period_s": 2.0000012, "phase_s": 0.4, "width_s": 0.0612},
+            "every 2 s; for 0.0612 s",
+        ),
+        ({"radius_gauss": 0.0063, "memory": (0.0, 0.5, 0.0)}, "half width of the loop 6.3 mG"),
+        ({"time_constant_s": 1.2096}, "time constant 1.21 s"),
+        ({"frequency_hz": 10.0031, "mains_hz": []}, "seen at 10 Hz"),
+        (
+            {"frequency_hz": 10.0031, "mains_hz": [50.0, 60.0]},
+            "seen at 10 Hz; as mains of 50 or 60 Hz would be",
+        ),
+        ({"covariate": "rpm", "harmonic": 2, "off_hz": -0.012},
+         "by the column rpm; 2 times a turn of the shaft; 0.012 Hz slower than the column"),
+        ({"hold_samples": 4, "phase": 3}, "each reading held for 4 samples"),
+        ({"shape": "wave", "length_s": 40.0}, "course: wave; lasts 40 s"),
+        ({"covariate": "an\nodd name"}, "by the column an\\nodd name"),
+    ],
+)  # fmt: skip
+def test_the_words(setting, text):
+    assert setting_text(setting) == text

@@ -1,0 +1,13 @@
+"""A recording with nothing wrong, which the tests spoil."""
+
+from __future__ import annotations
+
+import pytest
+from tracks import experiment, track_of
+
+from ahrsd.diagnosis.track import Track
+
+
+@pytest.fixture(scope="module")
+def track() -> Track:
+    return track_of(experiment("mam", samples=6000, seed=3))

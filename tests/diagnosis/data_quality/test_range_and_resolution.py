@@ -1,0 +1,123 @@
+"""Limits and coarse steps of a sensor's numbers, and noise that has neither."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from told_facts import only, value
+
+from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
+from ahrsd.diagnosis.data_quality.preparation import facts_of, put_right
+from ahrsd.diagnosis.data_quality.range_and_resolution import clipping, quantisation, step_of
+from ahrsd.diagnosis.track import Track
+
+
+def test_a_limit_that_the_sensor_stays_near_for_long(track: Track) -> None:
+    """A slow and small motion leaves many readings just below the limit, each of another number."""
+    rng = np.random.default_rng(5)
+    mag = 0.3 + 0.02 * np.sin(0.02 * track.time_s)[:, None] * np.array([1.0, 0.6, -0.4])
+    mag += 5e-4 * rng.standard_normal(mag.shape)
+    slow = replace(track, mag_b_gauss=mag, gyro_b_rad_s=1e-4 * rng.standard_normal(mag.shape))
+    assert clipping(slow) == []
+    ends = mag.copy()
+    ends[:, 0] = np.minimum(mag[:, 0], np.quantile(mag[:, 0], 0.97))
+    (fact,) = clipping(replace(slow, mag_b_gauss=ends))
+    assert fact.effect == "mag_saturation"
+    assert value(fact) == ends[:, 0].max()
+    assert fact.where.axes == ("x",)
+    stuck = mag.copy()
+    at = int(np.argmax(mag[:, 0]))
+    stuck[at : at + 40] = mag[at]
+    assert clipping(replace(slow, mag_b_gauss=stuck)) == []
+
+
+def test_noise_that_is_added_behind_a_limit_hides_none_of_what_stands_there(track: Track) -> None:
+    """A sensor at its limit whose converter adds noise: some readings are well below the limit."""
+    rng = np.random.default_rng(6)
+    clean = np.clip(track.mag_b_gauss, -0.3, 0.3)
+    mag = np.clip(clean + 8e-4 * rng.standard_normal(clean.shape), -0.3, 0.3)
+    (fact,) = clipping(replace(track, mag_b_gauss=mag))
+    at_limit = (np.abs(clean) == 0.3).any(axis=1)
+    assert np.count_nonzero(at_limit) > 500
+    assert fact.bad is not None
+    assert fact.bad[at_limit].all()
+    assert not fact.bad[(np.abs(clean) < 0.28).all(axis=1)].any()
+
+
+def test_saturation_of_both_sensors(track: Track) -> None:
+    mag = np.clip(track.mag_b_gauss, -np.inf, 0.3)
+    fact = only(facts_of(replace(track, mag_b_gauss=mag)))
+    assert fact.effect == "mag_saturation"
+    assert value(fact) == 0.3
+    assert fact.bad is not None
+    assert fact.bad[(mag == 0.3).any(axis=1)].all()
+    assert not fact.bad[(np.abs(mag) < 0.29).all(axis=1)].any()
+    top = 0.7 * float(np.abs(track.gyro_b_rad_s).max())
+    fact = only(facts_of(replace(track, gyro_b_rad_s=np.clip(track.gyro_b_rad_s, -top, top))))
+    assert fact.effect == "gyro_saturation"
+    assert fact.turned is not None
+    clipped = np.max(np.abs(track.gyro_b_rad_s), axis=1) >= top
+    assert np.isnan(fact.turned[clipped]).all()
+    right = put_right(track, (fact,))
+    assert np.isnan(right.dt_s[clipped]).all()
+    assert sum(run.stop - run.start for run in right.runs) == len(track)
+    assert len(right.runs) > 2
+    assert value(fact) == top
+
+
+def test_coarse_steps(track: Track) -> None:
+    coarse = replace(track, mag_b_gauss=np.round(track.mag_b_gauss / 0.01) * 0.01)
+    fact = only(facts_of(coarse))  # neither a limit nor a stuck sensor, though readings repeat
+    assert fact.effect == "mag_quantisation"
+    assert abs(value(fact) / 0.01 - 1) < 1e-6
+    fine = replace(track, mag_b_gauss=np.round(track.mag_b_gauss / 1e-4) * 1e-4)
+    assert facts_of(fine) == ()
+
+
+def test_steps_so_coarse_that_most_seconds_show_no_change(track: Track) -> None:
+    turn = 0.01 * (track.time_s - track.time_s[0])
+    slow = 0.3 * np.column_stack([np.cos(turn), np.sin(turn), np.cos(turn + 1)])
+    slow += np.random.default_rng(6).normal(0, 5e-4, slow.shape)
+    coarse = replace(track, mag_b_gauss=np.round(slow / 0.02) * 0.02)
+    assert noise_of_differences(coarse)[0] == 0.0
+    [fact] = quantisation(coarse)
+    assert abs(value(fact) / 0.02 - 1) < 1e-6
+    # a sensor that stands for three seconds each has no change either, but then it jumps
+    stood = np.random.default_rng(7).integers(100, 200, (len(track) // 120 + 1, 3))
+    stuck = replace(track, mag_b_gauss=np.repeat(1e-3 * stood, 120, axis=0)[: len(track)])
+    assert noise_of_differences(stuck)[0] == 0.0
+    assert abs(step_of(stuck.mag_b_gauss[:, 1]) / 1e-3 - 1) < 1e-6
+    assert quantisation(stuck) == []
+
+
+def test_a_gyro_s_limit_near_its_noise(track: Track) -> None:
+    """Fine numbers repeat at a limit only."""
+    rate = 0.02 * np.sin(track.time_s)[:, None] * np.array([1.0, 0.5, 0.2])
+    noisy = rate + 0.005 * np.random.default_rng(4).standard_normal(rate.shape)
+    fact = only(clipping(replace(track, gyro_b_rad_s=np.clip(noisy, -0.024, 0.024))))
+    assert fact.effect == "gyro_saturation"
+    assert value(fact) == 0.024
+    assert clipping(replace(track, gyro_b_rad_s=noisy)) == []
+
+
+def test_a_limit_with_noise_behind_it(track: Track) -> None:
+    """No two readings are equal: two axes that end at one size tell it, one axis does not."""
+    rng = np.random.default_rng(5)
+    rate = track.gyro_b_rad_s
+    top = 0.6 * float(np.min(np.abs(rate).max(axis=0)))
+    noise = 3e-4 * rng.standard_normal(rate.shape)
+    bias = np.array([1e-3, -5e-4, 2e-4])
+    clipped = np.clip(rate, -top, top) + bias + noise
+    fact = only(clipping(replace(track, gyro_b_rad_s=clipped)))
+    assert fact.effect == "gyro_saturation"
+    assert value(fact) == pytest.approx(top, abs=2e-3)
+    assert fact.turned is not None
+    at_limit = np.any(np.abs(rate) > top, axis=1)
+    assert np.isnan(fact.turned[at_limit]).mean() > 0.99
+    assert np.isfinite(fact.turned[np.all(np.abs(rate) < 0.8 * top, axis=1)]).all()
+    # a vehicle that always turns at one rate, to either side
+    turning = rate + bias + noise
+    turning[:, 2] = np.clip(rate[:, 2], -top, top) + noise[:, 2]
+    assert clipping(replace(track, gyro_b_rad_s=turning)) == []
