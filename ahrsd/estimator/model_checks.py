@@ -184,10 +184,10 @@ def misalignment(
 
 _MODES = 3  # half waves over the window: slower than epochs are long
 _SIZES = np.exp(np.arange(-4.0, 3.0))  # times what is ordinary
-_SPREAD = 2.0  # of their logarithm: `diagnosis/one_model/priors.py`, 1.5 to 2.2
+_SPREAD = 2.0  # of their logarithm: `diagnosis/priors.py`, 1.5 to 2.2
 _SHOWN = 1e-6  # information of a direction over that of the best one: less is none
-_THERE = 1.0 / 20.0  # probability before the data; `diagnosis/one_model/priors.py: COURSE`
-_NAMED = 12.0  # nats; `diagnosis/one_model/priors.py: ODDS_REAL`: the laws are not exact
+_THERE = 1.0 / 20.0  # probability before the data; `diagnosis/priors.py: COURSE`
+_NAMED = 12.0  # nats; `diagnosis/priors.py: ODDS_REAL`: the laws are not exact
 _FOLLOWS = {"attitude": "the attitude", "rate": "the rate of turn", "time": "the time"}
 
 

@@ -71,7 +71,7 @@ ORDINARY = Surroundings(place_gauss=2e-3, coloured=1.0, knot_s=10.0)
 #: gauss, 1 sigma of each of six numbers: by how much the field differs with the heading, for where
 #: the sensor is goes with where it heads. Nothing in the open; where real recordings were made a
 #: field that differs by place is of 8 mG in the median and above 0.6 mG in 19 of 20
-#: (`diagnosis/one_model/priors.py: ORDINARY`). So that nothing was seen is no proof that
+#: (`diagnosis/priors.py: ORDINARY`). So that nothing was seen is no proof that
 #: nothing is
 PLACES = (1e-6, 1e-3, 5e-3, 2e-2)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
 from ahrsd.diagnosis.external_simulation import align, differing
-from ahrsd.diagnosis.one_model.diagnose import diagnose_logged
+from ahrsd.diagnosis.inference.diagnose import diagnose_logged
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, from_text
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.errors import AhrsdError, RecordingError

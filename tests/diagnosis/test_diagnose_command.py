@@ -132,7 +132,7 @@ def test_a_fit_without_an_end_is_one_line_for_a_person(run, saved, clean, capsys
     def diverging(*_, **__):
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
-    monkeypatch.setattr("ahrsd.diagnosis.one_model.diagnose.diagnose", diverging)
+    monkeypatch.setattr("ahrsd.diagnosis.inference.diagnose.diagnose", diverging)
     assert run("diagnose", str(saved(clean))) == 2
     told = capsys.readouterr().err
     assert "Eigenvalues" not in told

@@ -14,7 +14,7 @@ import pytest
 from scipy.signal import lfilter
 
 from ahrsd import so3
-from ahrsd.diagnosis.one_model.priors import ORDINARY
+from ahrsd.diagnosis.priors import ORDINARY
 from ahrsd.estimator.epoch import with_drift
 from ahrsd.estimator.online import (
     WHOLE,

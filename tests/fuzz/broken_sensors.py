@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ahrsd import so3
 from ahrsd.config.config import Config, core_settings
 from ahrsd.core.core import Core
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import NothingToFit, Track
 from ahrsd.inputs import RegistersKnown, Samples, Stop
 from ahrsd.offline.track import checked, track_of

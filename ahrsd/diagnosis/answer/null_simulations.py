@@ -56,8 +56,8 @@ from ahrsd.diagnosis.innovation_filter.innovation import (
     regressing,
     sensitivities,
 )
-from ahrsd.diagnosis.limits import LIMITS, Limits
 from ahrsd.diagnosis.model import Noise, NullModel
+from ahrsd.diagnosis.priors import LIMITS, Limits
 from ahrsd.diagnosis.repaired_model import forward
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array

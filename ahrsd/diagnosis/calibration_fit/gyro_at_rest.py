@@ -26,8 +26,8 @@ from ahrsd.diagnosis.innovation_filter.regression_statistics import (
     solve,
     total_score,
 )
-from ahrsd.diagnosis.limits import LIMITS
 from ahrsd.diagnosis.model import Context
+from ahrsd.diagnosis.priors import LIMITS
 from ahrsd.samples import Array
 
 #: 1 - |mean direction| of the field in the sensor: directions within about 5 degrees

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from ahrsd.__main__ import main as ahrsd
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 from ahrsd.offline.diagnose import load_track
 from ahrsd.report import diagnosis_page, figures

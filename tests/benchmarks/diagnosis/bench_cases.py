@@ -37,7 +37,7 @@ from blind_trials.making import make
 from blind_trials.sealing import read_object
 from generators.truths import KINDS, WORLDS, made
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose_logged
+from ahrsd.diagnosis.inference.diagnose import diagnose_logged
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.offline.diagnose import load_spec, load_track
 

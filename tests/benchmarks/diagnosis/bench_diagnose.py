@@ -21,7 +21,7 @@ sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 
 NOISES = ("white", "red", "heavy", "walk", "bursts")
 SCENARIOS = ("wam", "mam", "lam")

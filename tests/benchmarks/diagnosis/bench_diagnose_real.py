@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.where_and_when.locate import Located
 from ahrsd.offline.diagnose import load_track

@@ -24,7 +24,7 @@ sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.one_model import diagnose as engine
+from ahrsd.diagnosis.inference import diagnose as engine
 from ahrsd.diagnosis.track import Track
 from ahrsd.offline.diagnose import diagnose_recording
 from ahrsd.recording.table import write_table

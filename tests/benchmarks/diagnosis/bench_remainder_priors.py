@@ -1,4 +1,4 @@
-"""What untouched real recordings leave: the sizes of `ahrsd/diagnosis/one_model/priors.py`.
+"""What untouched real recordings leave: the sizes of `ahrsd/diagnosis/priors.py`.
 
     python tests/benchmarks/diagnosis/bench_remainder_priors.py --measured SIZES.json [--only WORD]
     python tests/benchmarks/diagnosis/bench_remainder_priors.py --table SIZES.json
@@ -26,16 +26,17 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.data_quality.preparation import prepared
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.one_model import priors, rich
-from ahrsd.diagnosis.one_model.candidates import beside
-from ahrsd.diagnosis.one_model.diagnose import begun, diagnose
-from ahrsd.diagnosis.one_model.effect_components import LAG
-from ahrsd.diagnosis.one_model.evidence import evaluated
-from ahrsd.diagnosis.one_model.members import size_of
-from ahrsd.diagnosis.one_model.search_space import space_at
+from ahrsd.diagnosis.inference.components.effect_components import LAG
+from ahrsd.diagnosis.inference.decision.members import size_of
+from ahrsd.diagnosis.inference.diagnose import begun, diagnose
+from ahrsd.diagnosis.inference.likelihood import richest_model
+from ahrsd.diagnosis.inference.likelihood.candidates import beside
+from ahrsd.diagnosis.inference.likelihood.evidence import evaluated
+from ahrsd.diagnosis.inference.search.search_space import space_at
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import RecordingError
 from ahrsd.offline.diagnose import load_track
@@ -65,11 +66,11 @@ def measured(path: Path) -> dict[str, Any]:
     """What a recording leaves: `profiles` of the remainder, `effects` that nobody put there."""
     track = prepared(load_track(path)[0]).put_right()
     problem, fit = begun(track, Spec())
-    found = rich.richest(problem, fit.filtered, EFFECTS)
+    found = richest_model.richest(problem, fit.filtered, EFFECTS)
     return {"profiles": profiles(found), "effects": sizes(found)}
 
 
-def profiles(found: rich.Judged) -> dict[str, list[list[float]]]:
+def profiles(found: richest_model.Judged) -> dict[str, list[list[float]]]:
     """Of each component: log sizes, log likelihood at each without the size's own prior."""
     made, remainder, keys, at = found.base.made, found.base.remainder, found.base.whole, found.at
     products = made.products(keys, priors.NOISE_STEP_REAL)
@@ -90,7 +91,7 @@ def profiles(found: rich.Judged) -> dict[str, list[list[float]]]:
     return out
 
 
-def sizes(found: rich.Judged) -> dict[str, list[float]]:
+def sizes(found: richest_model.Judged) -> dict[str, list[float]]:
     """Of each effect in its likeliest setting, and each course: size and nats that it gains."""
     all_sets, space = space_at(found, EFFECTS, ())
     base = all_sets.judge({*found.base.remainder, LAG})

@@ -9,7 +9,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import bench_diagnose_time
 
-from ahrsd.diagnosis.one_model import diagnose as engine
+from ahrsd.diagnosis.inference import diagnose as engine
 
 
 def test_every_phase_is_a_function_of_the_engine() -> None:

@@ -27,7 +27,7 @@ from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.offline.diagnose import load_track
 from ahrsd.samples import Array

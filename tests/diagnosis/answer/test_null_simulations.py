@@ -22,7 +22,7 @@ from ahrsd.diagnosis.answer.null_simulations import (
 from ahrsd.diagnosis.answer.text import verdict
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
-from ahrsd.diagnosis.limits import LIMITS
+from ahrsd.diagnosis.priors import LIMITS
 from ahrsd.diagnosis.repaired_model.forward import noise_of
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.simulation import Experiment

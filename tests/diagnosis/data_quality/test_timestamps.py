@@ -17,7 +17,7 @@ from ahrsd import so3
 from ahrsd.diagnosis.data_quality.facts import matters
 from ahrsd.diagnosis.data_quality.preparation import facts_of, put_right
 from ahrsd.diagnosis.data_quality.timestamps import LEFT_S, regular, stamps, without_jumps
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 

@@ -13,7 +13,7 @@ from tracks import experiment, track_of
 from ahrsd.diagnosis.answer.diagnosis import (
     Diagnosis,
 )
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 from ahrsd.simulation import Experiment
 from ahrsd.simulation.scenarios import columns

@@ -10,7 +10,7 @@ import pytest
 from tracks import experiment, recorded, track_of
 
 from ahrsd import so3
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 
 

@@ -9,7 +9,7 @@ import pytest
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.answer.text import lines, verdict
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.simulation import Experiment
 
 STEP_GAUSS = np.array([1.6e-3, -1.2e-3, 0.0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from mismatch_trials import Trial, made
 from scipy.ndimage import gaussian_filter1d
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose_logged
+from ahrsd.diagnosis.inference.diagnose import diagnose_logged
 
 RATE_HZ = 25.0
 FIELD_PER_M_S = np.array([9e-3, -6e-3, 4e-3])

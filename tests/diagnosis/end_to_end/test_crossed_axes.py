@@ -3,7 +3,7 @@
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
 @pytest.fixture(scope="module")

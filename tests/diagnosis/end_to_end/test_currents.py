@@ -10,8 +10,8 @@ from scipy.signal import lfilter
 from tracks import experiment, track_of, true_model
 
 from ahrsd.diagnosis.calibration_fit.resampling import thinned
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.model import Noise, Term
-from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.repaired_model.forward import simulated
 from ahrsd.diagnosis.repaired_model.injection import readings_of
 from ahrsd.diagnosis.track import Track
@@ -36,7 +36,7 @@ def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:
     )
 
 
-@pytest.mark.slow  # quick ones: one_model/test_one_model, test_turret
+@pytest.mark.slow  # quick ones: inference/test_one_model, test_turret
 @pytest.mark.parametrize("shape", ["quick square", "pulses", "square", "levels"])
 def test_an_unlogged_current_is_one_source_on_the_vehicle(shape: str) -> None:
     track = track_of(experiment("wam", seed=6, samples=3000))
@@ -180,7 +180,7 @@ def test_a_late_magnetometer_reads_a_current_late_and_no_change_of_it_is_named(s
         assert parameter.value == pytest.approx(truth, rel=0.02)
 
 
-@pytest.mark.slow  # a quick one: one_model/test_means
+@pytest.mark.slow  # a quick one: inference/test_means
 @pytest.mark.parametrize(("memory_s", "mean_s"), [(0.5, 0.4), (6.0, 0.2)])
 def test_a_current_that_is_logged_as_a_mean_has_its_field_and_no_field_of_its_change(
     memory_s: float, mean_s: float

@@ -9,7 +9,7 @@ import pytest
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.data_quality.stuck import dead
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 
 

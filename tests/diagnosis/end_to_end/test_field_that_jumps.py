@@ -9,7 +9,7 @@ import pytest
 from tracks import experiment, track_of, true_model
 
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 
 SAMPLES = 5000
 JUMP_GAUSS = 1e-3 * np.array([0.6, -0.5, 0.6])

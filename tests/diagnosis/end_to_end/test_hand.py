@@ -9,7 +9,7 @@ import pytest
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.calibration_fit.delay import delayed_gyro
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 
 MAGNET = np.array([0.07, -0.1, 0.5])

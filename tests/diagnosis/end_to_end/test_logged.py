@@ -9,7 +9,7 @@ import pytest
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.one_model.diagnose import diagnose_logged
+from ahrsd.diagnosis.inference.diagnose import diagnose_logged
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 

@@ -10,8 +10,8 @@ from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.model import Term
-from ahrsd.diagnosis.one_model.diagnose import diagnose
 from ahrsd.diagnosis.repaired_model.forward import contribution
 
 

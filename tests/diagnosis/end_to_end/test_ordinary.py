@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tracks import experiment, recorded, track_of
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 
 SAMPLES = 3000  # two minutes

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
 def test_wild_readings_are_no_object_and_no_step():

@@ -11,7 +11,7 @@ from mismatch_trials import Trial, made
 from ahrsd import so3
 from ahrsd.diagnosis.calibration_fit.gyro_at_rest import at_rest
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 
 RATE_HZ = 40.0

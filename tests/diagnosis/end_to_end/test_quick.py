@@ -13,7 +13,7 @@ from ahrsd.diagnosis.calibration_fit.resampling import working_factor
 from ahrsd.diagnosis.effects.effect import readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.effects.sensor_sources import train, trains
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Spec, Track
 
 RATE_HZ = 40.0

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 from ahrsd.recording.table import read_table
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 
 TIMES_S = np.array([21.0, 62.0, 85.5, 120.0, 171.0, 203.0])
 

@@ -11,7 +11,7 @@ from mismatch_trials import Trial, made
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.effects.effect import Readings, Setting, readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 
 

@@ -10,7 +10,7 @@ from odd_tracks import SIGMA_GYRO, SIGMA_MAG, shaking
 
 from ahrsd.diagnosis.calibration_fit.gyro_readings import shaken
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Spec
 
 

@@ -9,7 +9,7 @@ import pytest
 from mismatch_trials import Trial, made
 from scipy.signal import lfilter
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 
 

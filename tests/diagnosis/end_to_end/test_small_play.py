@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
 def play(values, radius):

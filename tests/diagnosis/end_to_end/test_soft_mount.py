@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 
 

@@ -10,7 +10,7 @@ from mismatch_trials import Trial, made
 from scipy.spatial.transform import Rotation
 
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 from ahrsd.simulation import simulate
 

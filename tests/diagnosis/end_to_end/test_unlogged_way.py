@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.simulation import simulate
 
 PLACES = ("position_north_m", "position_east_m", "position_down_m")

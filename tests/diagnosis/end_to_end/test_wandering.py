@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def test_a_bias_that_walks_a_lot_is_named_and_leaves_nothing(track):
     assert not found.unexplained.detected
 
 
-@pytest.mark.slow  # a walk that is named, quick: one_model/test_one_model
+@pytest.mark.slow  # a walk that is named, quick: inference/test_one_model
 @pytest.mark.parametrize(
     ("seed", "size"),
     [

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mismatch_trials import Trial, made
 
-from ahrsd.diagnosis.one_model.diagnose import diagnose
+from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
 def test_a_warm_up_that_nobody_logged_is_one_drift() -> None:

@@ -1,0 +1,206 @@
+"""The size of what a recording leaves, part by part, beside what such recordings ordinarily leave.
+
+A part of the ordinary remainder adds to the readings what its likeliest coefficients make of its
+columns; the deviation of that over the recording, less what another calibration would take of it,
+is its size.  What 95 % of untouched recordings stay below is told in the same motion: as many times
+its size as the limit of its coefficients is theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.answer.added_field import (
+    calibration_of,
+    deviation,
+    heading_off_deg,
+    less_calibration,
+)
+from ahrsd.diagnosis.answer.diagnosis import (
+    Component,
+    Ordinary,
+    Suspect,
+    Unexplained,
+)
+from ahrsd.diagnosis.answer.text import SIMULATED
+from ahrsd.diagnosis.inference.components.alternatives import (
+    BY_HEADING,
+    BY_RATE,
+    BY_TILT,
+    QUICK,
+    form_keys,
+)
+from ahrsd.diagnosis.inference.components.component import Fixed
+from ahrsd.diagnosis.inference.decision.decision import Answer
+from ahrsd.diagnosis.inference.decision.members import (
+    added_by,
+    coefficients,
+    size_of,
+)
+from ahrsd.diagnosis.inference.likelihood.candidates import beside
+from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
+from ahrsd.diagnosis.inference.search_rounds import Searched
+from ahrsd.diagnosis.where_and_when import locate
+from ahrsd.samples import Array
+
+_WORDS = {
+    "world_course": "a field that differs from time to time and place to place",
+    "gyro_course": "a course in time of the gyro",
+    "by_direction": "a field by attitude",
+    "by_change": "axes that are late by different times",
+    "field_by_rate": "a field by the rates",
+    "by_rate_squared": "an error of the gyro by the squares of its rates",
+    "gyro_matrix": "a crooked gyro with scales of its own",
+    "by_force": "an error of the gyro by force",
+    "bending": "a mount that gives",
+    BY_RATE: "a field by the rates",
+    BY_TILT: "a field by the tilt",
+    BY_HEADING: "a field by the heading",
+    QUICK: "a quick course in time on the sensor",
+}
+#: what has a course in time, by its frame
+_COURSES = {"sensor": "on the sensor", "world": "of the field outside", "gyro": "of the gyro"}
+#: of 95 % of a normal size
+_WITHIN = 1.96
+
+
+def told_sizes(
+    all_sets: Hypotheses, answer: Answer, left: Unexplained, nats: float, *, simulated: bool
+) -> Unexplained:
+    """What is left, with its sizes where the recording leaves what real ones do.
+
+    nats: by which it is likelier that it does;  simulated: then none of it is ordinary
+    """
+    best = answer.best
+    if not all_sets.is_real(best.names):
+        return left
+    if left.detected:
+        known = dict.fromkeys(_words(all_sets, best, key) for key in answer.unknown)
+        why = f"beyond what such recordings ordinarily leave: {', '.join(known)}"
+        sizes = left_sizes(all_sets, best, why, answer.unknown)
+        return replace(left, ordinary=sizes)
+    if simulated and nats > priors.UNKNOWN_ODDS:
+        sizes = left_sizes(all_sets, best, SIMULATED, ())
+        return replace(left, detected=True, ordinary=sizes, evidence_nats=nats)
+    return replace(left, ordinary=left_sizes(all_sets, best, None, ()), evidence_nats=nats)
+
+
+def left_sizes(
+    all_sets: Hypotheses, best: Hypothesis, why: str | None, keys: Sequence[str]
+) -> Ordinary:
+    """Everything that is left beside the names.
+
+    why: it is not ordinary, None where it is;  keys: of a course that is left besides
+    """
+    context = all_sets.made.context
+    take, nats = calibration_of(context), _nats(all_sets, best)
+    whole = {unit: np.zeros((len(context.track), 3)) for unit in ("gauss", "rad/s")}
+    parts = []
+    for key in (*all_sets.remainder, *(key for key in keys if key not in all_sets.remainder)):
+        added, unit = added_by(all_sets, best, key)
+        added = less_calibration(added, take) if unit == "gauss" else added
+        whole[unit] += added
+        size, frame = deviation(added), all_sets.component(key).frame
+        heading_deg = heading_off_deg(added, context) if unit == "gauss" else None
+        up_to = size * _to_limit(all_sets, best, key)
+        there = nats[key] > priors.ODDS_REAL
+        row = Component(
+            key,
+            _words(all_sets, best, key),
+            frame,
+            size,
+            up_to,
+            unit,
+            heading_deg,
+            nats[key],
+            there,
+        )
+        parts.append(row)
+    fields = [one for one in parts if one.unit == "gauss"]
+    headings = [(one.heading_deg or 0.0) * one.up_to / max(one.size, 1e-300) for one in fields]
+    return Ordinary(
+        within=why is None,
+        why=why,
+        field_gauss=deviation(whole["gauss"]),
+        field_up_to_gauss=_together([one.up_to for one in fields]),
+        heading_deg=heading_off_deg(whole["gauss"], context),
+        heading_up_to_deg=_together(headings),
+        gyro_rad_s=deviation(whole["rad/s"]),
+        gyro_up_to_rad_s=_together([one.up_to for one in parts if one.unit != "gauss"]),
+        recordings=priors.RECORDINGS,
+        components=tuple(parts),
+    )
+
+
+def _words(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
+    """What a part is, in words."""
+    one, effect = all_sets.component(key), key.split(maxsplit=1)[0]
+    if not best.names.isdisjoint(form_keys(key)):
+        return f"what {effect} stands in for"
+    if one.row is not None:
+        return f"one of the steps of a source that changes ({effect})"
+    words = _WORDS.get(key) or _WORDS.get(key.removeprefix("free "))
+    return words or f"a course in time {_COURSES[one.frame]}"
+
+
+def _together(limits: Sequence[float]) -> float:
+    """What parts that know nothing of each other are ordinarily at most together."""
+    return float(np.linalg.norm(limits))
+
+
+def _to_limit(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
+    """How many times as large a part is ordinarily at most; 0 of what is not ordinary."""
+    law = all_sets.component(key).law
+    if isinstance(law, Fixed):
+        value, _ = coefficients(all_sets, best, key)
+        return _WITHIN / max(float(np.sqrt(np.mean(value**2 / law.variance))), 1e-12)
+    if key not in priors.ORDINARY:
+        return 0.0
+    return priors.ORDINARY[key].up_to() / max(size_of(all_sets, best, key), 1e-12)
+
+
+def _nats(all_sets: Hypotheses, best: Hypothesis) -> dict[str, float]:
+    """By how much likelier the recording is with each member, sizes and noise as they are.
+
+    Of a Gaussian: the prior's density where the coefficients are nothing, to the posterior's.
+    """
+    scan = beside(all_sets.made, best.keys, best.at)
+    inverse = np.linalg.inv(scan.root)
+    covariance = inverse.T @ inverse
+    psi, out, begin = all_sets.psi_of(best), {}, 0
+    for key in best.keys:
+        one = all_sets.component(key)
+        mine = slice(begin, begin + one.width)
+        begin = mine.stop
+        mean, phi = best.at.mean[mine], one.law.log_variance(psi[key])
+        out[key] = _to_nothing(mean, covariance[mine, mine], phi)
+    return out
+
+
+def _to_nothing(mean: Array, covariance: Array, log_variance: Array) -> float:
+    scale = np.exp(-0.5 * log_variance)
+    shrunk = covariance * scale * scale[:, None]
+    _, log_det = np.linalg.slogdet(shrunk)
+    z = mean * scale
+    return 0.5 * float(z @ np.linalg.solve(shrunk, z) + log_det)
+
+
+def with_channels(
+    left: Unexplained, found: Searched, courses: Sequence[locate.Located]
+) -> Unexplained:
+    """What is left, with the logged columns that move with it."""
+    if left.where is None or not left.course:
+        return left
+    frame, track = left.where.frame, found.all_sets.made.context.track
+    like = [one for course in courses if course.frame == frame
+            for one in locate.matches(track, course)]  # fmt: skip
+    follows = tuple(
+        Suspect(one.channel, one.correlation, one.p_value)
+        for one in like
+        if one.p_value < priors.CHANCE and abs(one.correlation) > priors.ALIKE
+    )
+    return replace(left, follows=follows)

@@ -1,0 +1,82 @@
+"""What a report draws of an answer: innovations, what each name adds, what was not named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ahrsd.diagnosis.answer.diagnosis import Contribution, Drawn
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
+from ahrsd.diagnosis.inference.answer.visibility import Seen
+from ahrsd.diagnosis.inference.decision.decision import Answer
+from ahrsd.diagnosis.inference.decision.members import added_by, coefficients
+from ahrsd.diagnosis.inference.likelihood.linearisation import moved
+from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
+from ahrsd.diagnosis.inference.search_rounds import Searched
+from ahrsd.diagnosis.where_and_when.locate import FRAMES, Frame, Located, coarse_cut, single_source
+from ahrsd.samples import Array
+
+
+def drawn(
+    start: NullFit,
+    found: Searched,
+    residual: Array,
+    contributions: Sequence[Contribution],
+    courses: tuple[Located, ...],
+    alone: Sequence[Seen],
+) -> Drawn:
+    """The pictures' numbers.
+
+    start: the calibration alone;  found: of which all is taken out after
+    residual: (N, 3) what that leaves, white where the model is right
+    """
+    best = found.answer.best
+    after = moved(found.all_sets.made, best.keys, best.at).filtered
+    return Drawn(
+        after.track.time_s,
+        start.filtered.whitened,
+        residual,
+        start.filtered.innovation,
+        after.innovation,
+        tuple(contributions),
+        courses,
+        {one.row.identifier: one.nats for one in alone},
+    )
+
+
+def contributions(all_sets: Hypotheses, answer: Answer) -> list[Contribution]:
+    """What each term of an answer adds to the readings, in the terms' order."""
+    time_s = all_sets.made.context.track.time_s
+    return [
+        Contribution(term.identifier, time_s, *added_by(all_sets, answer.best, key))
+        for key, term in zip(answer.keys, answer.terms, strict=True)
+    ]
+
+
+def courses(all_sets: Hypotheses, best: Hypothesis) -> tuple[Located, ...]:
+    """The free course of each frame beside an answer, stretch by stretch."""
+    known = all_sets.made.seen
+    return tuple(_course(all_sets, best, f) for f in FRAMES if f"free {f}" in known)
+
+
+def _course(all_sets: Hypotheses, best: Hypothesis, frame: Frame) -> Located:
+    key, track = f"free {frame}", all_sets.made.context.track
+    there = key in best.names
+    with_it = best if there else all_sets.judge(best.names | {key}, best)
+    without = all_sets.judge(best.names - {key}, best) if there else best
+    value, unsure = (part.reshape(-1, 3) for part in coefficients(all_sets, with_it, key))
+    cut = coarse_cut(track)
+    phase = np.pi * (cut.middle_s - track.time_s[0]) / track.duration_s
+    waves = np.cos(phase[:, None] * np.arange(1, len(value) + 1))
+    course, deviation = waves @ value, np.sqrt(np.mean(waves**2 @ unsure**2, axis=1))
+    direction, _ = single_source(course, deviation)
+    nats = max(with_it.at.nats - without.at.nats, 0.0)
+    return Located(
+        frame=frame,
+        evidence=nats,
+        cut=cut,
+        course=course,
+        deviation=deviation,
+        direction=direction,
+    )

@@ -1,0 +1,76 @@
+"""The noise of the repaired model: what a recording scatters by beside its names alone.
+
+The repaired model is calibration, names and noise.  What real recordings ordinarily leave is in no
+name, so it is noise to it, and the law is found with nothing but names taken out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.answer.diagnosis import (
+    Finding,
+)
+from ahrsd.diagnosis.answer.predictive_checks import usual_noise
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
+from ahrsd.diagnosis.data_quality.facts import Fact, around, lost_at, rounding
+from ahrsd.diagnosis.effects.effect import Effect
+from ahrsd.diagnosis.inference.components.effect_components import LAG
+from ahrsd.diagnosis.inference.likelihood.linearisation import Point, added, by_key, moved
+from ahrsd.diagnosis.inference.recorded_rate import Quick, at_recorded_rate
+from ahrsd.diagnosis.inference.search_rounds import Searched
+from ahrsd.diagnosis.innovation_filter.noise import level_facts
+from ahrsd.diagnosis.model import Noise
+
+
+def repaired_noise(
+    found: Searched,
+    fast: Quick,
+    library: Mapping[str, Effect],
+    facts: Sequence[Fact],
+    loud: Sequence[tuple[float, float]],
+) -> Noise:
+    """The noise law of the recording's own rate.  loud: spans of another level, s."""
+    point, answer = fast.left, found.answer
+    if found.all_sets.is_real(answer.best.names):
+        point = at_recorded_rate(_with_names_alone(found))
+    done = point.filtered
+    fit = NullFit(done.model, done, True, np.zeros((11, 11)), point.terms_mag, point.terms_gyro)
+    # a delay is out of the track, and what only the recorded rate shows out of the recording
+    kept = [term for term in answer.terms if not library[term.identifier].delay]
+    return usual_noise(fit, loud, (*kept, *rounding(facts)), library)
+
+
+def _with_names_alone(found: Searched) -> Point:
+    """The point of an answer with nothing but its names taken out of the readings."""
+    all_sets, best = found.all_sets, found.answer.best
+    values = by_key(all_sets.made, best.keys, best.at)
+    names = {key: all_sets.component(key) for key in found.answer.keys if key != LAG}
+    count = len(all_sets.made.context.track)
+    mag, gyro = added(count, names, {key: values[key] for key in names})
+    point = moved(all_sets.made, best.keys, best.at)
+    return replace(point, terms_mag=mag, terms_gyro=gyro)
+
+
+def loud_facts(
+    found: Searched, fast: Quick, facts: Sequence[Fact], told: Sequence[Finding], *,
+    spec_given: bool,
+) -> list[Fact]:  # fmt: skip
+    """What is to be said of the noise's level.
+
+    Beside a real remainder it comes and goes, coarse numbers scatter by themselves, and where turns
+    were lost or something passed what that leaves is no noise.
+    """
+    if found.all_sets.is_real(found.answer.best.names) or rounding(facts):
+        return []
+    short = [
+        span for one in told if one.where.frame == "world" for span in one.where.intervals_s
+        if span[1] - span[0] < priors.PASSING_S
+    ]  # fmt: skip
+    moments = [*lost_at(facts), *short]
+    levels = level_facts(fast.left.filtered, spec_given=spec_given)
+    return [fact for fact in levels if not around(fact, moments)]

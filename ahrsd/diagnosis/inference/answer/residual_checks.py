@@ -1,0 +1,277 @@
+"""What of the residual is still unlike the model: whiteness, by time, attitude, rate and column.
+
+In the noise that the answer leaves, its residual is V^-1 y, y of variance V = 1 + X Phi X^T.
+Copies are drawn of that law with the residual's own tails and fitted as the recording was; each
+statistic, chosen before anything is looked at, has the band of its copies (`predictive_checks`).  A
+bin of a regime (heading, tilt, rate, a column) is asked for a field of its own, Z: its score
+Z^T V^-1 y has the variance Z^T V^-1 Z, so half of the square has three halves of a nat where
+nothing is left.
+
+Before is the calibration alone in the same noise: what was left out would else pass for noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, special
+from scipy.fft import idct
+
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.answer.diagnosis import Check, RegimeMap, Whiteness
+from ahrsd.diagnosis.answer.omnibus import omnibus
+from ahrsd.diagnosis.answer.predictive_checks import COPIES, bands, scene_of, statistics
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
+from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, Linearised, by_frequency
+from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
+from ahrsd.diagnosis.innovation_filter.innovation import batches, joined, sensitivities
+from ahrsd.diagnosis.innovation_filter.noise import freedom_of
+from ahrsd.diagnosis.model import Columns
+from ahrsd.diagnosis.where_and_when.regime import regime_columns, regimes
+from ahrsd.samples import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """The rows of an answer, and what is left of them (3 N,) by the calibration and by all."""
+
+    rows: WhiteRows
+    calibration: Fit
+    whole: Fit
+    before: Array
+    after: Array
+
+    @property
+    def whitened(self) -> Array:
+        """(rows of the track, 3) what is left by all of it, nothing where there is no reading."""
+        return self.rows.in_track(self.after.reshape(-1, 3))
+
+
+def residuals_of(rows: WhiteRows) -> Residuals:
+    """What is left of an answer's rows."""
+    y = rows.y.reshape(-1, 1)
+    few, whole = rows.fit(rows.made.seen[CALIBRATION].component.width), rows.fit()
+    return Residuals(rows, few, whole, few.left(y)[:, 0], whole.left(y)[:, 0])
+
+
+def checks(found: Residuals, maps: Sequence[RegimeMap]) -> dict[str, Check]:
+    """Each statistic of the residual beside its copies, and each regime's bin that stands out most.
+
+    Deterministic.
+    """
+    out = _stated(found)
+    for one in maps:
+        each = priors.BINS_OUTSIDE / (len(maps) * len(one.after))
+        limit = float(special.chdtri(3.0, each)) / 2.0
+        was, now = max(one.before), max(one.after)
+        out[f"by_{one.quantity}"] = Check(now, (0.0, limit), was <= limit, now <= limit)
+    return out
+
+
+def at_recorded_rate(slow: Mapping[str, Check], found: Residuals) -> dict[str, Check]:
+    """Checks of the working rate, and of the recorded one where that has them.
+
+    found: rows of the recorded rate, with all that the search found taken out: where the
+    calibration alone was beside its band already, it is.
+    """
+    fast = _stated(found)
+    return {
+        name: replace(fast[name], inside_before=fast[name].inside_before and one.inside_before)
+        if name in fast
+        else one
+        for name, one in slow.items()
+    }
+
+
+def _stated(found: Residuals) -> dict[str, Check]:
+    """Each statistic of the residual beside its copies."""
+    before, value, expected = _compared(found)
+    return {
+        name: Check(value[name], band, _inside(before[name], band), _inside(value[name], band))
+        for name, band in expected.items()
+    }
+
+
+def _compared(
+    found: Residuals,
+) -> tuple[dict[str, float], dict[str, float], dict[str, tuple[float, float]]]:
+    """Statistics before and after, and the bands of copies."""
+    rows = found.rows
+    scene, shape = scene_of(rows.made.context), (-1, 3)
+
+    def stated(left: Array) -> dict[str, float]:
+        return statistics(rows.in_track(left.reshape(shape)), scene)
+
+    rng = np.random.default_rng(0)
+    e = _drawn(rng, found, (len(found.after), COPIES))
+    w = rng.standard_normal((rows.X.shape[2], COPIES)) * found.whole.deviation[:, None]
+    copies = found.whole.left(e + found.whole.X @ w)
+    return stated(found.before), stated(found.after), bands([stated(one) for one in copies.T])
+
+
+def _drawn(rng: np.random.Generator, found: Residuals, shape: tuple[int, int]) -> Array:
+    """White noise of unit variance, its tails those of what is left."""
+    filtered = found.rows.made.point.filtered
+    freedom = freedom_of(replace(filtered, whitened=found.whitened))
+    e = rng.standard_normal(shape)
+    if np.isfinite(freedom):
+        e *= np.sqrt((freedom - 2.0) / rng.chisquare(freedom, shape))
+    return e
+
+
+def _inside(value: float, band: tuple[float, float]) -> bool:
+    return band[0] <= value <= band[1]
+
+
+def regime_maps(found: Residuals) -> tuple[RegimeMap, ...]:
+    """How much is left under which conditions, the strongest first."""
+    asked = regimes(found.rows.made.context)
+    if not asked:
+        return ()
+    Z = found.rows.passed([regime_columns(one) for one in asked])
+    Z = Z.reshape(-1, Z.shape[2])
+    before = _nats(Z, found.calibration, found.before)
+    after = _nats(Z, found.whole, found.after)
+    maps, begin = [], 0
+    for one in asked:
+        mine = slice(begin, begin + len(one.edges) - 1)
+        begin = mine.stop
+        edges = tuple(float(edge) for edge in one.edges)
+        maps.append(RegimeMap(one.quantity, edges, tuple(before[mine]), tuple(after[mine])))
+    return tuple(sorted(maps, key=lambda one: -max(one.before)))
+
+
+def _nats(Z: Array, fit: Fit, left: Array) -> list[float]:
+    """What each three columns in turn gain."""
+    score, information = Z.T @ left, fit.information(Z)
+    out = []
+    for at in range(0, len(score), 3):
+        s, G = score[at : at + 3], information[at : at + 3, at : at + 3]
+        out.append(0.5 * float(s @ np.linalg.lstsq(G, s, rcond=1e-9)[0]))
+    return out
+
+
+def whiteness(start: NullFit, found: Residuals) -> dict[str, Whiteness]:
+    """Tests that need no idea of what may be wrong, of the null and of what the answer leaves."""
+    context = found.rows.made.context
+    left = replace(found.rows.made.point.filtered, whitened=found.whitened)
+    later = {test.name: test.p_value for test in omnibus(left, context)}
+    return {
+        test.name: Whiteness(test.words, test.p_value, later.get(test.name, 1.0))
+        for test in omnibus(start.filtered, start.context())
+    }
+
+
+#: relative: columns that are alike but for rounding would else leave no root
+_ROUNDED = 1e-10
+#: columns that pass the filter together
+_BATCH = 96
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WhiteRows:
+    """Rows of the readings that are there, and of a set's columns, in the set's noise.
+
+    y (N, 3);  X (N, 3, q);  phi (q,): log variances of the coefficients
+    log_power: of the noise that was taken out, mean over the rows
+    rows:      of the track, numbers (N,) of those that are here
+    made, log_noise: of which and by which they were made
+    """
+
+    y: Array
+    X: Array
+    phi: Array
+    log_power: float
+    rows: NDArray[np.intp]
+    made: Linearised
+    log_noise: Array
+
+    def like(self, rows: Array) -> Array:
+        """Other rows by frequency (3 M, p) as (N, 3, p) here."""
+        return _in_time(self.made, rows, self.log_noise)[self.rows]
+
+    def passed(self, columns: Sequence[Columns]) -> Array:
+        """(N, 3, p) columns of any kind as the filter and this noise leave them."""
+        made, found = self.made, []
+        for batch in batches(columns, _BATCH):
+            cube = sensitivities(made.regressing, joined([columns[k] for k in batch]))
+            cube = by_frequency(cube / made.point.loud.amplitude[:, None, None])
+            found.append((batch, self.like(cube)))
+        cut = {
+            number: part
+            for batch, cube in found
+            for number, part in zip(batch, _cut(cube, [columns[k] for k in batch]), strict=True)
+        }
+        return np.concatenate([cut[k] for k in range(len(columns))], axis=2)
+
+    def in_track(self, values: Array) -> Array:
+        """(rows of the track, ...) with nothing where there is no reading."""
+        out = np.zeros((len(self.made.point.loud.amplitude), *values.shape[1:]))
+        out[self.rows] = values
+        return out
+
+    def fit(self, width: int | None = None) -> Fit:
+        """The likeliest coefficients of the first `width` columns, or of all."""
+        X = self.X.reshape(-1, self.X.shape[2])[:, :width]
+        deviation = np.exp(0.5 * self.phi[:width])
+        return Fit(X, deviation, root_of(X.T @ X, deviation))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """Columns (3 N, q) with their prior deviations; root: upper, of A = I + D X^T X D."""
+
+    X: Array
+    deviation: Array
+    root: Array
+
+    def left(self, values: Array) -> Array:
+        """(3 N, k) of values (3 N, k), the columns at their likeliest taken out."""
+        D = self.deviation[:, None]
+        w = D * linalg.cho_solve((self.root, False), D * (self.X.T @ values))
+        return np.asarray(values - self.X @ w)
+
+    def information(self, Z: Array) -> Array:
+        """(p, p) Z^T V^-1 Z of other columns (3 N, p), V with all that the fit's columns may be."""
+        seen = linalg.solve_triangular(
+            self.root, self.deviation[:, None] * (self.X.T @ Z), trans="T", check_finite=False
+        )
+        return np.asarray(Z.T @ Z - seen.T @ seen)
+
+
+def root_of(G: Array, deviation: Array) -> Array:
+    """Upper root of I + D G D."""
+    A = G * deviation * deviation[:, None]
+    diagonal = np.diag_indices_from(A)
+    A[diagonal] = A[diagonal] * (1.0 + _ROUNDED) + 1.0
+    return np.asarray(linalg.cholesky(A, check_finite=False))
+
+
+def white_rows(all_sets: Hypotheses, known: Hypothesis) -> WhiteRows:
+    """A set's rows in its own noise."""
+    made = all_sets.made
+    rows = np.concatenate([*(made.rows(key) for key in known.keys), made.y[:, None]], axis=1)
+    cube = _in_time(made, rows, known.at.log_noise)
+    seen = np.flatnonzero(made.point.filtered.used)
+    laws = [all_sets.component(key).law for key in known.keys]
+    psi = all_sets.psi_of(known)
+    phi = [law.log_variance(psi[key]) for key, law in zip(known.keys, laws, strict=True)]
+    count = np.diff(made.edges)
+    log_power = float(count @ known.at.log_noise) / float(count.sum())
+    y, X = cube[seen, :, -1], cube[seen, :, :-1]
+    return WhiteRows(y, X, np.concatenate(phi), log_power, seen, made, known.at.log_noise)
+
+
+def _in_time(made: Linearised, rows: Array, log_noise: Array) -> Array:
+    """(N, 3, p) of rows by frequency (3 M, p), the noise's powers taken out."""
+    scale = np.exp(-0.5 * np.repeat(log_noise, 3 * np.diff(made.edges)))
+    cube = (rows * scale[:, None]).reshape(-1, 3, rows.shape[1])
+    return np.asarray(idct(cube, axis=0, norm="ortho")[: len(made.point.loud.amplitude)])
+
+
+def _cut(cube: Array, columns: Sequence[Columns]) -> list[Array]:
+    edges = np.cumsum([one.width for one in columns])[:-1]
+    return np.split(cube, edges, axis=2)

@@ -1,0 +1,74 @@
+"""What a recording says of each effect of the library alone, beside what is known.
+
+Each in its likeliest setting: how much likelier the recording is with it, its sizes averaged, and
+the smallest coefficients that would have shown in this noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.answer.diagnosis import Limit
+from ahrsd.diagnosis.effects.effect import Effect
+from ahrsd.diagnosis.inference.likelihood.candidates import beside
+from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Names, Space
+from ahrsd.samples import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """One effect: nats of it, information (p, p) of its coefficients beside all that is known."""
+
+    row: Effect
+    nats: float
+    information: Array
+
+
+def seen_alone(all_sets: Hypotheses, space: Space, names: Names) -> list[Seen]:
+    """Every effect that could be asked, each in its likeliest setting, beside a set."""
+    base = all_sets.judge(names)
+    scan = beside(all_sets.made, base.keys, base.at)
+    asked = {
+        name: [key for key in keys if key not in base.names] for name, keys in space.effects.items()
+    }
+    if not any(asked.values()):
+        return []
+    worth = scan.worth([key for keys in asked.values() for key in keys])
+    best = [max(keys, key=lambda key: worth[key]) for keys in asked.values() if keys]
+    C, own, _ = all_sets.made.candidates(base.keys, best, scan.inverse)
+    W = scan.projected(C)
+    out, begin = [], 0
+    for key, square in zip(best, own, strict=True):
+        mine = slice(begin, begin + len(square))
+        begin = mine.stop
+        row = all_sets.component(key).row
+        if row is not None:
+            out.append(Seen(row, worth[key], square - W[:, mine].T @ W[:, mine]))
+    return out
+
+
+def limits(found: Sequence[Seen]) -> tuple[Limit, ...]:
+    """The smallest value of every parameter that would have shown; None where it cannot."""
+    out = []
+    for one in found:
+        scale = np.array([parameter.scale for parameter in one.row.parameters])
+        smallest, hidden = _smallest(one, scale)
+        for k, parameter in enumerate(one.row.parameters):
+            value = None if hidden[k] else float(smallest[k])
+            out.append(Limit(one.row.identifier, parameter.name, value, parameter.unit))
+    return tuple(out)
+
+
+def _smallest(one: Seen, scale: Array) -> tuple[Array, NDArray[np.bool]]:
+    """(p,) what would have shown, and which are mostly in directions that the motion hides."""
+    G = one.information * scale * scale[:, None]
+    values, vectors = np.linalg.eigh((G + G.T) / 2)
+    shown = values > one.row.least_information
+    deviation = np.sqrt(np.sum(vectors[:, shown] ** 2 / values[shown], axis=1))
+    hidden = np.sum(vectors[:, shown] ** 2, axis=1) < 0.5
+    return priors.SHOWN_AT * scale * deviation, hidden

@@ -1,0 +1,122 @@
+"""A course in time, in a frame, as a Gaussian process of cosines.
+
+    x(t) = sum_k w_k cos(pi k (t - t0) / T),    var w_k = size^2 c / (1 + (k / corner)^2)
+
+with c such that the variance over the recording is size^2.  With a corner of one half wave it is a
+walk, with a corner beyond all of them white.  The constant is left out: the calibration has it.
+Each axis of the frame has such a course of its own, all of one size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.inference.components.component import Component, in_frame, log_density, stiff
+from ahrsd.diagnosis.model import Context
+from ahrsd.diagnosis.where_and_when.locate import Frame
+from ahrsd.samples import Array
+
+#: half waves of a course: one in so many seconds, and from few to many
+MODE_S, FEWEST, MOST = 5.0, 16, 28
+#: the same of a quick one
+QUICK_S, MOST_QUICK = 1.5, 80
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CourseLaw:
+    """psi: logarithms of the size, in units of `unit`, and of the corner, in half waves.
+
+    order (q,): of each coefficient;  mean, spread: of the log size; spread 0: even;  most: units
+    corners: between which the corner is
+    """
+
+    order: Array
+    unit: float
+    mean: float = 0.0
+    spread: float = 0.0
+    most: float = priors.COURSE_SIZES[1]
+    corners: tuple[float, float] = priors.COURSE_CORNERS
+
+    @property
+    def start(self) -> Array:
+        """Where a search begins."""
+        return np.array([self.mean, np.log(4.0)])
+
+    @property
+    def low(self) -> Array:
+        """Lowest psi."""
+        return np.log([priors.COURSE_SIZES[0], self.corners[0]])
+
+    @property
+    def high(self) -> Array:
+        """Highest psi."""
+        return np.log([self.most, self.corners[1]])
+
+    @property
+    def stiffness(self) -> Array:
+        """(k,) curvature of minus the log density of psi."""
+        return np.array([stiff(self.spread), 0.0])
+
+    def _shape(self, psi: Array) -> tuple[Array, Array]:
+        """Log shape (q,) before it is scaled, and its slope in the log corner (q,)."""
+        ratio = (self.order * np.exp(-psi[1])) ** 2
+        return -np.log1p(ratio), 2.0 * ratio / (1.0 + ratio)
+
+    def log_variance(self, psi: Array) -> Array:
+        """(q,) logarithms."""
+        shape, _ = self._shape(psi)
+        axes = len(shape) / len(np.unique(self.order))
+        whole = np.log(np.sum(np.exp(shape)) / axes / 2.0)  # a cosine has half of its square
+        return np.asarray(2 * np.log(self.unit) + 2 * psi[0] + shape - whole)
+
+    def slope(self, psi: Array) -> Array:
+        """(q, k) of the log variances."""
+        shape, by_corner = self._shape(psi)
+        share = np.exp(shape) / np.sum(np.exp(shape))
+        return np.column_stack([np.full(len(shape), 2.0), by_corner - share @ by_corner])
+
+    def log_prior(self, psi: Array) -> tuple[float, Array]:
+        """Log density and gradient (k,)."""
+        low, high = self.low, self.high
+        size, slope = log_density(psi[0], self.mean, self.spread, low[0], high[0])
+        corner, flat = log_density(psi[1], 0.0, 0.0, low[1], high[1])
+        return size + corner, np.concatenate([slope, flat])
+
+
+def course(
+    context: Context,
+    frame: Frame,
+    ordinary: priors.Size | None = None,
+    like: Component | None = None,
+    quick: str | None = None,
+) -> Component:
+    """A course in one frame; of ordinary size where that is given, else of any.
+
+    like: one of the same frame, whose columns it takes;  quick: key of one with short waves too
+    """
+    waves = np.clip(context.track.duration_s / MODE_S, FEWEST, MOST)
+    if quick is not None:
+        waves = np.clip(context.track.duration_s / QUICK_S, FEWEST, MOST_QUICK)
+    order = np.arange(1, int(waves) + 1)
+    waves_of = partial(_cosines, context.track.time_s, order)
+    columns = in_frame(context, frame, waves_of, len(order)) if like is None else like.columns
+    unit = priors.COURSE_UNIT[frame]
+    law = CourseLaw(np.repeat(order, 3).astype(float), unit)
+    key = quick or f"free {frame}"
+    if ordinary is not None:
+        middle = float(np.log(ordinary.median / unit))
+        law = CourseLaw(law.order, unit, middle, ordinary.spread, ordinary.most / unit)
+        key = f"{frame}_course"
+    odds = 0.0 if ordinary is not None else float(np.log(priors.COURSE))
+    return Component(key, frame, columns, law, odds)
+
+
+def _cosines(time_s: Array, order: NDArray[np.int_]) -> Array:
+    """(N, k) half waves."""
+    phase = np.pi * (time_s - time_s[0]) / (time_s[-1] - time_s[0])
+    return np.asarray(np.cos(phase[:, None] * order))

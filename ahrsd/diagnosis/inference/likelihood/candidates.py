@@ -1,0 +1,96 @@
+"""Candidates beside a model that is factored once: what each is worth, its sizes averaged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.inference.components.component import Component
+from ahrsd.diagnosis.inference.likelihood.evidence import At
+from ahrsd.diagnosis.inference.likelihood.linearisation import Linearised
+from ahrsd.samples import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Beside:
+    """A model in its noise, beside which candidates are asked.
+
+    at: its coefficients and noise
+    root: lower, of the information of its coefficients with their prior;  seen: root^-1 s
+    """
+
+    made: Linearised
+    keys: Sequence[str]
+    at: At
+    inverse: Array
+    root: Array
+    seen: Array
+
+    def projected(self, products: Array) -> Array:
+        """(q, p) root^-1 times products of the model with candidates."""
+        return np.asarray(solve_triangular(self.root, products, lower=True, check_finite=False))
+
+    def in_quiet(self) -> Beside:
+        """The same in the sensor's own noise: what a candidate explains is noise still."""
+        noise = np.minimum(self.at.log_noise, self.at.log_noise[-1])
+        return beside(self.made, self.keys, replace(self.at, log_noise=noise))
+
+    def likeliest(self, one: Component) -> tuple[Array, Array]:
+        """(q,) coefficients of a candidate of the largest size, and their deviations."""
+        self.made.add([one])
+        C, own, s = self.made.candidates(self.keys, [one.key], self.inverse)
+        W = self.projected(C)
+        G = own[0] - W.T @ W
+        G[np.diag_indices_from(G)] += np.exp(-one.law.log_variance(one.law.high))
+        covariance = np.linalg.inv(G)
+        return covariance @ (s - self.seen @ W), np.sqrt(np.diagonal(covariance))
+
+    def worth(self, candidates: Sequence[str]) -> dict[str, float]:
+        """Log Bayes factor of each candidate, sizes averaged."""
+        C, own, s = self.made.candidates(self.keys, candidates, self.inverse)
+        W = self.projected(C)
+        left = s - self.seen @ W
+        out, begin = {}, 0
+        for key, square in zip(candidates, own, strict=True):
+            part = slice(begin, begin + len(square))
+            begin += len(square)
+            G = square - W[:, part].T @ W[:, part]
+            out[key] = averaged(G, left[part], self.made.seen[key].component)
+        return out
+
+
+def beside(made: Linearised, keys: Sequence[str], at: At) -> Beside:
+    """A model beside which candidates are asked."""
+    products = made.products(keys, priors.NOISE_STEP_REAL)
+    inverse = np.exp(-at.log_noise)
+    phi, begin = [], 0
+    for law in (made.seen[key].component.law for key in keys):
+        width = len(law.start)
+        phi.append(law.log_variance(at.psi[begin : begin + width]))
+        begin += width
+    A = np.tensordot(inverse, products.G, 1)
+    A[np.diag_indices_from(A)] += np.exp(-np.concatenate(phi))
+    root = cholesky(A, lower=True, check_finite=False)
+    seen = solve_triangular(root, inverse @ products.s, lower=True, check_finite=False)
+    return Beside(made, tuple(keys), at, inverse, root, seen)
+
+
+def averaged(G: Array, s: Array, component: Component) -> float:
+    """Log Bayes factor of a component with information G (p, p) and score s (p,)."""
+    variance = component.law.log_variance(np.zeros(len(component.law.start)))
+    deviation = np.exp(0.5 * variance)
+    scaled = G * deviation * deviation[:, None]
+    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
+    values = np.maximum(values, 0.0)
+    score = vectors.T @ (s * deviation)
+    k2 = (
+        np.square(np.array(priors.EFFECT_GRID))[:, None]
+        if len(component.law.start)
+        else np.ones((1, 1))
+    )
+    terms = 0.5 * np.sum(score**2 / (values + 1 / k2) - np.log1p(k2 * values), axis=1)
+    return float(np.logaddexp.reduce(terms) - np.log(len(k2)))

@@ -1,0 +1,301 @@
+"""The log marginal likelihood of a model, its gradient and curvature, and where it is largest.
+
+    y = B w + e,    w_j ~ N(0, Phi_j(psi)),    e in band b white of variance v_b
+
+With the bands' products G_b = B_b^T B_b, s_b = B_b^T y_b, y_b^T y_b and n_b rows, everything else
+is algebra of the size of B: with D = Phi^(1/2), G = sum_b G_b / v_b, s likewise, A = I + D G D and
+m = A^-1 D s,
+
+    2 L = -sum_b n_b log v_b - log |A| - sum_b y_b^T y_b / v_b + m^T D s - n log 2 pi
+
+    dL / d log phi_j = (m_j^2 - 1 + (A^-1)_jj) / 2
+    dL / d log v_b   = (r_b / v_b - n_b + tr(A^-1 D G_b D) / v_b) / 2
+
+with r_b the square of the band's residual.  The calibration is in B with its own wide prior, so
+this is a restricted likelihood.  Priors of psi and log v are added: what is maximised is their
+joint density, and every hypothesis is judged at its own maximum.
+
+A step to the maximum takes the average information (Gilmour, Thompson and Cullis 1995), half of
+Z^T P Z with Z the columns dV P y and P the projection of the restricted likelihood: the mean of
+observed and expected curvature, without a trace of a product.  With M = I - A^-1 and, of each band,
+t_b = A^-1 D B_b^T r_b / v_b it is
+
+    2 H(phi_i, phi_j) = m_i M_ij m_j,    2 H(v_b, phi_j) = t_bj m_j,
+    2 H(v_b, v_c) = |r_b|^2 / v_b where b = c, less (B_b^T r_b / v_b)^T D A^-1 D (B_c^T r_c / v_c)
+
+Where a variance is far too large m is nothing: its diagonal is at least the expected one.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from ahrsd.diagnosis.inference.components.component import Law
+from ahrsd.diagnosis.inference.likelihood import noise_model
+from ahrsd.samples import Array
+
+#: relative: columns that are alike but for rounding would else leave no root
+_ROUNDED = 1e-10
+#: a maximum is reached where a step would gain less, nats; steps; and the longest, of a logarithm
+_FLAT, _STEPS, _LONGEST = 0.02, 40, 2.0
+#: how many times what a step foretells the rest of a climb may gain
+_HOPED = 5.0
+#: parts of a step that are tried
+_PARTS = (1.0, 0.3, 0.1, 0.02)
+#: curvature of a logarithm that nothing tells of;  parts of the curvature's diagonal that are added
+#: to it until a step leads up
+_LOOSE, _DAMPED = 0.02, (0.0, 0.1, 1.0, 10.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Products:
+    """What the data say, band by band.
+
+    G (B, q, q), s (B, q), square (B,), rows (B,);  step: of the noise's spectrum (`noise_model`)
+    alone: numbers of bands that stand alone in it
+    """
+
+    G: Array
+    s: Array
+    square: Array
+    rows: Array
+    step: float
+    alone: slice | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class At:
+    """The model at one point of its hyperparameters.
+
+    nats: log likelihood and log priors;  gradient (k,), curvature (k, k): in (log v, psi)
+    mean, deviation: (q,) of the coefficients
+    """
+
+    nats: float
+    gradient: Array
+    curvature: Array
+    mean: Array
+    deviation: Array
+    log_noise: Array
+    psi: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Prior:
+    """The laws at one psi: log variances (q,), slopes (q, k), log density with slope, stiffness."""
+
+    phi: Array
+    slopes: Array
+    nats: float
+    gradient: Array
+    stiffness: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Noise:
+    """Of each band: expected square (B,), square of the likeliest residual (B,), B^T r (B, q)."""
+
+    expected: Array
+    square: Array
+    turned: Array
+
+
+def evaluated(products: Products, laws: Sequence[Law], log_noise: Array, psi: Array) -> At:
+    """The log marginal likelihood with its priors, at these hyperparameters."""
+    prior, inverse = _laws(laws, psi), np.exp(-log_noise)
+    deviation = np.exp(0.5 * prior.phi)
+    scaled = deviation * (inverse @ products.s)
+    found, log_det = _inverse(products, inverse, deviation)
+    m = found @ scaled
+    sure = 1.0 - np.diag(found)
+    by_phi = 0.5 * (m**2 - sure)
+    noise = _noise(products, found, m * deviation, deviation)
+    by_noise = 0.5 * (noise.expected * inverse - products.rows)
+    of_noise, slope_of_noise = noise_model.log_prior(log_noise, products.step, products.alone)
+    likelihood = 0.5 * (float(m @ scaled) - log_det)
+    likelihood -= 0.5 * float(
+        products.rows @ (log_noise + np.log(2 * np.pi)) + products.square @ inverse
+    )
+    return At(
+        likelihood + prior.nats + of_noise,
+        np.concatenate([by_noise + slope_of_noise, prior.slopes.T @ by_phi + prior.gradient]),
+        _curvature(products, prior, noise, found, m, inverse),
+        m * deviation,
+        deviation * np.sqrt(np.diag(found)),
+        log_noise,
+        psi,
+    )
+
+
+def _inverse(products: Products, inverse: Array, deviation: Array) -> tuple[Array, float]:
+    """A^-1 of A = I + D G D, and log |A|."""
+    A = (inverse @ products.G.reshape(len(inverse), -1)).reshape(products.G.shape[1:])
+    A *= deviation
+    A *= deviation[:, None]
+    diagonal = np.diag_indices_from(A)
+    A[diagonal] = A[diagonal] * (1.0 + _ROUNDED) + 1.0
+    root, broken = linalg.lapack.dpotrf(A.T, lower=0, overwrite_a=1, clean=1)
+    if broken:
+        raise np.linalg.LinAlgError("the columns of a model are alike to the last digit")
+    log_det = 2.0 * float(np.sum(np.log(np.diag(root))))
+    half, _ = linalg.lapack.dpotri(root, lower=0, overwrite_c=1)
+    own = np.diag(half).copy()
+    found = half + half.T
+    found[diagonal] = own
+    return np.asarray(found), log_det
+
+
+def _noise(products: Products, found: Array, mean: Array, deviation: Array) -> _Noise:
+    fitted = products.G @ mean
+    square = products.square - 2 * products.s @ mean + fitted @ mean
+    covariance = found * deviation
+    covariance *= deviation[:, None]
+    unsure = products.G.reshape(len(square), -1) @ covariance.ravel()
+    return _Noise(square + unsure, square, products.s - fitted)
+
+
+def _curvature(
+    products: Products, prior: _Prior, noise: _Noise, found: Array, m: Array, inverse: Array
+) -> Array:
+    """Average information of (log v, psi), its diagonal at least the expected, and the priors'."""
+    deviation, count = np.exp(0.5 * prior.phi), len(inverse)
+    turned = noise.turned * inverse[:, None] * deviation
+    seen = turned @ found
+    by_phi = prior.slopes * m[:, None]
+    unlike = -found
+    unlike[np.diag_indices_from(unlike)] += 1.0
+    H = np.zeros((count + by_phi.shape[1],) * 2)
+    H[:count, :count] = np.diag(noise.square * inverse) - seen @ turned.T
+    H[:count, count:] = seen @ by_phi
+    H[count:, :count] = H[:count, count:].T
+    H[count:, count:] = by_phi.T @ unlike @ by_phi
+    unsure = (noise.expected - noise.square) * inverse
+    expected = [
+        products.rows - unsure,
+        np.einsum("ik,ij,jk->k", prior.slopes, unlike**2, prior.slopes, optimize=True),
+    ]
+    own = np.diag_indices_from(H)
+    H[own] = np.maximum(H[own], np.concatenate(expected))
+    H *= 0.5
+    H[:count, :count] += noise_model.stiffness(count, products.step, products.alone)
+    H[own] += np.concatenate([np.zeros(count), prior.stiffness])
+    return H
+
+
+def _laws(laws: Sequence[Law], psi: Array) -> _Prior:
+    """The laws together."""
+    starts = np.cumsum([0, *(len(law.start) for law in laws)])
+    mine = [psi[a:b] for a, b in itertools.pairwise(starts)]
+    phi = [law.log_variance(one) for law, one in zip(laws, mine, strict=True)]
+    rows = np.cumsum([0, *(len(one) for one in phi)])
+    slopes = np.zeros((rows[-1], starts[-1]))
+    gradient, stiffness, nats = np.zeros(starts[-1]), np.zeros(starts[-1]), 0.0
+    for k, (law, one) in enumerate(zip(laws, mine, strict=True)):
+        own = slice(starts[k], starts[k + 1])
+        slopes[rows[k] : rows[k + 1], own] = law.slope(one)
+        density, gradient[own] = law.log_prior(one)
+        stiffness[own] = law.stiffness
+        nats += density
+    return _Prior(np.concatenate(phi), slopes, nats, gradient, stiffness)
+
+
+def maximised(products: Products, laws: Sequence[Law], start: tuple[Array, Array]) -> At:
+    """The likeliest hyperparameters, climbed to from a start (log noise, psi)."""
+    found = reached(products, laws, start, -np.inf)
+    if found is None:
+        raise ValueError("a climb that nothing ends has an end")
+    return found
+
+
+def reached(
+    products: Products,
+    laws: Sequence[Law],
+    start: tuple[Array, Array],
+    asked: float,
+    *,
+    small: Sequence[int] = (),
+) -> At | None:
+    """The same, None as soon as the climb will surely not reach so many nats.
+
+    Newton's steps with the average information, between the ends of what is allowed.
+    small: laws that begin at their smallest where that is likelier: of many coefficients that
+    nothing tells a size comes down by half a logarithm a step, and a climb looks as if it ended
+    """
+    count = len(products.rows)
+    low, high = noise_model.bounds(count)
+    low = np.concatenate([low, *(law.low for law in laws)])
+    high = np.concatenate([high, *(law.high for law in laws)])
+    x = np.clip(np.concatenate(start), low, high)
+    at = evaluated(products, laws, x[:count], x[count:])
+    if small:
+        first = np.cumsum([count, *(len(law.start) for law in laws)])
+        least = x.copy()
+        for k in small:
+            least[first[k] : first[k + 1]] = low[first[k] : first[k + 1]]
+        if (there := evaluated(products, laws, least[:count], least[count:])).nats > at.nats:
+            x, at = least, there
+    for _ in range(_STEPS):
+        step = _newton(at, x, low, high)
+        gain = 0.5 * float(at.gradient @ step)
+        if at.nats + _HOPED * max(gain, _FLAT) < asked:
+            return None
+        step *= min(1.0, _LONGEST / max(float(np.max(np.abs(step))), 1e-300))
+        if 0.5 * float(at.gradient @ step) < _FLAT:
+            break
+        for part in _PARTS:
+            new = np.clip(x + part * step, low, high)
+            found = evaluated(products, laws, new[:count], new[count:])
+            if found.nats > at.nats:
+                break
+        else:
+            break
+        x, at = new, found
+    return at
+
+
+def _newton(at: At, x: Array, low: Array, high: Array) -> Array:
+    """The step to the maximum of the quadratic that this point shows, inside of what is allowed.
+
+    Where a logarithm ends at what is allowed and hardly differs from another, as the size and the
+    corner of a course, what is left of the step may lead down: then a shorter one is taken.
+    """
+    step = np.zeros(len(x))
+    for damped in _DAMPED:
+        step = _bounded(at, x, low, high, damped)
+        if float(at.gradient @ step) >= 0.0:
+            break
+    return step
+
+
+def _bounded(at: At, x: Array, low: Array, high: Array, damped: float) -> Array:
+    """The step with so much of the curvature's diagonal added to it, end after end held."""
+    g = at.gradient
+    H = at.curvature + np.diag(_LOOSE + damped * np.diag(at.curvature))
+    step = np.zeros(len(x))
+    free = ~(((x <= low) & (g < 0.0)) | ((x >= high) & (g > 0.0)))
+    while np.any(free):
+        rest = g[free] - H[np.ix_(free, ~free)] @ step[~free]
+        step[free] = _solved(H[np.ix_(free, free)], rest)
+        inside = np.clip(step, low - x, high - x)
+        beyond = free & (inside != step)
+        step = inside
+        if not np.any(beyond):
+            break
+        free &= ~beyond
+    return step
+
+
+def _solved(H: Array, g: Array) -> Array:
+    """H^-1 g of a curvature, each hyperparameter in its own unit.
+
+    Beside something a thousand times louder than the noise some curvatures are 1e12 times others,
+    and unscaled the matrix is singular to rounding.
+    """
+    scale = 1.0 / np.sqrt(np.diag(H))
+    scaled = H * scale * scale[:, None]
+    return np.asarray(scale * linalg.solve(scaled, scale * g, assume_a="pos"))

@@ -1,0 +1,187 @@
+"""What only the recording's own rate shows: fields that alternate, rotors, pulses, single readings.
+
+Averaging to the working rate loses a field that changes many times a second, or folds it to another
+frequency.  So the recording as it came is filtered with the calibration and all that the search
+found, and the library's quick effects are searched there, by the same evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.answer.diagnosis import Unexplained
+from ahrsd.diagnosis.calibration_fit.delay import without_lag
+from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate
+from ahrsd.diagnosis.effects.effect import Effect
+from ahrsd.diagnosis.inference.components.component import Component
+from ahrsd.diagnosis.inference.components.effect_components import component, form_of
+from ahrsd.diagnosis.inference.decision import decision
+from ahrsd.diagnosis.inference.likelihood import noise_model, richest_model
+from ahrsd.diagnosis.inference.likelihood.linearisation import (
+    CALIBRATION,
+    Linearised,
+    Point,
+    added,
+    by_key,
+    linearised,
+    moved,
+    relevelled,
+)
+from ahrsd.diagnosis.inference.search.model_search import (
+    Hypotheses,
+    Hypothesis,
+    Names,
+    Space,
+    searched,
+)
+from ahrsd.diagnosis.innovation_filter.innovation import run_filter
+from ahrsd.diagnosis.where_and_when.narrow_band import loudest_band, of_band
+from ahrsd.samples import Array
+
+#: how often rows are weighed anew beside what was found
+LEVELLED = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quick:
+    """An answer at the recorded rate.
+
+    left: the recording with all that was found taken out;  all_sets, space: what was searched
+    hum: a band that no name explains and that stands out of the noise
+    slower: the problem of a search that begins anew without what was found, None where nothing was
+    """
+
+    answer: decision.Answer
+    left: Point
+    slower: Problem | None
+    all_sets: Hypotheses
+    space: Space
+    hum: Unexplained
+
+
+def quick(
+    made: Linearised,
+    best: Hypothesis,
+    library: Mapping[str, Effect],
+    *,
+    real: bool,
+    source_nats: float = 0.0,
+) -> Quick:
+    """The quick effects beside a set that was found at the working rate.
+
+    real: whether that set leaves what real recordings do: then a column has to tell, for a room has
+          alternating fields of its own
+    source_nats: evidence of a source in that set that switches
+    """
+    point = at_recorded_rate(moved(made, best.keys, best.at))
+    fast, all_sets, space, found = _searched(point, library, real=real)
+    for _ in range(LEVELLED if found.names else 0):  # rows far off for what is found are not now
+        point = relevelled(fast, found.keys, found.at)
+        fast, all_sets, space, found = _searched(point, library, real=real)
+    all_sets.unknown_nats = source_nats
+    answer = decision.decided(all_sets, space, found, library)
+    slower = None
+    if answer.findings:
+        slower = _without(point.problem, made.point.problem, fast, answer.best)
+    return Quick(answer, point, slower, all_sets, space, _hum(fast, answer.best))
+
+
+def _searched(
+    point: Point, library: Mapping[str, Effect], *, real: bool
+) -> tuple[Linearised, Hypotheses, Space, Hypothesis]:
+    """The likeliest set of quick effects at a point.
+
+    Where a band stands out it may be noise as well: what was found without that has to be likelier
+    than a band of any power.
+    """
+    plain = linearised(point, point.context)
+    first = _searched_in(plain, library, (), real=real)
+    if real:
+        return first
+    known = first[1].judge(frozenset())
+    rate_hz = point.problem.rate_hz
+    highest_hz = 0.5 * rate_hz * float(np.mean(point.filtered.used))  # readings that repeat
+    band = loudest_band(plain.left_by(known.keys, known.at), rate_hz, highest_hz)
+    if band is None:
+        return first
+    beside = linearised(point, point.context, band[:2])
+    return _searched_in(beside, library, [first[3].names], real=real)
+
+
+def _searched_in(
+    fast: Linearised, library: Mapping[str, Effect], starts: Sequence[Names], *, real: bool
+) -> tuple[Linearised, Hypotheses, Space, Hypothesis]:
+    """The likeliest set in one form of the noise.  starts: sets beside the empty one."""
+    candidates: dict[str, list[str]] = {}
+    forms: dict[str, Component] = {}
+    for name, effect in library.items():
+        settings = effect.settings(fast.context) if effect.quick else ()
+        settings = tuple(one for one in settings if "covariate" in one or not real)
+        parts = [component(fast.context, effect, one, len(settings)) for one in settings]
+        unlogged = [one for one in parts if "covariate" not in one.setting]
+        left = [(one.key, form_of(one, fast.context, library)) for one in unlogged]
+        forms |= {key: form for key, form in left if form is not None}
+        fast.add(parts)
+        if parts:
+            candidates[name] = [one.key for one in parts]
+    step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN
+    noise = richest_model.fitted(fast, (CALIBRATION,), step).log_noise
+    fast.add(list(forms.values()))
+    known = {key: form.key for key, form in forms.items()}
+    all_sets = Hypotheses(fast, (), noise, {}, known, real=real)
+    space = Space(
+        candidates, (), lambda *_: [], lambda *_: [], lambda _: None, lambda _: [], lambda *_: []
+    )
+    return fast, all_sets, space, searched(all_sets, space, [frozenset(), *starts])[0]
+
+
+def _hum(fast: Linearised, best: Hypothesis) -> Unexplained:
+    """The band of the noise that stands alone, where what was found leaves it loud."""
+    alone = fast.alone
+    if alone is None:
+        return Unexplained(False)
+    log_noise = best.at.log_noise
+    sides = [k for k in (alone.start - 1, alone.stop) if 0 <= k < len(log_noise)]
+    beside = float(max(log_noise[k] for k in sides))
+    ratio = np.exp(log_noise[alone] - beside)
+    rows = 1.5 * np.diff(fast.edges)[alone]
+    nats = float(np.sum(rows * (ratio - 1.0 - np.log(ratio))))
+    if np.max(ratio) < priors.STANDS_OUT or nats < priors.UNKNOWN_ODDS:
+        return Unexplained(False)
+    low, high = float(fast.edges[alone.start]), float(fast.edges[alone.stop])
+    rate_hz, count = fast.point.problem.rate_hz, int(fast.edges[-1])
+    level = replace(best.at, log_noise=np.full(len(log_noise), beside))
+    left = fast.left_by(best.keys, level)
+    band_hz = (rate_hz * low / (2 * count), rate_hz * high / (2 * count))
+    return of_band(fast.context, left, rate_hz, band_hz, nats)
+
+
+def at_recorded_rate(slow: Point) -> Point:
+    """A point at the recording's own rate: all that is taken out is drawn between working rows."""
+    problem = slow.problem
+    track = without_lag(problem.recorded, problem.lag_s, instants=problem.instants)
+    at_s, time_s = slow.filtered.track.time_s, track.time_s
+
+    def drawn(values: Array | None) -> Array | None:
+        if values is None:
+            return None
+        return np.column_stack([np.interp(time_s, at_s, column) for column in values.T])
+
+    mag, gyro = drawn(slow.terms_mag), drawn(slow.terms_gyro)
+    filtered = run_filter(track, model_at_rate(slow.filtered.model, problem), mag, gyro)
+    fast = replace(problem, track=track, thin=1, averaged=1.0)
+    loud = noise_model.loudness(filtered.whitened, filtered.used, fast.rate_hz)
+    return Point(fast, filtered, {}, mag, gyro, loud)
+
+
+def _without(fast: Problem, slow: Problem, made: Linearised, best: Hypothesis) -> Problem:
+    """The problem of the working rate, without what was found at the recorded one."""
+    values = {key: v for key, v in by_key(made, best.keys, best.at).items() if key in best.names}
+    known = {key: made.seen[key].component for key in values}
+    mag, _ = added(len(fast.track), known, values)
+    recorded = replace(slow.recorded, mag_b_gauss=slow.recorded.mag_b_gauss - mag)
+    return replace(slow, recorded=recorded, instants=False).lagging(0.0)

@@ -1,0 +1,1 @@
+"""The likeliest set of components, and what may be put into one."""

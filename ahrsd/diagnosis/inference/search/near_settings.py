@@ -1,0 +1,77 @@
+"""What is linear in an effect's setting, near where it is: onset, scale, lateness, memory.
+
+    columns(s + d) w = columns(s) w + sum_i d_i (d columns / d s_i) w
+
+A setting is chosen and not averaged over, and coefficients are known to what it leaves open as
+well: those of a course that begins earlier are smaller.  With the slopes beside it as columns of
+their own each coefficient has the deviation that it has whatever the setting is nearby.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ahrsd.diagnosis.effects.effect import ANGLES, SCALES, Setting
+from ahrsd.diagnosis.inference.components.component import MOMENTS, Component, Fixed
+from ahrsd.diagnosis.model import Columns, Context
+from ahrsd.samples import Array
+
+#: changes of which slopes are made: part of the recording, part of a scale, degrees, s, part of
+#: what may be remembered
+_ONSET, _SCALE, _TURN_DEG, _LATE_S, _MEMORY = 1 / 2000, 0.02, 1.0, 0.02, 0.01
+#: of each, how far it may be off in such changes
+_FAR = 25.0
+
+
+def changed(one: Component, context: Context) -> dict[str, Setting]:
+    """The setting with each of its numbers changed a little."""
+    setting, out = one.setting, dict[str, Setting]()
+    for name in MOMENTS:
+        if setting.get(name) is not None:
+            at_s = float(setting[name]) + _ONSET * context.track.duration_s
+            out[name] = {**setting, name: at_s}
+    for name in SCALES:
+        if name in setting:
+            out[name] = {**setting, name: float(setting[name]) * (1.0 + _SCALE)}
+    for name in ANGLES:
+        if name in setting:
+            out[name] = {**setting, name: float(setting[name]) + _TURN_DEG}
+    if "late_s" in setting:
+        out["late_s"] = {**setting, "late_s": float(setting["late_s"]) + _LATE_S}
+    if one.row is not None and one.row.remembers:
+        memory = np.array(setting.get("memory", (0.0, 0.0, 0.0)))
+        for axis, part in enumerate(_MEMORY * one.row.remembers * np.eye(3)):
+            out[f"memory {axis}"] = {**setting, "memory": tuple((memory + part).tolist())}
+    return out
+
+
+def opened(
+    one: Component, context: Context, value: Array, nearby: Mapping[str, Setting]
+) -> Component | None:
+    """A component of the library with its slopes at these coefficients behind its own columns.
+
+    Coefficients of slopes are in changes of `nearby`; None where it has nothing to change.
+    """
+    if one.row is None or not nearby:
+        return None
+    found = [one.row.columns(context, setting) for setting in nearby.values()]
+    here = one.row.columns(context, one.setting)
+    mag = _with_slopes(one.columns.mag, here.mag, [each.mag for each in found], value)
+    gyro = _with_slopes(one.columns.gyro, here.gyro, [each.gyro for each in found], value)
+    largest = one.law.log_variance(one.law.high)
+    law = Fixed(np.concatenate([np.exp(largest), np.full(len(nearby), _FAR**2)]))
+    key = f"{one.key}, open in {', '.join(nearby)} at {np.array2string(value, precision=6)}"
+    return replace(one, key=key, columns=Columns(mag, gyro), law=law)
+
+
+def _with_slopes(
+    own: Array | None, here: Array | None, there: list[Array | None], value: Array
+) -> Array | None:
+    """(N, 3, p + k) columns of one sensor and what they change by."""
+    if own is None or here is None:
+        return None
+    slopes = [(each - here) @ value for each in there if each is not None]
+    return np.concatenate([own, np.stack(slopes, axis=2)], axis=2)

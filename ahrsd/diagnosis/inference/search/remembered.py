@@ -1,0 +1,45 @@
+"""What iron has from before the recording, along each axis, sought beside a model.
+
+The middle of a play operator, or what is behind by when the recording begins (setting `memory`), is
+no coefficient: it is in the columns.  Near where it is sought its change is linear, and the
+likeliest change beside the coefficients is one step; where it is not (a play that has met its end)
+each axis is moved by itself.  All of it in the sensor's own noise: what is not yet explained is
+noise still.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ahrsd.diagnosis.effects.effect import Setting
+from ahrsd.diagnosis.inference.components.component import Component
+from ahrsd.diagnosis.inference.likelihood.candidates import Beside
+from ahrsd.diagnosis.inference.search.near_settings import changed, opened
+from ahrsd.samples import Array
+
+#: digits to which it is sought, of what may be remembered
+_DIGITS = 3
+
+
+def remembered(scan: Beside, one: Component, round_: int) -> list[Setting]:
+    """Settings of an effect with another memory, nearer by the round; none where it has none."""
+    row = one.row
+    if row is None or not row.remembers:
+        return []
+    most, memory = row.remembers, np.array(one.setting.get("memory", (0.0, 0.0, 0.0)))
+    moved = memory + np.vstack([np.eye(3), -np.eye(3)]) * most / 2**round_
+    found = np.clip(np.vstack([moved, memory + _step(scan, one, memory)]), -most, most)
+    found = np.round(found / most, _DIGITS) * most
+    kept = {tuple(each) for each in found.tolist()} - {tuple(memory.tolist())}
+    return [{**one.setting, "memory": each} for each in sorted(kept)]
+
+
+def _step(scan: Beside, one: Component, memory: Array) -> Array:
+    """(3,) to the likeliest memory as it is seen from here."""
+    context = scan.made.context
+    nearby = {k: each for k, each in changed(one, context).items() if k.startswith("memory")}
+    whole = opened(one, context, scan.likeliest(one)[0], nearby)
+    if whole is None:
+        return np.zeros(3)
+    parts = np.array([each["memory"] for each in nearby.values()]) - memory
+    return np.asarray(scan.likeliest(whole)[0][-len(nearby) :] @ parts)

@@ -1,0 +1,162 @@
+"""What a search at one point may choose from: the library's settings there, courses, forms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+from ahrsd.diagnosis.effects.effect import Effect, Setting
+from ahrsd.diagnosis.inference.components.component import Component
+from ahrsd.diagnosis.inference.components.effect_components import (
+    LAG,
+    LAG_FORM,
+    beside_key,
+    beyond,
+    component,
+    form_of,
+    holds,
+    library_components,
+    neighbours,
+    while_there,
+)
+from ahrsd.diagnosis.inference.likelihood.candidates import Beside
+from ahrsd.diagnosis.inference.likelihood.linearisation import Linearised
+from ahrsd.diagnosis.inference.likelihood.richest_model import Judged, psi_by_key
+from ahrsd.diagnosis.inference.search.model_search import (
+    Hypotheses,
+    Hypothesis,
+    Names,
+    Space,
+    searched,
+)
+from ahrsd.diagnosis.inference.search.one_direction import one_direction
+from ahrsd.diagnosis.inference.search.remembered import remembered
+from ahrsd.diagnosis.inference.search.switching_sources import switching
+
+COURSES = ("free sensor", "free world", "free gyro")
+#: columns that are made before the first of them pass the filter
+_TOGETHER = 500
+#: settings that an onset which was sought finely counts for at least
+_SOUGHT = 40
+#: onsets among which one that the data proposed was chosen
+_ONSETS = 200
+
+
+def best_at(
+    rich: Judged, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
+) -> tuple[Hypotheses, Space, Hypothesis]:
+    """The likeliest set at a richest model, searched from what is known and from nothing."""
+    base = rich.base
+    all_sets, space = space_at(rich, library, named)
+    made = all_sets.made
+    real = frozenset(base.remainder)
+    known = all_sets.without(frozenset(one.key for one in named), LAG)
+    lag = frozenset([LAG]) & made.seen.keys()
+    starts: list[Names] = [frozenset(), lag, real | lag, real | lag | {COURSES[0]}]
+    if known:
+        here = known | real if was_real else known
+        starts = [here, known, here | {COURSES[0]}, here | set(COURSES[:2]) - real]
+    if not (known and was_real):
+        bare = all_sets.judge(())
+        clean = bare.score > all_sets.judge(real, bare).score
+        _offered(all_sets, space, bare, clean=clean)
+    found = searched(all_sets, space, starts)
+    if not all_sets.is_real(found[0].names):
+        new = [found[0].names | {key} for key in _offered(all_sets, space, found[0], clean=True)]
+        if new:
+            found = searched(all_sets, space, [found[0].names, *new])
+    return all_sets, space, found[0]
+
+
+def _offered(all_sets: Hypotheses, space: Space, here: Hypothesis, *, clean: bool) -> list[str]:
+    """Keys of sources as a set leaves them, put among what may be in one: that switch, and, where a
+    recording is clean and leaves nothing ordinary, that have one direction."""
+    new = switching(all_sets, here) + (one_direction(all_sets, here) if clean else [])
+    all_sets.made.add(new)
+    space.sources.extend(one.key for one in new if one.key not in space.sources)
+    return [one.key for one in new]
+
+
+def _by_hundreds(
+    parts: Iterable[tuple[str, list[Component]]],
+) -> Iterator[list[tuple[str, list[Component]]]]:
+    """Effects together that have some hundred columns: few batches, and few columns at a time."""
+    some: list[tuple[str, list[Component]]] = []
+    for one in parts:
+        some.append(one)
+        if sum(each.width for _, found in some for each in found) >= _TOGETHER:
+            yield some
+            some = []
+    if some:
+        yield some
+
+
+def _passed(
+    made: Linearised, library: Mapping[str, Effect]
+) -> tuple[dict[str, list[str]], list[Component]]:
+    """Keys of the library's components by effect, all passed; and those that hold the delay."""
+    delay = made.seen[LAG].component if LAG in made.seen else None
+    whole: list[Component] = []
+    effects: dict[str, list[str]] = {}
+    for some in _by_hundreds(library_components(made.context, library)):
+        passed = []
+        for name, parts in some:
+            held = [] if delay is None or not holds(parts[0], delay) else parts
+            beside = [] if delay is None else [beyond(one, delay) for one in held]
+            effects[name] = [one.key for one in (*parts, *beside)]
+            passed += [*parts, *beside]
+            whole += held
+        made.add(passed)
+        made.keep_lightly([one for _, parts in some for one in parts])
+    if delay is not None:
+        effects[delay.effect or LAG] = [LAG]
+    return effects, whole
+
+
+def space_at(
+    rich: Judged, library: Mapping[str, Effect], named: Sequence[Component]
+) -> tuple[Hypotheses, Space]:
+    """The sets at a richest model, none judged yet, and what they may be made of."""
+    base = rich.base
+    made, context = base.made.copied(), base.made.context
+    effects, whole = _passed(made, library)
+    forms = {}
+    for one in named:
+        listed = effects.setdefault(one.effect or one.key, [])
+        if one.key not in listed:
+            listed.append(one.key)
+        form = form_of(one, context, library)
+        if form is not None:
+            made.add([form])
+            forms[one.key] = form.key
+    if LAG_FORM in made.seen:
+        forms[LAG] = LAG_FORM
+    psi = psi_by_key(made, base.whole, rich.at)
+    holding = {one.key: beside_key(one.key) for one in whole}
+    all_sets = Hypotheses(made, base.remainder, rich.at.log_noise, psi, forms, holding)
+    length_s = context.track.duration_s
+
+    def made_of(one: Component, settings: Iterable[Setting]) -> list[Component]:
+        if one.row is None or one.key == LAG:
+            return []
+        row, tried = one.row, max(_SOUGHT, len(effects[one.row.identifier]))
+        return [component(context, row, one, tried).lightly(context) for one in settings]
+
+    def finer(one: Component, round_: int) -> list[Component]:
+        return made_of(one, neighbours(one.setting, length_s, round_))
+
+    def closer(scan: Beside, one: Component, round_: int) -> list[Component]:
+        return made_of(one, remembered(scan, one, round_))
+
+    def left_of(one: Component) -> Component | None:
+        return form_of(one, context, library)
+
+    def steps_at(time_s: float) -> list[Component]:
+        setting = {"onset_s": round(time_s, 3)}
+        jumping = [row for row in library.values() if row.jumps]
+        return [component(context, row, setting, _ONSETS).lightly(context) for row in jumping]
+
+    def come_and_gone(begins: Component, ends: Component) -> list[Component]:
+        return while_there(begins, ends, context, library, _SOUGHT**2)
+
+    space = Space(effects, COURSES, finer, closer, left_of, steps_at, come_and_gone)
+    return all_sets, space

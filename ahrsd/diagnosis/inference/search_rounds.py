@@ -1,0 +1,127 @@
+"""Searches at one linearisation after the other, until what is found stays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.effects.effect import Effect
+from ahrsd.diagnosis.inference.components.component import Component
+from ahrsd.diagnosis.inference.components.effect_components import LAG, PIECES
+from ahrsd.diagnosis.inference.decision import decision, members
+from ahrsd.diagnosis.inference.likelihood import richest_model
+from ahrsd.diagnosis.inference.likelihood.linearisation import unread
+from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space
+from ahrsd.diagnosis.inference.search.search_space import best_at
+from ahrsd.samples import Array
+
+#: linearisations with a search each, at most
+ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Searched:
+    """An answer, and the sets at the last linearisation that it was chosen of."""
+
+    answer: decision.Answer
+    all_sets: Hypotheses
+    space: Space
+
+
+def answered(found: richest_model.Judged, library: Mapping[str, Effect]) -> Searched:
+    """Searched at the richest model, and again at what was found, until that stays."""
+    all_sets, space, best = best_at(found, library, (), was_real=True)
+    answer = decision.decided(all_sets, space, best, library)
+    for _ in range(ROUNDS - 1):
+        before = members.names_of(all_sets, answer.best)
+        there = [all_sets.component(key) for key in sorted(answer.best.names)]
+        named = [one for one in there if one.effect is not None and one.key != LAG]
+        if not named:
+            break
+        real = all_sets.is_real(answer.best.names)
+        spans = moved_in(all_sets, answer.best)
+        point = unread(all_sets.made.point, spans) if spans else all_sets.made.point
+        del all_sets, space  # what was asked at the point before is as much again
+        found = richest_model.settled(point, library, named)
+        all_sets, space, best = best_at(found, library, named, real)
+        answer = decision.decided(all_sets, space, best, library)
+        if members.names_of(all_sets, answer.best) == before and not spans:
+            break
+    return Searched(answer, all_sets, space)
+
+
+def moved_in(all_sets: Hypotheses, best: Hypothesis) -> list[tuple[float, float]]:
+    """When something was moved, (from, to) s: where the way of a step's source is far off a step.
+
+    A step has its two levels right, but a form of some pieces is not the way from one to the other:
+    what it leaves is louder than all else, and other names are told for it.  Of names that begin
+    within a hand's time of each other, and end so or stay, all but the levels is the way.
+    """
+    point, half_s = all_sets.made.point, priors.APPROACH_S / 2 / PIECES
+    track, sigma = point.filtered.track, point.filtered.model.sigma_mag_gauss
+    read = np.isfinite(track.mag_b_gauss).all(axis=1)
+    starting = [
+        one for key in sorted(best.names) if "onset_s" in (one := all_sets.component(key)).setting
+    ]
+    out = []
+    for step in starting:
+        form = all_sets.forms.get(step.key)
+        if form is None or not step.columns.on_mag:
+            continue
+        way_of = np.linalg.norm(_put(all_sets, best, form), axis=1) / sigma
+        for moment_s in step.moments_s:
+            beside = [one for one in starting if one is not step and _is_of_way(one, moment_s)]
+            edges = [time_s for one in beside for time_s in _lasting(one)]
+            edges += _of_same_way(step, moment_s, starting)
+            if edges:
+                edges.append(moment_s)
+                out.append((min(edges) - 2 * half_s, max(edges) + 2 * half_s))
+            near = read & (np.abs(track.time_s - moment_s) <= priors.APPROACH_S)
+            way = np.where(near, way_of, 0.0)
+            loud = _runs(way > priors.MOVED_LEAST, way > priors.MOVED)
+            out += [(track.time_s[a] - half_s, track.time_s[b - 1] + half_s) for a, b in loud]
+    at_s = track.time_s[read]
+    return [(float(a), float(b)) for a, b in out if np.any((at_s >= a) & (at_s <= b))]
+
+
+def _is_of_way(one: Component, moment_s: float) -> bool:
+    """Whether a member begins beside a step and does not outlast what a hand does there."""
+    begin, end = _lasting(one)
+    near = abs(begin - moment_s) <= priors.APPROACH_S
+    return near and end - begin <= 2 * priors.APPROACH_S and one.columns.on_mag
+
+
+def _of_same_way(step: Component, moment_s: float, starting: Sequence[Component]) -> list[float]:
+    """When steps of the same vector as one at a moment are there: all moments are those of it."""
+    out = list[float]()
+    for one in starting:
+        if one is step or one.frame != step.frame or len(one.moments_s) != len(step.moments_s):
+            continue
+        apart_s = np.abs(np.subtract(one.moments_s, step.moments_s))
+        if one.jumps and step.jumps and np.all(apart_s <= priors.APPROACH_S):
+            out.append(min(one.moments_s, key=lambda at: abs(at - moment_s)))
+    return out
+
+
+def _lasting(one: Component) -> tuple[float, float]:
+    """From when to when a member changes, s."""
+    begin, *end = one.moments_s
+    return begin, end[0] if end else begin + float(one.setting.get("length_s", 0.0))
+
+
+def _runs(wide: NDArray[np.bool], high: NDArray[np.bool]) -> list[tuple[int, int]]:
+    """Runs of rows of the first kind that have one of the second, first and behind the last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], wide.astype(int), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if np.any(high[a:b])]
+
+
+def _put(all_sets: Hypotheses, best: Hypothesis, key: str) -> Array:
+    """(N, 3) gauss that a member puts on the magnetometer."""
+    columns = all_sets.component(key).columns.mag
+    if columns is None:
+        return np.zeros((len(all_sets.made.context.track), 3))
+    return np.asarray(columns @ members.coefficients(all_sets, best, key)[0])

@@ -1,1 +1,0 @@
-"""Diagnosis by one generative model: components with priors, one evidence, one search (beta)."""

@@ -1,1 +1,0 @@
-"""What is said beside the names, and what they are held against: the answer in full."""

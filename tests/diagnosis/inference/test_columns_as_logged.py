@@ -1,0 +1,59 @@
+"""Columns that a logger held, or added noise to: read as they were written, in one search."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mismatch_trials import Trial, made
+from scipy.ndimage import gaussian_filter1d
+from tracks import experiment, track_of
+
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.inference.diagnose import begun
+from ahrsd.diagnosis.inference.likelihood import richest_model
+from ahrsd.diagnosis.track import Spec
+
+RATE_HZ = 25.0
+
+
+def held(values, rows):
+    return values[(np.arange(len(values)) // rows) * rows]
+
+
+def notes_at_the_richest_model(track):
+    """What is said of the columns before anything is searched."""
+    problem, fit = begun(track, Spec())
+    return richest_model.richest(problem, fit.filtered, EFFECTS).base.made.point.problem.notes
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """160 s beside a motor, its current in every row."""
+    return made(
+        Trial(seed=11, effects=(("motor_current_field", 1.0),), samples=4_000, rate_hz=RATE_HZ)
+    )
+
+
+def test_a_quick_current_that_was_held_is_drawn_straight_where_the_field_follows_it():
+    track = track_of(experiment("wam", motion="rov", seed=4, samples=3000, rate_hz=RATE_HZ))
+    course = gaussian_filter1d(np.random.default_rng(5).normal(size=3000), 8.0)
+    current = 6.0 + 2.0 * course / course.std()
+    mag = track.mag_b_gauss + current[:, None] * np.array([3e-3, -2e-3, 2e-3])
+    track = replace(track, mag_b_gauss=mag).with_columns({"motor_current_a": held(current, 5)})
+    said = "column motor_current_a comes every 0.2 s: drawn straight between its values"
+    assert said in notes_at_the_richest_model(track)
+
+
+def test_a_current_that_was_logged_in_every_row_stays_as_it_is(driven):
+    current = driven.track.covariates["motor_current_a"]
+    track = driven.track.with_columns({"motor_current_a": current})
+    assert not any("motor_current_a" in said for said in notes_at_the_richest_model(track))
+
+
+def test_a_column_that_the_field_does_not_follow_stays_as_it_was_held(driven):
+    """A speed of another trip, and the readings without the motor's field."""
+    speed = 1.2 + 0.25 * gaussian_filter1d(np.random.default_rng(3).normal(size=4_000), 40.0)
+    track = driven.track.with_columns({"speed_m_s": held(speed, 5)})
+    assert not any("speed_m_s" in said for said in notes_at_the_richest_model(track))

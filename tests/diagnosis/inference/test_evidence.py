@@ -1,0 +1,240 @@
+"""The evidence against a dense Gaussian, its slope against differences, and its one maximum."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+from scipy.optimize import minimize
+from scipy.stats import multivariate_normal
+
+from ahrsd.diagnosis.inference.components.component import Fixed, Sized
+from ahrsd.diagnosis.inference.components.gaussian_process import CourseLaw
+from ahrsd.diagnosis.inference.likelihood import noise_model
+from ahrsd.diagnosis.inference.likelihood.evidence import Products, evaluated, maximised, reached
+
+ROWS, STEP = (20, 20, 40, 80), 0.7
+
+
+def design(seed: int, widths: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Columns that overlap, and readings that hold some of them."""
+    rng = np.random.default_rng(seed)
+    count = sum(ROWS)
+    B = rng.normal(size=(count, sum(widths))) + 0.5 * rng.normal(size=(count, 1))
+    band = np.repeat(np.arange(len(ROWS)), ROWS)
+    y = B @ rng.normal(scale=0.7, size=B.shape[1]) + np.exp(0.3 * band) * rng.normal(size=count)
+    return B, y
+
+
+def products(B: np.ndarray, y: np.ndarray) -> Products:
+    edges = np.cumsum([0, *ROWS])
+    parts = [slice(a, b) for a, b in itertools.pairwise(edges)]
+    return Products(
+        np.stack([B[p].T @ B[p] for p in parts]),
+        np.stack([B[p].T @ y[p] for p in parts]),
+        np.array([y[p] @ y[p] for p in parts]),
+        np.array(ROWS, dtype=float),
+        STEP,
+    )
+
+
+def laws() -> list:
+    even = (np.array([np.log(0.01)]), np.array([np.log(10.0)]))
+    return [
+        Fixed(np.full(3, 4.0)),
+        Sized(np.array([0.5, 1.0, 2.0]), *even),
+        Sized(np.ones(4), *even, mean=np.log(0.3), spread=0.8),
+        CourseLaw(np.repeat(np.arange(1, 6), 2).astype(float), 1.0),
+    ]
+
+
+WIDTHS = (3, 3, 4, 10)
+
+
+def dense(B: np.ndarray, y: np.ndarray, log_noise: np.ndarray, psi: np.ndarray) -> float:
+    """Log density of the readings by their whole covariance, and of the hyperparameters."""
+    at, variance, prior = 0, [], 0.0
+    for law in laws():
+        mine = psi[at : at + len(law.start)]
+        at += len(mine)
+        variance.append(np.exp(law.log_variance(mine)))
+        prior += law.log_prior(mine)[0]
+    V = np.diag(np.repeat(np.exp(log_noise), ROWS)) + (B * np.concatenate(variance)) @ B.T
+    readings = multivariate_normal(np.zeros(len(y)), V).logpdf(y)
+    return float(readings + prior + noise_model.log_prior(log_noise, STEP)[0])
+
+
+LOG_NOISE, PSI = np.array([0.4, 0.1, -0.2, 0.3]), np.array([-0.4, -0.9, 0.2, 0.8])
+
+
+def test_the_evidence_is_that_of_the_dense_gaussian():
+    B, y = design(1, WIDTHS)
+    at = evaluated(products(B, y), laws(), LOG_NOISE, PSI)
+    assert at.nats == pytest.approx(dense(B, y, LOG_NOISE, PSI), abs=1e-6)
+
+
+def test_the_gradient_is_that_of_differences():
+    B, y = design(2, WIDTHS)
+    at = evaluated(products(B, y), laws(), LOG_NOISE, PSI)
+    x = np.concatenate([LOG_NOISE, PSI])
+    for k in range(len(x)):
+        step = 1e-5 * np.eye(len(x))[k]
+        ahead, behind = (dense(B, y, (x + s)[:4], (x + s)[4:]) for s in (step, -step))
+        assert at.gradient[k] == pytest.approx((ahead - behind) / 2e-5, rel=1e-5, abs=1e-5)
+
+
+def test_the_mean_and_covariance_are_those_of_bayes():
+    B, y = design(3, WIDTHS)
+    at = evaluated(products(B, y), laws(), LOG_NOISE, PSI)
+    weight = np.repeat(np.exp(-LOG_NOISE), ROWS)
+    k, variance = 0, []
+    for law in laws():
+        variance.append(np.exp(law.log_variance(PSI[k : k + len(law.start)])))
+        k += len(law.start)
+    precision = (B.T * weight) @ B + np.diag(1 / np.concatenate(variance))
+    covariance = np.linalg.inv(precision)
+    np.testing.assert_allclose(at.deviation, np.sqrt(np.diag(covariance)), rtol=1e-7)
+    np.testing.assert_allclose(at.mean, covariance @ (B.T @ (weight * y)), atol=1e-7)
+
+
+def test_adding_and_dropping_agree_on_200_hypotheses():
+    """A set is worth the same whether the search came to it from fewer members or from more."""
+    rng = np.random.default_rng(4)
+    width, members = 3, 8
+    worst = 0.0
+    for trial in range(200):
+        if trial % 20 == 0:
+            B, y = design(100 + trial, (width,) * members)
+        few = np.sort(rng.choice(members, size=rng.integers(1, members), replace=False))
+        whole = np.arange(members)
+
+        def of(chosen, start=None, B=B, y=y):
+            columns = np.concatenate([np.arange(width) + width * k for k in chosen])
+            even = (np.array([np.log(0.01)]), np.array([np.log(10.0)]))
+            own = [Sized(np.ones(width), *even) for _ in chosen]
+            begin = start or (np.full(4, 1.0), np.zeros(len(chosen)))
+            return maximised(products(B[:, columns], y), own, begin)
+
+        rich = of(whole)
+        dropped = of(few, (rich.log_noise, rich.psi[few]))
+        fewer = of(few[:-1]) if len(few) > 1 else of(few)
+        psi = np.concatenate([fewer.psi, [0.0]]) if len(few) > 1 else np.zeros(1)
+        added = of(few, (fewer.log_noise, psi))
+        worst = max(worst, abs(added.nats - dropped.nats))
+    assert worst < 1.0
+
+
+def test_what_is_not_there_is_small_and_what_is_there_is_found():
+    rng = np.random.default_rng(5)
+    B = rng.normal(size=(sum(ROWS), 16))
+    y = B[:, :8] @ rng.normal(scale=2.0, size=8) + rng.normal(size=len(B))
+    even = (np.array([np.log(0.01)]), np.array([np.log(10.0)]))
+    found = maximised(
+        products(B, y),
+        [Sized(np.ones(8), *even), Sized(np.ones(8), *even)],
+        (np.zeros(4), np.zeros(2)),
+    )
+    assert np.exp(found.psi[0]) == pytest.approx(2.0, rel=0.5)
+    assert np.exp(found.psi[1]) < 0.15
+    np.testing.assert_allclose(np.exp(found.log_noise), 1.0, rtol=0.6)
+
+
+def test_a_climb_is_given_up_only_where_it_would_not_reach_what_is_asked():
+    for seed in range(30):
+        B, y = design(60 + seed, WIDTHS)
+        start = (np.full(4, 1.5), np.full(len(PSI), -0.5))
+        top = maximised(products(B, y), laws(), start)
+        found = reached(products(B, y), laws(), start, top.nats - 0.1)
+        assert found is not None
+        assert found.nats == top.nats
+        assert reached(products(B, y), laws(), start, top.nats + 1e3) is None
+
+
+def test_the_curvature_is_the_average_information_and_no_less_than_the_expected():
+    B, y = design(6, WIDTHS)
+    at = evaluated(products(B, y), laws(), LOG_NOISE, PSI)
+    begin, variance, slopes, stiff = 0, [], [], []
+    for law in laws():
+        mine = PSI[begin : begin + len(law.start)]
+        begin += len(mine)
+        variance.append(np.exp(law.log_variance(mine)))
+        slopes.append(law.slope(mine))
+        stiff.append(law.stiffness)
+    phi, slope = np.concatenate(variance), block_diag(*slopes)
+    noise = np.repeat(np.exp(LOG_NOISE), ROWS)
+    band = np.repeat(np.eye(len(ROWS)), ROWS, axis=0)
+    P = np.linalg.inv(np.diag(noise) + (B * phi) @ B.T)
+    changes = [np.diag(noise * part) for part in band.T]
+    changes += [(B * phi * part) @ B.T for part in slope.T]
+    Z = np.column_stack([change @ P @ y for change in changes])
+    average = 0.5 * Z.T @ P @ Z
+    k = len(ROWS)
+    found = at.curvature.copy()
+    found[:k, :k] -= noise_model.stiffness(k, STEP)
+    found[k:, k:] -= np.diag(np.concatenate(stiff))
+    off = ~np.eye(len(found), dtype=bool)
+    np.testing.assert_allclose(found[off], average[off], rtol=1e-6, atol=1e-9)
+    expected = [0.5 * np.trace(P @ change @ P @ change) for change in changes[k:]]
+    most = np.maximum(np.diag(average)[k:], expected)
+    np.testing.assert_allclose(np.diag(found)[k:], most, rtol=1e-6)
+
+
+def test_the_maximum_is_that_of_another_climb():
+    """Newton's steps against a quasi-Newton search of the same function, from far away."""
+    for seed in range(10):
+        B, y = design(20 + seed, WIDTHS)
+        found = maximised(products(B, y), laws(), (np.full(4, 1.5), np.zeros(4)))
+
+        of_all = products(B, y)
+
+        def cost(x, known=of_all):
+            at = evaluated(known, laws(), x[:4], x[4:])
+            return -at.nats, -at.gradient
+
+        low, high = noise_model.bounds(4)
+        low = np.concatenate([low, *(law.low for law in laws())])
+        high = np.concatenate([high, *(law.high for law in laws())])
+        start = np.concatenate([found.log_noise, found.psi]) + 0.3
+        other = minimize(cost, start, jac=True, bounds=list(zip(low, high, strict=True)))
+        assert found.nats == pytest.approx(-other.fun, abs=0.05)
+
+
+def test_bands_that_stand_alone_may_have_any_power() -> None:
+    edges, alone = noise_model.with_band(noise_model.octaves(4000), 700, 900, 50)
+    assert edges.tolist() == [0, 62, 125, 250, 500, 700, 750, 800, 850, 900, 2000, 4000]
+    assert edges[alone].tolist() == [700, 750, 800, 850]
+    quiet = np.zeros(len(edges) - 1)
+    loud = quiet.copy()
+    loud[alone] = 3.0
+    near, far = (noise_model.log_prior(loud, STEP, where)[0] for where in (alone, None))
+    assert near > noise_model.log_prior(quiet, STEP, alone)[0] - 1.1
+    assert far < noise_model.log_prior(quiet, STEP)[0] - 15.0
+    _, slope = noise_model.log_prior(loud, STEP, alone)
+    for k, one in enumerate(np.eye(len(loud))):
+        up, down = (noise_model.log_prior(loud + d * one, STEP, alone)[0] for d in (1e-4, -1e-4))
+        assert slope[k] == pytest.approx((up - down) / 2e-4, abs=1e-6)
+    expected = -noise_model.stiffness(len(loud), STEP, alone) @ loud
+    np.testing.assert_allclose(slope, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [0.03, 0.1])
+def test_a_climb_goes_on_where_size_and_corner_are_nearly_one(size: float) -> None:
+    """As many half waves as are seen, one as loud as the other: the corner ends at its highest."""
+    rng, count, known = np.random.default_rng(1), 200, 1e4
+    w = size * rng.normal(size=count)
+    s = known * w + np.sqrt(known) * rng.normal(size=count)
+    rows = 3.0 * count
+    said = Products(
+        np.diag(np.full(count, known))[None],
+        s[None],
+        np.array([s @ s / known + rows - count]),
+        np.array([rows]),
+        STEP,
+    )
+    law = CourseLaw(np.arange(1, count + 1).astype(float), 1.0)
+    starts = [np.array([0.0, np.log(corner)]) for corner in (4.0, 36.0)]
+    low, high = (maximised(said, [law], (np.zeros(1), start)) for start in starts)
+    assert low.nats == pytest.approx(high.nats, abs=0.05)
+    assert np.exp(low.psi[1]) == pytest.approx(40.0, rel=0.01)

@@ -1,0 +1,209 @@
+"""One recording linearised: candidates beside a model, delays that hold, where nothing is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from tracks import experiment, track_of
+
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.inference.components.component import Component, Fixed
+from ahrsd.diagnosis.inference.components.effect_components import (
+    LAG,
+    LAG_FORM,
+    beyond,
+    holds,
+    library_components,
+)
+from ahrsd.diagnosis.inference.components.ordinary_remainder import ordinary_remainder, still_spells
+from ahrsd.diagnosis.inference.diagnose import broken_where_unsampled
+from ahrsd.diagnosis.inference.likelihood import richest_model
+from ahrsd.diagnosis.inference.likelihood.candidates import beside
+from ahrsd.diagnosis.inference.likelihood.evidence import evaluated
+from ahrsd.diagnosis.inference.likelihood.linearisation import (
+    CALIBRATION,
+    by_key,
+    first_point,
+    moved,
+    unread,
+)
+from ahrsd.diagnosis.inference.likelihood.linearisation import added as added_by
+from ahrsd.diagnosis.innovation_filter.context import build_context
+from ahrsd.diagnosis.innovation_filter.innovation import run_filter
+from ahrsd.diagnosis.model import Columns
+from ahrsd.diagnosis.track import Spec, Track
+
+
+def richest(track: Track) -> richest_model.Judged:
+    problem, cold = problem_of(track, Spec())
+    fit = fit_null(problem.track, problem.spec, cold, walk=False)
+    return richest_model.richest(problem, fit.filtered, EFFECTS)
+
+
+def delayed(track: Track, lag_s: float) -> Track:
+    """The magnetometer's readings late by so much."""
+    t, m = track.time_s, track.mag_b_gauss
+    late = [np.interp(t - lag_s, t, m[:, axis]) for axis in range(3)]
+    return replace(track, mag_b_gauss=np.column_stack(late))
+
+
+@pytest.fixture(scope="module")
+def bare() -> richest_model.Judged:
+    """A simulated recording without an accelerometer."""
+    return richest(replace(track_of(experiment("wam", seed=8, samples=3000)), accel_b_m_s2=None))
+
+
+def test_without_an_accelerometer_nothing_is_asked_of_it(bare):
+    assert np.isfinite(bare.nats)
+    assert {"by_force", "bending"}.isdisjoint(bare.base.remainder)
+    assert "by_direction" in bare.base.remainder
+
+
+def test_a_candidate_beside_a_model_is_worth_what_it_adds_to_the_evidence(bare):
+    made, keys = bare.base.made, (CALIBRATION, "gyro_matrix")
+    laws = [made.seen[key].component.law for key in keys]
+    noise = np.linspace(-0.3, 0.4, len(made.edges) - 1)
+    step = priors.NOISE_STEP_REAL
+    without = evaluated(made.products(keys, step), laws, noise, np.zeros(0))
+    both = (*keys, LAG)
+    laws.append(made.seen[LAG].component.law)
+    with_it = evaluated(made.products(both, step), laws, noise, np.zeros(0))
+    worth = beside(made, keys, without).worth([LAG])
+    assert worth[LAG] == pytest.approx(with_it.nats - without.nats, abs=1e-5)
+
+
+def test_a_delay_that_is_long_is_found_from_none():
+    found = richest(delayed(track_of(experiment("wam", seed=9, samples=4000)), 0.11))
+    value = by_key(found.base.made, found.base.whole, found.at)[LAG]
+    assert value[0] == pytest.approx(0.11, abs=0.006)
+
+
+def test_eddy_currents_hold_a_delay_and_no_other_effect_does(bare):
+    delay = bare.base.made.seen[LAG].component
+    parts = dict(library_components(bare.base.made.context, EFFECTS))
+    assert [name for name, some in parts.items() if holds(some[0], delay)] == ["eddy_current"]
+    eddy = beyond(parts["eddy_current"][0], delay)
+    assert eddy.beside == LAG
+    assert eddy.key != parts["eddy_current"][0].key
+    assert not holds(eddy, delay)
+    shared = np.einsum("nia,ni->a", eddy.columns.mag, delay.columns.mag[:, :, 0])
+    np.testing.assert_allclose(shared, 0.0, atol=1e-9)
+
+
+def test_columns_hold_others_that_are_a_sum_of_them():
+    rng = np.random.default_rng(1)
+    X = rng.normal(size=(50, 3, 4))
+    law = Fixed(np.ones(4))
+    whole = Component("whole", "sensor", Columns(mag=X), law)
+    part = Component("part", "sensor", Columns(mag=X @ np.array([[1.0], [2], [0], [-1]])), law)
+    other = Component("other", "sensor", Columns(mag=rng.normal(size=(50, 3, 1))), law)
+    assert holds(whole, part)
+    assert not holds(whole, other)
+    assert not holds(part, whole)
+
+
+def test_spells_at_rest_are_those_in_which_a_sensor_hardly_turns():
+    t = np.arange(0.0, 100.0, 0.1)
+    gyro = np.zeros((len(t), 3))
+    moving = (t >= 20.0) & (t < 60.0)
+    gyro[moving, 2] = 1.0
+    gyro[(t >= 80.0) & (t < 81.0), 0] = 1.0
+    found = still_spells(t, gyro)
+    expected = [(0.0, 19.7), (60.2, 79.7), (81.2, 99.9)]
+    np.testing.assert_allclose(found, expected, atol=0.31)
+
+
+def test_what_hardly_turns_in_most_of_its_time_is_never_at_rest():
+    t = np.arange(0.0, 100.0, 0.1)
+    gyro = np.zeros((len(t), 3))
+    gyro[:100, 2] = 1.0
+    assert still_spells(t, gyro) == []
+
+
+def test_a_logged_cause_is_the_same_component_at_every_point():
+    """Its reference follows the readings, and what it took out of them has to be put back."""
+    track = track_of(experiment("wam", seed=4, samples=3000))
+    warm = 15.0 + np.cumsum(np.random.default_rng(2).normal(size=len(track))) / 500.0
+    track = replace(track, covariates={"temperature_c": warm})
+    problem, cold = problem_of(track, Spec())
+    fit = fit_null(problem.track, problem.spec, cold, walk=False)
+    keys = []
+    for one in (problem, problem.lagging(0.03)):
+        start = first_point(one, run_filter(one.track, fit.filtered.model), (LAG,))
+        keys.append(richest_model.base_of(start, EFFECTS, (), whole=False).whole)
+    assert "gyro_bias_temperature as logged" in keys[0]
+    assert set(keys[1]) - set(keys[0]) == {LAG_FORM}
+
+
+def test_what_a_point_takes_out_of_the_readings_is_what_it_puts_back():
+    """A course of 40 mG on the sensor: the readings with everything in are those of before."""
+    track = track_of(experiment("wam", seed=11, samples=3000))
+    t = track.time_s - track.time_s[0]
+    added = 0.04 * np.sin(2 * np.pi * t / 31.0)[:, None] * np.array([0.6, -0.7, 0.39])
+    track = replace(track, mag_b_gauss=track.mag_b_gauss + added)
+    problem, cold = problem_of(track, Spec())
+    fit = fit_null(problem.track, problem.spec, cold, walk=False)
+    here = richest_model.judged(first_point(problem, fit.filtered, (LAG,)), EFFECTS, ())
+    there = richest_model.judged(
+        moved(here.base.made, here.base.whole, here.at, delayed=False), EFFECTS, ()
+    )
+    made, values = there.base.made, there.base.made.point.values
+    known = {key: made.seen[key].component for key in values if key != LAG}
+    taken, _ = added_by(len(made.context.track), known, {key: values[key] for key in known})
+    assert np.max(np.abs(taken)) > 0.02
+    np.testing.assert_allclose(made.point.terms_mag, taken, atol=1e-12)
+    assert there.nats > here.nats
+
+
+def test_a_run_ends_where_a_step_turns_too_far_to_be_told():
+    track = track_of(experiment("wam", seed=8, samples=400))
+    gyro = track.gyro_b_rad_s.copy()
+    gyro[250] = [0.0, 20.0, 5.0]
+    broken = broken_where_unsampled(replace(track, gyro_b_rad_s=gyro))
+    assert [(run.start, run.stop) for run in broken.runs] == [(0, 250), (250, 400)]
+    assert np.isnan(broken.dt_s[250])
+    assert broken_where_unsampled(track) is track
+
+
+def test_a_span_in_which_something_was_moved_is_unread_and_the_gyro_carries_the_field_across():
+    track = track_of(experiment("wam", seed=8, samples=3000))
+    problem, cold = problem_of(track, Spec())
+    point = first_point(problem, fit_null(problem.track, problem.spec, cold).filtered, (LAG,))
+    middle_s = float(np.median(track.time_s))
+    silent = unread(point, [(middle_s, middle_s + 6.0)])
+    at_s = silent.filtered.track.time_s
+    inside = (at_s > middle_s + 1.0) & (at_s < middle_s + 5.0)
+    assert not silent.filtered.used[inside].any()
+    assert silent.filtered.used[at_s > middle_s + 7.0].all()
+    assert np.isfinite(silent.filtered.whitened).all()
+    assert silent.problem.recorded.mag_b_gauss.shape == track.mag_b_gauss.shape
+
+
+@pytest.mark.parametrize("name", ["by_direction", "viscous_magnetisation", "hysteresis"])
+def test_what_is_made_of_the_field_row_by_row_does_not_follow_that_rows_reading(name):
+    """Beside a loud gyro the smooth field is nearly the reading, which then explains itself."""
+    loud = track_of(experiment("wam", seed=31, samples=600, rate_hz=10.0, sigma_gyro=0.03))
+    problem, cold = problem_of(loud, Spec())
+    model = fit_null(problem.track, problem.spec, cold, walk=False).model
+    row, off_gauss = 300, 1e-3
+
+    def columns(track: Track) -> np.ndarray:
+        fit = SimpleNamespace(filtered=run_filter(track, model), terms_gyro=None)
+        context = build_context(track, fit)
+        known = {one.key: one for one in ordinary_remainder(context)}
+        made = (
+            known[name] if name in known else dict(library_components(context, EFFECTS))[name][-1]
+        )
+        assert made.columns.mag is not None
+        return made.columns.mag[row]
+
+    mag = problem.track.mag_b_gauss.copy()
+    mag[row] += off_gauss
+    moved = columns(replace(problem.track, mag_b_gauss=mag)) - columns(problem.track)
+    assert np.max(np.abs(moved)) < 0.01 * off_gauss

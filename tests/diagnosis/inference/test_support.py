@@ -1,0 +1,322 @@
+"""What an answer is held against, where the right answer is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import chdtri
+from tracks import experiment, track_of
+
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.answer.added_field import calibration_of, deviation, less_calibration
+from ahrsd.diagnosis.answer.diagnosis import Assumed, Finding, Heldout, OnPriors, Where
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.inference.answer.held_out import HeldOut, dealt
+from ahrsd.diagnosis.inference.answer.left_sizes import left_sizes
+from ahrsd.diagnosis.inference.answer.residual_checks import (
+    checks,
+    regime_maps,
+    residuals_of,
+    whiteness,
+)
+from ahrsd.diagnosis.inference.answer.support import (
+    COURSE,
+    NAME,
+    NOISE,
+    ORDINARY,
+    doubts,
+    on_priors,
+)
+from ahrsd.diagnosis.inference.answer.visibility import limits, seen_alone
+from ahrsd.diagnosis.inference.likelihood import richest_model
+from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Space
+from ahrsd.diagnosis.inference.search.search_space import space_at
+from ahrsd.diagnosis.track import Spec, Track
+
+CURRENT = np.array([5e-4, -7e-4, 3e-4])
+NOTHING = frozenset()
+
+
+def with_current(track: Track, *, field: bool) -> Track:
+    """A logged current that goes up and down at random; field: whether it has one."""
+    seconds = np.arange(0.0, track.duration_s + 8.0, 7.0)
+    levels = np.random.default_rng(4).uniform(0.0, 12.0, len(seconds))
+    amps = np.interp(track.time_s - track.time_s[0], seconds, levels)
+    mag = track.mag_b_gauss + (amps[:, None] * CURRENT if field else 0.0)
+    return replace(track, mag_b_gauss=mag, covariates={"motor_current_a": amps})
+
+
+def sets_of(track: Track) -> tuple[Hypotheses, Space]:
+    problem, cold = problem_of(track, Spec())
+    fit = fit_null(problem.track, problem.spec, cold, walk=False)
+    return space_at(richest_model.richest(problem, fit.filtered, EFFECTS), EFFECTS, ())
+
+
+@pytest.fixture(scope="module")
+def track():
+    return replace(track_of(experiment("wam", seed=21, samples=3000)), accel_b_m_s2=None)
+
+
+@pytest.fixture(scope="module")
+def idle(track):
+    """A current that does nothing."""
+    return sets_of(with_current(track, field=False))
+
+
+@pytest.fixture(scope="module")
+def driven(track):
+    """A current with a field."""
+    return sets_of(with_current(track, field=True))
+
+
+def key_of(space: Space, name: str) -> str:
+    return space.effects[name][len(space.effects[name]) // 2]
+
+
+def gains(found: tuple[Hypotheses, Space], name: str) -> tuple[float, float]:
+    """Nats on all readings of an effect that is put in, and of its best copy."""
+    all_sets, space = found
+    key = key_of(space, name)
+    held = HeldOut(all_sets, all_sets.judge({key}))
+    told = held.told((key,))
+    return told.nll_gain_per_sample * held.samples, told.placebo_gain * held.samples
+
+
+def test_a_set_with_too_many_coefficients_is_no_candidate_and_its_neighbours_are(idle, monkeypatch):
+    all_sets, space = idle
+    key = key_of(space, "motor_current_field")
+    bare, course = all_sets.judge(()), space.courses[0]
+    width = all_sets.component(course).width
+    monkeypatch.setattr(priors, "WIDEST", width)  # beside the calibration there is less room
+    before = all_sets.too_wide
+    assert all_sets.compared({course}, bare, -np.inf) is None
+    assert all_sets.too_wide == before + 1
+    assert all_sets.compared({key}, bare, -np.inf) is not None
+    assert all_sets.judge({course}).names == {course}  # what is asked for by itself has a score
+
+
+def test_what_is_not_there_foretells_nothing(idle):
+    """Over the library nothing on the mean, and none more than chance.
+
+    Sizes and the noise's spectrum are of all readings: half a nat is theirs.
+    """
+    found = {name: gains(idle, name)[0] for name in idle[1].effects}
+    assert len(found) > 15
+    assert np.mean(list(found.values())) < 0.5
+    assert max(found.values()) < 3.0
+    assert min(found.values()) > -8.0
+    gain, copy = gains(idle, "motor_current_field")
+    assert max(gain, copy) < 2.0
+
+
+def test_a_cause_foretells_readings_and_its_copies_do_not(driven):
+    gain, copy = gains(driven, "motor_current_field")
+    assert gain > 200.0
+    assert copy < 0.1 * gain
+    all_sets, space = driven
+    key = key_of(space, "motor_current_field")
+    told = HeldOut(all_sets, all_sets.judge({key})).told((key,))
+    # the next reading is off by the sensor's own noise, a row being a mean of so many readings
+    noise = 1e-3 / np.sqrt(all_sets.made.point.problem.averaged)
+    assert told.rms_after_gauss == pytest.approx(noise, rel=0.15)
+    assert told.rms_before_gauss > 1.05 * told.rms_after_gauss
+
+
+def test_an_effect_that_says_the_wrong_thing_loses(driven):
+    """A step beside the current's field: what is left to say is nothing."""
+    all_sets, space = driven
+    cause, step = (key_of(space, name) for name in ("motor_current_field", "hard_iron_step"))
+    held = HeldOut(all_sets, all_sets.judge({cause, step}))
+    assert held.gain(held.less((step,))) * held.samples < 0.5
+    assert held.gain(held.less((cause,))) * held.samples > 200.0
+
+
+def test_a_part_is_foretold_with_the_density_that_the_dense_gaussian_has():
+    short = replace(track_of(experiment("wam", seed=22, samples=900)), accel_b_m_s2=None)
+    all_sets, space = sets_of(with_current(short, field=True))
+    held = HeldOut(all_sets, all_sets.judge({key_of(space, "motor_current_field")}))
+    rows = held.rows(held.best.names)
+    part = np.repeat(dealt(rows), 3)
+    X, y = rows.X.reshape(len(part), -1), rows.y.ravel()
+    V = (X * np.exp(rows.phi)) @ X.T + np.eye(len(y))
+
+    def density(mine: np.ndarray) -> float:
+        own, seen = V[np.ix_(mine, mine)], y[mine]
+        unit = len(seen) * (np.log(2 * np.pi) + rows.log_power)
+        return -0.5 * (np.linalg.slogdet(own)[1] + seen @ np.linalg.solve(own, seen) + unit)
+
+    whole = density(np.ones(len(y), dtype=bool))
+    expected = sum(whole - density(part != k) for k in range(priors.PARTS))
+    assert held.of(held.best.names).nats == pytest.approx(expected, rel=1e-6)
+
+
+def test_stretches_are_dealt_in_turn(driven):
+    rows = HeldOut(driven[0], driven[0].judge(NOTHING)).rows(NOTHING)
+    track, part = rows.made.point.problem.track, dealt(rows)
+    since_s = track.time_s[rows.rows] - track.time_s[0]
+    np.testing.assert_array_equal(part, (since_s // 2.0).astype(int) % 5)
+
+
+def test_a_course_gains_in_its_own_frame_alone(track):
+    t = track.time_s - track.time_s[0]
+    level = np.sin(2 * np.pi * t / 31.0) + np.sin(2 * np.pi * t / 47.0)
+    added = 4e-3 * level[:, None] * np.array([0.6, -0.7, 0.4])
+    all_sets, _ = sets_of(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    held = HeldOut(all_sets, all_sets.judge({"free sensor"}))
+    told = held.told(("free sensor",))
+    assert told.nll_gain_per_sample * held.samples > 200.0
+    assert told.placebo_gain < 0.8 * told.nll_gain_per_sample
+
+
+# -- priors -------------------------------------------------------------------------------------
+
+
+def test_odds_move_with_the_probability_of_a_name_by_its_logarithm(driven):
+    all_sets, space = driven
+    best = all_sets.judge({key_of(space, "motor_current_field")})
+    found = on_priors(all_sets, best, all_sets.judge(NOTHING), asked=3.0)
+    (by_name,) = (one for one in found.assumed if one.what == NAME)
+    assert found.log_odds == pytest.approx(best.score - all_sets.judge(NOTHING).score)
+    assert by_name.half_nats == pytest.approx(found.log_odds - np.log(2.0))
+    assert by_name.double_nats == pytest.approx(found.log_odds + np.log(2.0))
+    assert found.stays
+    assert not on_priors(all_sets, best, all_sets.judge(NOTHING), found.log_odds).stays
+
+
+def test_odds_in_another_noise_are_those_of_a_search_that_assumed_it(driven, monkeypatch):
+    all_sets, space = driven
+    names = frozenset({key_of(space, "motor_current_field")})
+    found = on_priors(all_sets, all_sets.judge(names), all_sets.judge(NOTHING), asked=3.0)
+    (by_noise,) = (one for one in found.assumed if one.what == NOISE)
+    monkeypatch.setattr(priors, "NOISE_STEP_CLEAN", 2.0 * priors.NOISE_STEP_CLEAN)
+    anew = replace(all_sets, judged={})
+    change = anew.judge(names).score - anew.judge(NOTHING).score - found.log_odds
+    assert np.sign(by_noise.double_nats - found.log_odds) == np.sign(change)
+    assert by_noise.double_nats - found.log_odds == pytest.approx(change, rel=0.5, abs=1.0)
+
+
+def test_a_rival_course_is_as_likely_as_it_is_assumed_to_be(driven):
+    all_sets, space = driven
+    best = all_sets.judge({key_of(space, "motor_current_field")})
+    rival = all_sets.judge({"free sensor"})
+    by = {one.what: one for one in on_priors(all_sets, best, rival, 3.0).assumed}
+    assert by[COURSE].double_nats - by[COURSE].half_nats == pytest.approx(-2 * np.log(2.0))
+    assert ORDINARY not in by
+
+
+# -- what is left -------------------------------------------------------------------------------
+
+
+def test_a_null_is_like_its_copies_and_no_bin_has_a_field_of_its_own(idle):
+    all_sets, _ = idle
+    held = HeldOut(all_sets, all_sets.judge(NOTHING))
+    found = residuals_of(held.rows(NOTHING))
+    maps = regime_maps(found)
+    seen = checks(found, maps)
+    assert {"autocorrelation", "shift_sensor", "heading", "by_rate_rad_s", "tail"} <= seen.keys()
+    assert [name for name, one in seen.items() if not one.inside_after] == []
+    assert seen["normalised_innovation"].value == pytest.approx(1.0, abs=0.05)
+    nats = np.concatenate([one.after for one in maps])
+    assert np.mean(nats) == pytest.approx(1.5, abs=4.0 * 1.22 / np.sqrt(len(nats)))
+    limit = seen["by_rate_rad_s"].band[1]
+    bins = next(len(one.after) for one in maps if one.quantity == "rate_rad_s")
+    assert limit == pytest.approx(chdtri(3.0, 0.01 / (len(maps) * bins)) / 2.0)
+
+
+def test_what_follows_a_column_fails_before_and_not_after_it_is_named(driven):
+    all_sets, space = driven
+    names = frozenset({key_of(space, "motor_current_field")})
+    held = HeldOut(all_sets, all_sets.judge(names))
+    found = residuals_of(held.rows(names))
+    maps = regime_maps(found)
+    one = checks(found, maps)["by_motor_current_a"]
+    assert not one.inside_before
+    assert one.inside_after
+    (current,) = (each for each in maps if each.quantity == "motor_current_a")
+    assert max(current.before) > 100.0
+    assert max(current.after) < 10.0
+
+
+def test_a_source_that_is_in_no_set_fails_by_time_and_by_whiteness(track):
+    t = track.time_s - track.time_s[0]
+    pulse = ((t > 50.0) & (t < 75.0))[:, None] * np.array([4e-3, -3e-3, 2e-3])
+    problem, cold = problem_of(replace(track, mag_b_gauss=track.mag_b_gauss + pulse), Spec())
+    start = fit_null(problem.track, problem.spec, cold, walk=False)
+    all_sets, _ = space_at(richest_model.richest(problem, start.filtered, EFFECTS), EFFECTS, ())
+    quiet = all_sets.judge({"free sensor"})
+    bare = replace(all_sets.judge(NOTHING), at=replace(
+        all_sets.judge(NOTHING).at, log_noise=quiet.at.log_noise))  # fmt: skip
+    all_sets.judged[NOTHING] = bare
+    found = residuals_of(HeldOut(all_sets, bare).rows(NOTHING))
+    seen = checks(found, ())
+    assert not seen["shift_sensor"].inside_after
+    assert not seen["autocorrelation"].inside_after
+    assert whiteness(start, found)["ljung_box"].p_after < 1e-4
+
+
+def test_what_would_have_shown_shows_and_a_third_of_it_does_not(idle, track):
+    all_sets, space = idle
+    found = seen_alone(all_sets, space, NOTHING)
+    told = {(one.effect, one.parameter): one for one in limits(found)}
+    limit = told["motor_current_field", "field_per_ampere_x"]
+    assert limit.unit == "gauss/A"
+    assert max(one.nats for one in found) < 6.0
+
+    def odds(size: float) -> float:
+        column = with_current(track, field=False)
+        mag = column.mag_b_gauss.copy()
+        mag[:, 0] += size * column.covariates["motor_current_a"]
+        sets, asked = sets_of(replace(column, mag_b_gauss=mag))
+        key = key_of(asked, "motor_current_field")
+        return sets.judge({key}).score - sets.judge(NOTHING).score
+
+    assert odds(1.2 * limit.smallest) > priors.NAME_ODDS  # with the noise that is there
+    assert odds(limit.smallest / 3.0) < priors.NAME_ODDS
+
+
+def test_sizes_of_what_is_left_are_those_that_were_put_in(track):
+    rng = np.random.default_rng(5)
+    t = (track.time_s - track.time_s[0]) / track.duration_s
+    waves = np.cos(np.pi * np.outer(t, np.arange(2, 8)))
+    field = 12e-3 * waves @ rng.normal(size=(6, 3)) / np.sqrt(6)
+    truth = experiment("wam", seed=21, samples=3000).R_nb
+    world = np.einsum("nji,nj->ni", truth, field)
+    all_sets, _ = sets_of(replace(track, mag_b_gauss=track.mag_b_gauss + world))
+    best = all_sets.judge(all_sets.remainder)
+    found = left_sizes(all_sets, best, None, ())
+    parts = {one.component: one for one in found.components}
+    at_s, times = all_sets.made.context.track.time_s, track.time_s
+    rows = np.column_stack([np.interp(at_s, times, column) for column in world.T])
+    put_in = deviation(less_calibration(rows, calibration_of(all_sets.made.context)))
+    assert found.within
+    # the filter follows what is slow: the likeliest course is smaller than the true one, never more
+    assert 0.5 * put_in < parts["world_course"].size < 1.1 * put_in
+    assert parts["world_course"].there
+    assert parts["world_course"].up_to > 5.0 * parts["world_course"].size
+    others = [one for name, one in parts.items() if name != "world_course"]
+    assert max(one.size for one in others if one.unit == "gauss") < 0.3 * put_in
+    assert found.heading_deg > 0.3
+
+
+def test_a_name_that_gains_no_more_than_its_copies_or_owes_itself_to_a_prior_is_doubted():
+    held = Heldout(1e-3, 9e-4, 0.01, 0.001)
+    sure = OnPriors(20.0, 3.0, True, (Assumed(NAME, 19.3, 20.7),))
+    told = Finding(
+        effect="hysteresis", confidence=1.0, alternatives=(), where=Where((), (), "sensor"),
+        parameters=(), heldout=held, cost_if_left_out=None, separate_from=None, priors=sure,
+    )  # fmt: skip
+    assert doubts((told,)) == ()
+    (copied,) = doubts((replace(told, heldout=replace(held, placebo_gain=0.02)),))
+    assert copied.startswith(
+        "hysteresis: other readings than it was fitted to are foretold no better"
+    )
+    owed = OnPriors(3.4, 3.0, False, (Assumed(NAME, 2.7, 4.1), Assumed(NOISE, 5.0, 1.2)))
+    (note,) = doubts((replace(told, priors=owed),))
+    assert note == (
+        "hysteresis owes its name to what is assumed: with twice of steps of the noise from octave "
+        "to octave it has 1 nats of odds, 3 are asked"
+    )

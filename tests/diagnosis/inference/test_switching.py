@@ -1,0 +1,102 @@
+"""Sources that switch: states of a chain, moments of change, and the law of a spell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracks import experiment, track_of
+
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
+from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.inference.likelihood import richest_model
+from ahrsd.diagnosis.inference.search.search_space import space_at
+from ahrsd.diagnosis.inference.search.switching_sources import (
+    SpellLaw,
+    changes,
+    likeliest_states,
+    switching,
+)
+from ahrsd.diagnosis.track import Spec
+
+PIECE_S, ROWS = 0.2, 5
+
+
+def squares(left: np.ndarray) -> np.ndarray:
+    """Of the sum of each piece's rows."""
+    return np.sum(left.reshape(-1, ROWS, 3).sum(axis=1) ** 2, axis=1)
+
+
+def test_spells_are_on_and_paid_with_the_probability_of_their_chain():
+    left = np.random.default_rng(1).standard_normal((600 * ROWS, 3))
+    on = np.zeros(600, dtype=bool)
+    on[100:110] = on[400:407] = True
+    left += np.repeat(on, ROWS)[:, None] * [4.0, 0.0, -3.0]
+    found, log_odds = likeliest_states(squares(left), np.full(600, float(ROWS)), PIECE_S)
+    np.testing.assert_array_equal(found, on)
+    stays_on, stays_off = np.exp(-PIECE_S / priors.SPELL_S), np.exp(-PIECE_S / priors.BETWEEN_S)
+    chain = 581 * np.log(stays_off) + 15 * np.log(stays_on)
+    chain += 2 * np.log((1 - stays_on) * (1 - stays_off))
+    assert log_odds == pytest.approx(chain, abs=1e-9)
+
+
+def test_noise_is_never_on_and_never_changes():
+    left = np.random.default_rng(2).standard_normal((3000, 3))
+    found, _ = likeliest_states(squares(left), np.full(600, float(ROWS)), PIECE_S)
+    assert not found.any()
+    assert changes(left, 10) == []
+
+
+def test_a_chain_of_noise_and_ever_less_is_off():
+    found, log_odds = likeliest_states(np.zeros(50), np.full(50, float(ROWS)), PIECE_S)
+    assert not found.any()
+    assert log_odds == pytest.approx(-50 * PIECE_S / priors.BETWEEN_S)
+
+
+def test_levels_change_where_they_do():
+    left = np.random.default_rng(3).standard_normal((2000, 3))
+    for row, change in ((400, 6.0), (700, -6.0), (705, 0.0), (1500, 5.0)):
+        left[row:, 1] += change
+    found = np.array(changes(left, 10))
+    assert len(found) == 3
+    assert np.abs(found - [400, 700, 1500]).max() <= 1
+
+
+def test_a_spell_s_slopes_are_those_of_differences():
+    law = SpellLaw(np.array([0.0, 0.5, 1.0, 3.0]), 1e-3)
+    psi = np.array([0.4, 0.7])
+    assert law.log_variance(psi)[0] == pytest.approx(2 * np.log(1e-3) + 0.8)
+    for k in range(2):
+        step = 1e-6 * np.eye(2)[k]
+        ahead, behind = law.log_variance(psi + step), law.log_variance(psi - step)
+        np.testing.assert_allclose(law.slope(psi)[:, k], (ahead - behind) / 2e-6, atol=1e-6)
+    volume = np.prod(law.high - law.low)
+    assert law.log_prior(psi)[0] == pytest.approx(-np.log(volume))
+    np.testing.assert_array_equal(law.log_prior(psi)[1], [0.0, 0.0])
+
+
+def test_spells_are_found_to_a_second_and_what_was_tried_is_not_kept():
+    track = replace(track_of(experiment("wam", seed=22, samples=3000)), accel_b_m_s2=None)
+    since_s = track.time_s - track.time_s[0]
+    true = [(20.0, 22.0), (50.0, 51.5), (80.0, 83.0)]
+    on = np.any([(since_s >= a) & (since_s < b) for a, b in true], axis=0)
+    lamp = on[:, None] * np.array([0.02, -0.015, 0.01])
+    track = replace(track, mag_b_gauss=track.mag_b_gauss + lamp)
+    problem, cold = problem_of(track, Spec())
+    fit = fit_null(problem.track, problem.spec, cold, walk=False)
+    all_sets, _ = space_at(richest_model.richest(problem, fit.filtered, EFFECTS), EFFECTS, ())
+    nothing = all_sets.judge(())
+    known = set(all_sets.made.seen)
+    comes = [one for one in switching(all_sets, nothing) if "spans_s" in one.setting]
+    assert [one.frame for one in comes] == ["sensor", "world"]
+    assert all_sets.made.seen.keys() == known
+    told = np.array(comes[0].setting["spans_s"]) - track.time_s[0]
+    assert told.shape == (3, 2)
+    np.testing.assert_allclose(told, true, atol=1.0)
+    assert comes[0].columns.mag is not None
+    outside = ~np.any([(since_s >= a - 1.0) & (since_s < b + 1.0) for a, b in true], axis=0)
+    at_rows = np.interp(problem.track.time_s, track.time_s, outside) > 0.5
+    assert not np.any(comes[0].columns.mag[at_rows])
