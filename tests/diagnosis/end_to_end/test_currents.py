@@ -36,7 +36,7 @@ def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:
     )
 
 
-@pytest.mark.slow  # quick ones: inference/test_one_model, test_turret
+@pytest.mark.slow  # quick ones: inference/test_diagnose, test_turret
 @pytest.mark.parametrize("shape", ["quick square", "pulses", "square", "levels"])
 def test_an_unlogged_current_is_one_source_on_the_vehicle(shape: str) -> None:
     track = track_of(experiment("wam", seed=6, samples=3000))

@@ -25,7 +25,7 @@ def test_a_bias_that_walks_a_lot_is_named_and_leaves_nothing(track):
     assert not found.unexplained.detected
 
 
-@pytest.mark.slow  # a walk that is named, quick: inference/test_one_model
+@pytest.mark.slow  # a walk that is named, quick: inference/test_diagnose
 @pytest.mark.parametrize(
     ("seed", "size"),
     [
