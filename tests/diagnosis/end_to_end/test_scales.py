@@ -16,8 +16,6 @@ from ahrsd.diagnosis.track import Track
 
 #: what is known wrong of a compensation that updates in steps
 _STEPS_LEFT = "its part is 2.8 deviations off: its steps leave something unknown"
-    "its part is 2.8 deviations off: its steps leave an unknown, of which they know nothing"
-)
 
 
 def _quiet(seed: int) -> tuple[Track, Readings]:
