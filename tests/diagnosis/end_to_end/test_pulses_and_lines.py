@@ -22,8 +22,8 @@ def quiet() -> Track:
     return made(Trial(seed=5, samples=7000, rate_hz=RATE_HZ)).track
 
 
-def test_unlogged_pulses_are_named() -> None:
-    quiet = made(Trial(seed=5, samples=4500, rate_hz=RATE_HZ)).track
+@pytest.mark.slow  # a quick one: the next
+def test_unlogged_pulses_are_named(quiet: Track) -> None:
     since = (quiet.time_s - 0.4) % 1.37
     hit = np.where(since < 0.06, 1.0, 0.0)[:, None]
     pulsed = replace(quiet, mag_b_gauss=quiet.mag_b_gauss + 2.5e-3 * hit * np.array([0.8, 0, 0.6]))
@@ -33,13 +33,19 @@ def test_unlogged_pulses_are_named() -> None:
     assert abs(found[0].parameters[0].value - 2e-3) < 5e-4
 
 
-@pytest.mark.slow
-def test_what_the_form_of_pulses_leaves_is_no_line(quiet: Track) -> None:
-    """Pulses that swell and fade, held for a box, leave multiples of their rate."""
+def test_pulses_that_swell_and_fade_are_one_name() -> None:
+    """Folded by the working rate they look like what real recordings leave.
+
+    Held for a box, they leave multiples of their rate.
+    """
+    quiet = made(Trial(seed=5, samples=4500, rate_hz=RATE_HZ)).track
     part = np.minimum(((quiet.time_s - 0.4) % 1.0661) / 0.12, 1.0)
     swell = np.sin(np.pi * part)[:, None] ** 2
     pulsed = replace(quiet, mag_b_gauss=quiet.mag_b_gauss + 1e-2 * swell * np.array([0.6, 0, 0.8]))
-    assert [one.effect for one in diagnose(pulsed).findings] == ["sync_pulses"]
+    found = diagnose(pulsed)
+    assert [one.effect for one in found.findings] == ["sync_pulses"]
+    assert abs(found.findings[0].setting["period_s"] - 1.0661) < 1e-3
+    assert not found.unexplained.detected
 
 
 @pytest.mark.slow
