@@ -81,8 +81,9 @@ class HeldOut:
         self.samples = int(np.count_nonzero(np.isfinite(recorded.mag_b_gauss).all(axis=1)))
 
     def rows(self, names: Names) -> WhiteRows:
-        """A set's rows in its own noise."""
+        """A set's rows in its own noise; those of the best set and of the last one asked stay."""
         if names not in self._rows:
+            self._rows = {key: one for key, one in self._rows.items() if key == self.best.names}
             self._rows[names] = white_rows(self.all_sets, self.all_sets.judge(names, self.best))
         return self._rows[names]
 
