@@ -22,12 +22,10 @@ from ahrsd.diagnosis.data_quality.preparation import prepared, with_holes
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.answer.whole_answer import whole_answer
-from ahrsd.diagnosis.inference.decision.members import nats_of_remainder
+from ahrsd.diagnosis.inference.both_rates import found_at_both_rates
 from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.inference.likelihood.column_clocks import wrong_clock
 from ahrsd.diagnosis.inference.lost_turns import broken_where_unsampled, lost_beside, nats
-from ahrsd.diagnosis.inference.recorded_rate import Quick, quick
-from ahrsd.diagnosis.inference.search_rounds import Searched, answered
 from ahrsd.diagnosis.track import Spec, Track
 
 
@@ -89,13 +87,13 @@ def _answered(
             return replace(at_its_time, found=replace(moved, notes=(said, *moved.notes)))
     still = resting(start.context(), library) if at_rest(start) else ()
     searched = told_at_rest(library, still) if at_rest(start) else library
-    found, fast = _found(problem, richest, start, searched)
+    found, fast = found_at_both_rates(problem, richest, start, searched)
     beside = lost_beside(came, found, fast, lost)
     if differ(lost, beside):
         other = counted.with_facts(beside)
         otherwise, begin = begun(other.put_right(), spec)
         richest = richest_model.richest(otherwise, begin.filtered, library)
-        again, quickly = _found(otherwise, richest, begin, searched)
+        again, quickly = found_at_both_rates(otherwise, richest, begin, searched)
         if nats(again, beside) > nats(found, lost):
             asked, problem, start, found, fast = other, otherwise, begin, again, quickly
     told = whole_answer(
@@ -109,46 +107,3 @@ def _answered(
         simulated=simulated,
     )
     return Answered(told, problem, start)
-
-
-def _found(
-    problem: Problem, richest: richest_model.Judged, start: NullFit, library: Mapping[str, Effect]
-) -> tuple[Searched, Quick]:
-    """The search, and what only the recorded rate shows; with that taken out the search anew.
-
-    A source that is quicker than the working rate is folded by it and looks like what real
-    recordings leave.  Where it is surer than that, and without it nothing of the kind is left, it
-    is the source.
-    """
-    found = answered(richest, library)
-    real = found.all_sets.is_real(found.answer.best.names)
-    fast = _quick(found, library, real=real)
-    if fast.slower is not None:
-        return _without_quick(problem, fast, start, library)
-    if real:
-        instead = _quick(found, library, real=False)
-        left_nats = nats_of_remainder(found.all_sets, found.answer.best)
-        if instead.slower is not None and instead.answer.log_odds > left_nats:
-            again, quickly = _without_quick(problem, instead, start, library)
-            if not again.all_sets.is_real(again.answer.best.names):
-                return again, quickly
-    return found, fast
-
-
-def _without_quick(
-    problem: Problem, fast: Quick, start: NullFit, library: Mapping[str, Effect]
-) -> tuple[Searched, Quick]:
-    """The search anew, without what the recorded rate shows."""
-    if fast.slower is None:
-        raise ValueError("nothing was found at the recorded rate")
-    again = fit_null(fast.slower.track, problem.spec, start.model, walk=False)
-    found = answered(richest_model.richest(fast.slower, again.filtered, library), library)
-    real = found.all_sets.is_real(found.answer.best.names)
-    return found, replace(fast, left=_quick(found, library, real=real).left)
-
-
-def _quick(found: Searched, library: Mapping[str, Effect], *, real: bool) -> Quick:
-    answer = found.answer
-    switches = any(key in found.space.sources for key in answer.unknown)
-    nats = answer.unexplained.evidence_nats if switches else 0.0
-    return quick(found.all_sets.made, answer.best, library, real=real, source_nats=nats)

@@ -8,10 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.answer.added_field import heading_error_deg
-from ahrsd.diagnosis.answer.diagnosis import Cost, Finding, Share, Value, Where
+from ahrsd.diagnosis.answer.diagnosis import Finding, Share, Value, Where
 from ahrsd.diagnosis.answer.text import separating_manoeuvre
-from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
 from ahrsd.diagnosis.effects.effect import Effect, Setting
 from ahrsd.diagnosis.inference.components.effect_components import (
     LAG,
@@ -19,10 +17,9 @@ from ahrsd.diagnosis.inference.components.effect_components import (
     holds,
 )
 from ahrsd.diagnosis.inference.components.ordinary_remainder import GYRO_MATRIX, TURNS
-from ahrsd.diagnosis.inference.decision.members import added_by, coefficients
+from ahrsd.diagnosis.inference.decision.members import added_by, coefficients, cost_if_left_out
 from ahrsd.diagnosis.inference.decision.which_delay import delay_unit, which_delay
 from ahrsd.diagnosis.inference.likelihood.candidates import beside
-from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, model_of
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.inference.search.near_settings import changed, opened
 from ahrsd.diagnosis.model import Term
@@ -55,7 +52,7 @@ def as_finding(
         setting["time_constant_s"] = float(value[0])
     where = _where(all_sets, best, key, effect.frame or effect.family)
     found = _found(effect, shares, where, value, deviation, setting, odds, library)
-    found = replace(found, cost_if_left_out=_cost(all_sets, best, key))
+    found = replace(found, cost_if_left_out=cost_if_left_out(all_sets, best, key))
     return found, Term(effect.identifier, value, deviation, setting)
 
 
@@ -100,19 +97,6 @@ def _found(
         setting=setting,
         evidence_nats=float(odds),
     )
-
-
-def _cost(all_sets: Hypotheses, best: Hypothesis, key: str) -> Cost:
-    """What the calibration would be off by in the set without a member."""
-    made = all_sets.made
-    middle, here = prior_of(made.point.problem.track).mean, made.point.filtered.model
-    fewer = all_sets.judge(all_sets.without(best.names, key), best)
-    left_out, known = (
-        model_of(coefficients(all_sets, one, CALIBRATION)[0] + middle, here)
-        for one in (fewer, best)
-    )
-    shift = np.linalg.norm(left_out.hard_iron_gauss - known.hard_iron_gauss)
-    return Cost(float(shift), heading_error_deg(left_out, known, made.context.field_b))
 
 
 def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> dict[str, float]:
@@ -176,7 +160,7 @@ def drift_finding(
     shares = {effect.identifier: whole, **shares}
     where = _where(all_sets, best, key, effect.frame or effect.family)
     found = _found(effect, shares, where, drift, unsure, kept, odds, library)
-    found = replace(found, cost_if_left_out=_cost(all_sets, best, key))
+    found = replace(found, cost_if_left_out=cost_if_left_out(all_sets, best, key))
     return found, Term(effect.identifier, drift, unsure, kept)
 
 
@@ -192,5 +176,5 @@ def turn_finding(
     where = _where(all_sets, best, GYRO_MATRIX, effect.frame or effect.family)
     shares = {effect.identifier: 1.0}
     found = _found(effect, shares, where, -turn, unsure, {}, odds, library)
-    found = replace(found, cost_if_left_out=_cost(all_sets, best, GYRO_MATRIX))
+    found = replace(found, cost_if_left_out=cost_if_left_out(all_sets, best, GYRO_MATRIX))
     return found, Term(effect.identifier, -turn, unsure, {})

@@ -7,9 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.answer.added_field import heading_error_deg
+from ahrsd.diagnosis.answer.diagnosis import Cost
+from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
 from ahrsd.diagnosis.inference.components.component import Sized
 from ahrsd.diagnosis.inference.components.effect_components import LAG
 from ahrsd.diagnosis.inference.components.ordinary_remainder import still_spells
+from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, model_of
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.samples import Array
 
@@ -85,3 +89,16 @@ def nats_of_remainder(all_sets: Hypotheses, best: Hypothesis) -> float:
     """By how much likelier a set is with what recordings ordinarily leave."""
     without = best.names - frozenset(all_sets.remainder)
     return 0.0 if without == best.names else best.score - all_sets.judge(without).score
+
+
+def cost_if_left_out(all_sets: Hypotheses, best: Hypothesis, key: str) -> Cost:
+    """What the calibration would be off by in the set without a member."""
+    made = all_sets.made
+    middle, here = prior_of(made.point.problem.track).mean, made.point.filtered.model
+    fewer = all_sets.judge(all_sets.without(best.names, key), best)
+    left_out, known = (
+        model_of(coefficients(all_sets, one, CALIBRATION)[0] + middle, here)
+        for one in (fewer, best)
+    )
+    shift = np.linalg.norm(left_out.hard_iron_gauss - known.hard_iron_gauss)
+    return Cost(float(shift), heading_error_deg(left_out, known, made.context.field_b))
