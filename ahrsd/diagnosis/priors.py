@@ -169,6 +169,9 @@ SAME_FORM = 0.5
 #: part of the evidence of what is unknown that a name beside it must have;  source: stand-ins .25
 #: and .46 there, the one that is there .75
 BESIDE_UNKNOWN = 0.5
+#: part of the square of what a name and its form add that the name's own columns hold at least;
+#: source: pulses .92 (that swell and fade) and 1.0, a square current taken for pulses .29
+OWN_PART = 0.5
 #: coefficients of a set that is asked, at most: the time that it takes goes by the cube;  source:
 #: a flight with its current and magnets put on were told with sets of up to 770, counted once
 WIDEST = 800

@@ -95,11 +95,27 @@ def _come_and_gone(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypo
 
 
 def _is_form(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
-    """Whether of a member only what it leaves of its form is there: it is no name of anything."""
+    """Whether of a member mostly what it leaves of its form is there: it is no name of anything.
+
+    Its coefficients are within their deviations, or its own columns, however large, hold less than
+    the larger part of what both add.
+    """
     if key not in all_sets.forms:
         return False
     value, deviation = coefficients(all_sets, best, key)
-    return bool(np.all(np.abs(value) < deviation))
+    if np.all(np.abs(value) < deviation):
+        return True
+    if key == LAG:
+        return False
+    columns = all_sets.component(key).columns
+    own = columns.mag if columns.on_mag else columns.gyro
+    if own is None:
+        return False
+    added = [added_by(all_sets, best, one)[0] for one in (key, all_sets.forms[key])]
+    both = np.sum(added, axis=0).ravel()
+    flat = np.asarray(own).reshape(len(both), -1)
+    held = flat @ np.linalg.lstsq(flat, both)[0]
+    return bool(held @ held < priors.OWN_PART * (both @ both))
 
 
 def _without_one_moment(
