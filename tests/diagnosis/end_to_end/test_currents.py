@@ -158,14 +158,11 @@ def _late(seed: int, shape: str, lag_s: float) -> Track:
     return replace(track_of(made), mag_b_gauss=mag, covariates={"motor_current_a": current})
 
 
-_BETWEEN = "edges every two seconds are drawn straight between two samples: false pulses"
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "shape"),
     [
-        pytest.param(6, "quick square", marks=pytest.mark.xfail(strict=True, reason=_BETWEEN)),
+        (6, "quick square"),
         (6, "square"),
         (11, "square"),
         (11, "pulses"),

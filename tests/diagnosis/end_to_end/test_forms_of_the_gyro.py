@@ -41,12 +41,17 @@ def test_a_scale_that_differs_between_the_senses_of_rotation_has_no_name(track: 
 
 
 @pytest.mark.slow
-def test_a_gyro_that_turns_more_to_one_side_is_an_unknown_of_the_gyro():
+def test_a_gyro_that_turns_more_to_one_side_has_its_mean_scale_and_an_unknown_of_the_gyro():
     track = made(Trial(8, samples=8_000, rate_hz=25.0)).track
     rate = track.gyro_b_rad_s
     uneven = rate + 0.004 * np.maximum(rate, 0.0)
     found = diagnose(replace(track, gyro_b_rad_s=uneven))
-    assert found.findings == ()
+    (scale,) = found.findings
+    assert {scale.effect, *(one.effect for one in scale.alternatives)} == {
+        "clock_rate",
+        "gyro_scale",
+    }
+    assert scale.parameters[0].value == pytest.approx(0.002, abs=2e-4)
     assert found.unexplained.detected
     assert found.unexplained.where.frame == "gyro"
     assert found.unexplained.evidence_nats > 15.0

