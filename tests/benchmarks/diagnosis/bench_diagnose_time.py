@@ -24,6 +24,7 @@ sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 
 from mismatch_trials import Trial, made
 
+from ahrsd.diagnosis.inference import both_rates
 from ahrsd.diagnosis.inference import diagnose as engine
 from ahrsd.diagnosis.track import Track
 from ahrsd.offline.diagnose import diagnose_recording
@@ -42,11 +43,12 @@ KINDS = {
         "hidden": ("motor_current_a",),
     },
 }
-#: functions of the engine that are timed, in the order in which they run
-PHASES = (
-    "prepared", "problem_of", "fit_null", "lost_turns", "wrong_clock", "answered", "quick",
-    "lost_beside", "whole_answer", "beyond_chance",
-)  # fmt: skip
+#: functions that are timed, in the order in which they run, and the modules that call them
+PHASES = {
+    **dict.fromkeys(("prepared", "problem_of", "fit_null", "lost_turns", "wrong_clock"), engine),
+    **dict.fromkeys(("answered", "quick"), both_rates),
+    **dict.fromkeys(("lost_beside", "whole_answer", "beyond_chance"), engine),
+}
 
 
 def written(track: Track, path: Path) -> Path:
@@ -80,7 +82,7 @@ def command_s(path: Path) -> float:
 def phases_s(path: Path) -> dict[str, float]:
     """Processor seconds of every phase."""
     spent: dict[str, float] = defaultdict(float)
-    plain = {name: getattr(engine, name) for name in PHASES}
+    plain = {name: getattr(module, name) for name, module in PHASES.items()}
 
     def timed(name):
         def run(*arguments, **options):
@@ -92,13 +94,13 @@ def phases_s(path: Path) -> dict[str, float]:
 
         return run
 
-    for name in PHASES:
-        setattr(engine, name, timed(name))
+    for name, module in PHASES.items():
+        setattr(module, name, timed(name))
     begin = time.process_time()
     diagnose_recording(path)
     whole = time.process_time() - begin
-    for name in PHASES:
-        setattr(engine, name, plain[name])
+    for name, module in PHASES.items():
+        setattr(module, name, plain[name])
     return {"in process": whole, **{name: spent[name] for name in PHASES}}
 
 
