@@ -26,6 +26,7 @@ from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis.inference import both_rates
 from ahrsd.diagnosis.inference import diagnose as engine
+from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.track import Track
 from ahrsd.offline.diagnose import diagnose_recording
 from ahrsd.recording.table import write_table
@@ -46,6 +47,7 @@ KINDS = {
 #: functions that are timed, in the order in which they run, and the modules that call them
 PHASES = {
     **dict.fromkeys(("prepared", "problem_of", "fit_null", "lost_turns", "wrong_clock"), engine),
+    "richest": richest_model,
     **dict.fromkeys(("answered", "quick"), both_rates),
     **dict.fromkeys(("lost_beside", "whole_answer", "beyond_chance"), engine),
 }
