@@ -18,7 +18,6 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Finding,
     RegimeMap,
 )
-from ahrsd.diagnosis.calibration_fit.gyro_at_rest import at_rest
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, baseline
 from ahrsd.diagnosis.data_quality.facts import Fact, of_fact, rounding
 from ahrsd.diagnosis.data_quality.preparation import Prepared
@@ -89,7 +88,7 @@ def whole_answer(
         unexplained=left,
         posterior_predictive=_checked(residuals, maps, fast.answer, quickly),
         sensitivity=() if something else visibility.limits([*alone, *_seen_quickly(fast)]),
-        notes=support.notes(asked, found, said, still=at_rest(start), something=something),
+        notes=support.notes(asked, start, found, said, something=something),
         model=fast.left.filtered.model,
         noise=repaired_noise(found, fast, library, asked.facts, _spans(loud)),
         terms=(*_as_recorded((*answer.terms, *fast.answer.terms), found), *rounding(asked.facts)),
