@@ -77,7 +77,7 @@ TRANSITION_S = 2.0
 APPROACH_S = 4.0
 #: of a further step of a kind that is there: what was put on is taken off
 AGAIN = 0.3
-#: steps of a kind, or spells, from which on they are one source that changes, which has no name
+#: steps of a kind from which on they are one source that changes, which has no name
 CHANGES = 3
 #: of a course in time that nothing names, in one frame
 COURSE = 1.0 / 20.0

@@ -12,6 +12,7 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.inference.search.search_space import space_at
 from ahrsd.diagnosis.inference.search.switching_sources import (
@@ -100,3 +101,21 @@ def test_spells_are_found_to_a_second_and_what_was_tried_is_not_kept():
     outside = ~np.any([(since_s >= a - 1.0) & (since_s < b + 1.0) for a, b in true], axis=0)
     at_rows = np.interp(problem.track.time_s, track.time_s, outside) > 0.5
     assert not np.any(comes[0].columns.mag[at_rows])
+
+
+def test_what_runs_for_seven_seconds_once_is_unknown_where_it_does():
+    """Iron that turns one way and the other, twice a second or less: a single spell is a source."""
+    track = replace(track_of(experiment("wam", seed=23, samples=3000)), accel_b_m_s2=None)
+    since_s = track.time_s - track.time_s[0]
+    runs = (since_s >= 56.0) & (since_s < 63.0)
+    turned = np.random.default_rng(4).standard_normal((len(track), 3))
+    turned = np.apply_along_axis(np.convolve, 0, turned, np.hanning(13) / 2.0, "same")
+    added = 0.005 * runs[:, None] * turned
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    left = found.unexplained
+    assert found.findings == ()
+    assert left.detected
+    assert left.where.frame == "sensor"
+    assert left.evidence_nats > 30.0
+    told_s = np.array(left.where.intervals_s) - track.time_s[0]
+    np.testing.assert_allclose([told_s.min(), told_s.max()], [56.0, 63.0], atol=1.0)

@@ -2,10 +2,10 @@
 
 Of the first there is nothing for most of the time, and for spells a field of its own.
 
-What switches now and then, hits, rings or passes shows as bursts of seconds.  A course in time over
-the whole recording is no law of that, and beside noise of any colour, which is as loud all of the
-time, no evidence of it is left.  Here the time is a chain of two states, and while it is on the
-source is a free course:
+What switches now and then, hits, rings or passes, once or often, shows as bursts of seconds.  A
+course in time over the whole recording is no law of that, and beside noise of any colour, which is
+as loud all of the time, no evidence of it is left.  Here the time is a chain of two states, and
+while it is on the source is a free course:
 
     x(t) = sum_k w_k cos(pi k (t - t0) / T) in a spell from t0 to t0 + T,  k from 0 on
     var w_k = size^2 / (1 + (k / T corner)^2)
@@ -104,7 +104,7 @@ def switching(all_sets: Hypotheses, here: Hypothesis) -> list[Component]:
     # of what is often alike noise of a colour would leave nothing
     quiet = replace(here.at, log_noise=np.full(len(here.at.log_noise), here.at.log_noise[-1]))
     found: list[Component] = []
-    if len(spells) >= priors.CHANGES:
+    if spells:
         spells = _closest(all_sets, here, quiet, spells, rows)
         log_odds -= 2 * len(spells) * float(np.log(rows))  # ends are sought to a row, not a piece
         found += [_coming(made.context, frame, spells, log_odds) for frame in FRAMES]
