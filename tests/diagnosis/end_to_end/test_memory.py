@@ -46,7 +46,7 @@ def test_a_low_pass_begins_where_it_was_left() -> None:
 
 
 def test_iron_that_had_not_settled_is_no_step_and_no_drift() -> None:
-    track = made(Trial(6, scenario="wam", samples=4000)).track
+    track = made(Trial(6, scenario="wam", samples=2500)).track
     setting = {"time_constant_s": 25.0, "memory": (0.3, -0.25, 0.2)}
     value = np.array([0.02, 0.012, -0.008, 0.004, -0.006, 0.005])
     term = Term("viscous_magnetisation", value, np.zeros(6), setting)

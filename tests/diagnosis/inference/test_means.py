@@ -16,8 +16,8 @@ PER_AMPERE = np.array([1.2e-3, -0.7e-3, 0.5e-3])
 
 
 def driven(seed: int, memory_s: float, mean_s: float):
-    """160 s beside a current that forgets in memory_s and is logged as a mean of mean_s."""
-    track = track_of(experiment("wam", seed=seed, samples=4000))
+    """120 s beside a current that forgets in memory_s and is logged as a mean of mean_s."""
+    track = track_of(experiment("wam", seed=seed, samples=3000))
     kept, count = np.exp(-track.step_s / memory_s), max(1, round(mean_s / track.step_s))
     drawn = np.random.default_rng(seed).normal(0.0, np.sqrt(1 - kept**2), len(track))
     amps = 6.0 + 2.5 * lfilter([1.0], [1.0, -kept], drawn)
