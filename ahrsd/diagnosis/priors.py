@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import exp
+from math import exp, log
 
 from ahrsd.estimator import locked
 
@@ -197,6 +197,182 @@ BINS_OUTSIDE = 0.01
 PASSING_S = 30.0
 #: probability by chance, and correlation, of a logged column that is said to move with a course
 CHANCE, ALIKE = 0.2, 0.5
+
+# --- noise that is louder for a while ------------------------------------------------------------
+#: nats by which a change of level must be likelier than none;  source: with the 20,000 stretches
+#: that 400 s have, one recording of one level in ten thousand has such a one
+LOUDER_NATS = 17.0
+#: of the two variances, at least;  chosen
+LOUDER_RATIO = 1.3
+#: deviations from which a reading is no more a sign of a louder noise
+LOUDER_OUTLIER = 3.0
+#: part of the recording that a burst may last;  part of a stretch that is loud, from which on it is
+#: loud throughout;  chosen
+BURST_SHARE, BURST_FILLED = 0.4, 0.7
+#: correlation of successive differences of noise, at most;  source: -1/2 where it is white
+NOISE_OPPOSED = -0.3
+#: variance over the spec's, from which on the noise is above it;  chosen
+LEVEL_RATIO = 1.15
+
+# --- data quality: how sure a fact is ------------------------------------------------------------
+#: probability of a name that was counted and compared: a limit, coarse steps, stamps, axes, units
+SURE_OF_READINGS = 0.99
+#: the same of lost turns and of louder noise, which are told against noise
+SURE_OF_NOISE = 0.98
+#: of samples that came twice;  of a clock's rate against another;  of time that goes back
+SURE_OF_DOUBLED, SURE_OF_CLOCK, SURE_BACKWARDS = 0.95, 0.95, 0.9
+
+# --- data quality: time stamps -------------------------------------------------------------------
+#: share of the samples that are missing, from which on it is said;  chosen
+MISSING_SHARE = 1e-3
+#: of the step, from which on scatter is jitter unless the field says that the steps are as stamped;
+#: below, only where the field says that they are even
+JITTER_SHARE = 0.03
+#: correlation of neighbouring steps that scatter, at most;  source: -1/2 of late stamps
+JITTER_OPPOSED = -0.25
+#: nats for steps as stamped, against steps of a regular clock, or the reverse
+STAMPED_NATS = 5.0
+#: deviations beyond which a change of the field is not asked for that
+STAMPED_OUTLIER = 5.0
+#: relative rate between two clocks that is worth a word
+CLOCK_RATE = 2e-4
+#: s of a break that is believed whatever the recording's length;  what is left of one that is not
+BREAK_BELIEVED_S, BREAK_LEFT_S = 60.0, 10.0
+#: share of the samples that are missing, and scatter of the stamps of the step, from which on they
+#: are a finding;  source: by honest stamps they are part of the recording and no difference from
+#: its simulation, which has the same stamps, unless there are so many
+MISSING_FINDING_SHARE, JITTER_FINDING_SHARE = 0.02, 0.05
+
+# --- data quality: lost turns --------------------------------------------------------------------
+#: samples before and after a jump, and how many deviations of a mean a step's turn must have;
+#: source: over more samples there are fewer jumps by chance
+LOST_TURN_AVERAGED = ((3, 7.0), (12, 5.0))
+#: steps by which a jump may be off a whole number
+LOST_TURN_NEAR = 0.3
+#: jumps, at least;  chosen
+LOST_TURNS_FEWEST = 5
+#: nats by which they must be whole steps rather than noise;  source: others have 160 and more
+LOST_TURNS_NATS = 12.0
+#: and nats that each must have in the mean;  source: a gyro that reads 3 % too little is ahead all
+#: the time, and on a path through a room 13 jumps had 2.4 each; lost turns have 3.8 and more
+LOST_TURN_EACH_NATS = 3.0
+#: deviations of a mean that no noise jumps by;  part of such a jump that is across the turn, more
+#: than a lost one has
+JUMP_CLEAR, JUMP_ACROSS = 8.0, 0.5
+#: deviations of a jump that many turns in a row were lost at, which nobody can count
+JUMP_LONG = 30.0
+#: nats of one lost turn beyond its share of the rows;  chosen
+LOST_TURN_BEYOND_SHARE_NATS = 3.0
+#: times as many rows as are averaged: else their spread is not known
+LOST_TURN_ROWS = 10
+#: nats that each further step of a gap costs: one in four gaps is longer by one more
+LONGER_GAP_NATS = log(4.0)
+#: chi square, of two axes, of a jump's part across the turn that one in 400 is beyond
+JUMP_ACROSS_CHI2 = 12.0
+#: nats for a step that counts twice;  source: one in twenty does, and must be surer than chance
+COUNTED_TWICE_NATS = 6.0
+#: nats that one jump is worth at most: several must say it, not a field that jumps once
+JUMP_MOST_NATS = 6.0
+#: of a step, in the mean over the rows that have a part of it: what a lost turn has there, and what
+#: it has not
+LOST_TURN_PART, OTHER_PARTS = 0.7, (0.3, 1.4)
+#: nats by which all jumps together must be lost turns, less so many times those backward;  source:
+#: 3.5 is the most of 370 recordings with none lost
+LOST_TURNS_TOGETHER_NATS, LOST_TURNS_BACKWARD = 12.0, 3.0
+
+# --- data quality: limits and steps of the numbers -----------------------------------------------
+#: samples at a limit, and their share of all samples, at least;  chosen
+LIMIT_FEWEST, LIMIT_SHARE = 8, 1e-3
+#: times as many at a limit as at each number just inside it;  chosen
+LIMIT_PILED = 6.0
+#: noise levels, and share of the limit, at which it begins to act
+LIMIT_MARGIN_NOISE, LIMIT_MARGIN_SHARE = 5.0, 0.02
+#: steps of coarse numbers: as many at the top as one step below are no limit
+LIMIT_TOP_STEPS = 1.5
+#: noise levels that hold a heap of readings at a limit that noise is added to
+LIMIT_HEAP_NOISE = 7.0
+#: sides of axes that end at a shared limit, and how alike they are, of it
+LIMIT_SIDES, LIMIT_ALIKE = 3, 0.01
+#: share of the readings that differ from all others, where numbers are fine
+FINE_NUMBERS = 0.5
+#: steps of the numbers over the noise's deviation that matter
+COARSE_STEPS = 2.0
+
+# --- data quality: axes and units ----------------------------------------------------------------
+#: cost of the best frame, of that of no motion, at most;  chosen
+FRAME_EXPLAINED = 0.6
+#: times the cost, and nats, by which the frame as recorded must be worse;  chosen
+FRAME_BETTER, FRAME_NATS = 1.5, 20.0
+#: times the cost by which iron that deforms may favour another frame: it is left out there
+FRAME_BENT = 3.0
+#: rad/s that no vehicle has for long;  factor from that of degrees within which the scale is theirs
+FAST_RAD_S, DEGREES_NEAR = 3.0, 1.1
+#: factor from a unit's own within which the gyro's scale is that unit
+SAME_UNIT = 1.2
+#: factor of the gyro's scale beyond which it is another unit
+OTHER_UNIT = 2.0
+#: part of the rates' variance that is noise, at most, for a factor that is no unit's to be believed
+RATES_NOISE_SHARE = 0.05
+#: cost below which a part of a recording is explained;  chosen
+PART_EXPLAINED = 0.1
+#: part of gravity's turns that the gyro may leave, and how many times more by other axes;  chosen
+GRAVITY_EXPLAINED, GRAVITY_BETTER = 0.5, 1.5
+#: readings of an ellipsoid, more than;  chosen
+ELLIPSOID_READINGS = 100
+#: sine of the inclination from which up and down are told
+STEEP = 0.15
+#: degrees of a turn beyond any quarter from which a mount is askew, and no crooked sensor any more
+ASKEW_DEG = 10.0
+#: of a map that is a turn: its longest axis over its shortest, at most;  deviations by which it is
+#: no quarter
+ASKEW_ROUND, ASKEW_TOLD = 1.25, 4.0
+#: cosine of a turn's axis to the sensor's, to be called by its name
+ASKEW_ABOUT = 0.97
+
+# --- data quality: stuck, held and doubled readings ----------------------------------------------
+#: part of the field, and noise levels, by which a reading should have moved;  chosen
+STUCK_MOVED_SHARE, STUCK_MOVED_NOISE = 0.1, 8.0
+#: steps of coarse readings by which it should: they repeat themselves where they turn the least
+STUCK_MOVED_STEPS = 20.0
+#: rad that the gyro turned by while a magnetometer never changed, beyond which it is stuck;  chosen
+STUCK_TURNED_RAD = 0.3
+#: rows that one axis, or the gyro, repeats at least;  chosen
+AXIS_STUCK_ROWS = 8
+#: part of what is left of the field's changes which lies as a turn about one axis of the gyro;
+#: noise levels that this is at least;  rad about that axis, by the field, beyond which it is dead
+DEAD_AXIS_SHOWN, DEAD_AXIS_NOISE, DEAD_AXIS_TURNED_RAD = 0.5, 3.0, 0.1
+#: usual size of a reading in any unit of a field, from tesla to nanotesla
+FIELD_READINGS = (1e-6, 1e6)
+#: readings so many times the usual field are none;  nor are rates so many times the quickest but
+#: for one in a thousand and beyond what is quick in any unit
+IMPOSSIBLE_FIELD, IMPOSSIBLE_RATE, IMPOSSIBLE_RAD_S = 100.0, 100.0, 40.0
+#: rows that a stuck reading lasts at least, and so many times as long as a reading usually does
+STUCK_ROWS, STUCK_LONGER = 8, 5.0
+#: noise levels by which the field must have turned during the repetition;  chosen
+STUCK_TURNED_NOISE = 8.0
+#: s, all together, from which on a stuck magnetometer is a finding;  source: a reading that is held
+#: for less came late and is not used; that is no fault of the sensor, but again and again it is
+STUCK_FINDING_S = 0.25
+#: steps of coarse numbers by which the field must turn to have a new reading
+HELD_STEPS = 3.0
+#: repeated readings, at least;  chosen
+HELD_REPEATS = 20
+#: share of repeated readings where the sensor turns, of that in all, at least;  source: numbers
+#: that are coarse change there, and a reading that is held does not
+HELD_MOVING_SHARE = 0.7
+#: s between readings of a magnetometer: less is a rate of its own;  source: 202 a second in all
+#: recordings of BROAD, rows at 286
+HELD_ORDINARY_S = 0.01
+#: variance of the time from one new reading to the next, in that of chance, at most
+HELD_CLOCKWORK = 0.3
+#: sums of such times that tell it, at least;  variances that one counts, at most;  chosen
+HELD_FEWEST_SUMS, HELD_MOST_VARIANCES = 15, 4.0
+#: share of the samples that came twice, at least;  chosen
+DOUBLED_SHARE = 2e-3
+#: times as many as if each sensor repeated for itself;  source: a slow turn makes it nearly two
+DOUBLED_BEYOND_CHANCE = 5.0
+#: noise levels of the gyro beyond which the sensor turns;  chosen
+DOUBLED_TURNING_NOISE = 5.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,6 +38,7 @@ from itertools import permutations, product
 import numpy as np
 
 from ahrsd import so3
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.calibration_fit.null_fit import ellipsoid, sphere_centre
@@ -46,16 +47,7 @@ from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 from ahrsd.so3 import skew
 
-EXPLAINED = 0.6  # cost of the best frame, of that of no motion, at most
-_BETTER = 1.5  # times the cost that the frame as recorded must be worse
-_BENT = 3.0  # times, by which iron that deforms may favour another frame: it is left out here
-_NATS = 20.0  # log likelihood by which it must be worse
-_FAST_RAD_S, _NEAR = 3.0, 1.1  # rates that no vehicle has for long; a factor that is another's
-_SURE = 0.99  # of a finding that was counted and compared
-_SAME_UNIT = 1.2  # factor from a unit's own within which the gyro's scale is that unit
-_NOISE_SHARE = 0.05  # of the rates' variance, for a factor that is no unit's to be believed
-_PARTS, _CLEARLY = 4, 0.1  # of a recording; cost below which a part of it is explained
-_UNIT = 2.0  # factor of the gyro's scale beyond which it is another unit
+_PARTS = 4  # of a recording
 #: median readings in gauss of the Earth's field (0.2 to 0.7 G) taken in other units
 MAG_UNITS = (
     ("uT", 1e-2, 20.0, 70.0),
@@ -67,16 +59,6 @@ GYRO_UNITS = (("deg/s", np.pi / 180), ("mrad/s", 1e-3), ("rpm", 2 * np.pi / 60))
 _WINDOW_S = 0.5
 _ROWS, _WINDOWS = 4000, 80  # samples and windows, those that turn most
 _AXES = "xyz"
-#: part of gravity's turns that the gyro must explain, and by how much better than by other axes
-_GRAVITY_EXPLAINED, _GRAVITY_BETTER = 0.5, 1.5
-_FEWEST = 100  # readings of an ellipsoid
-#: sine of the inclination from which up and down are told
-_STEEP = 0.15
-#: turn beyond any quarter from which a mount is askew, and no crooked sensor any more
-_ASKEW_DEG = 10.0
-#: of a map that is a turn: its longest axis over its shortest; deviations by which it is no quarter
-_ROUND, _TOLD = 1.25, 4.0
-_ABOUT = 0.97  # cosine of a turn's axis to the sensor's, to be called by its name
 
 
 def as_recorded(track: Track) -> list[Fact]:
@@ -109,17 +91,17 @@ def _gyro(track: Track) -> list[Fact]:
     if not order:
         return []
     best = order[0]
-    if best.cost > EXPLAINED:
+    if best.cost > priors.FRAME_EXPLAINED:
         return _gyro_unit(track, best) if _in_degrees(track, best, found.count) else []
     if same is not None and (
-        same.cost < _BENT * best.cost or not _worse(same.cost, best.cost, found.count)
+        same.cost < priors.FRAME_BENT * best.cost or not _worse(same.cost, best.cost, found.count)
     ):
         best = same
     facts = []
     if not best.is_identity:
         equal = [one for one in order if not _worse(one.cost, best.cost, found.count)]
         facts.append(_frame_error(track, min(equal, key=_changes), len(equal)))
-    if not 1 / _UNIT < best.scale < _UNIT:
+    if not 1 / priors.OTHER_UNIT < best.scale < priors.OTHER_UNIT:
         facts += _gyro_unit(track, best)
     return facts
 
@@ -130,16 +112,18 @@ def _in_degrees(track: Track, best: SignedPermutation, count: int) -> bool:
     In a room, or beside a motor, no frame explains most; but no vehicle turns at 3 rad/s a tenth
     of the time while its field turns at a fifty-seventh of that.
     """
-    clear = best.is_identity and -1.5 * count * np.log(max(best.cost, 1e-12)) > _NATS
+    clear = best.is_identity and -1.5 * count * np.log(max(best.cost, 1e-12)) > priors.FRAME_NATS
     size = np.linalg.norm(track.gyro_b_rad_s, axis=1)
-    fast = float(np.nanpercentile(size, 90)) > _FAST_RAD_S
-    return bool(clear and fast and abs(np.log(best.scale * 180 / np.pi)) < np.log(_NEAR))
+    fast = float(np.nanpercentile(size, 90)) > priors.FAST_RAD_S
+    return bool(
+        clear and fast and abs(np.log(best.scale * 180 / np.pi)) < np.log(priors.DEGREES_NEAR)
+    )
 
 
 def _worse(cost: float, best: float, count: int) -> bool:
     """Whether a frame explains so much less that it is out."""
     ratio = max(cost, 1e-12) / max(best, 1e-12)
-    return ratio > _BETTER and 1.5 * count * np.log(ratio) > _NATS
+    return ratio > priors.FRAME_BETTER and 1.5 * count * np.log(ratio) > priors.FRAME_NATS
 
 
 def _frame_error(track: Track, best: SignedPermutation, equal: int) -> Fact:
@@ -155,7 +139,7 @@ def _frame_error(track: Track, best: SignedPermutation, equal: int) -> Fact:
         "frame_error",
         words,
         Where(_whole(track), ("x", "y", "z"), "gyro" if odd is None else "sensor"),
-        1.0 if equal == 1 else _SURE,  # that it is one of them
+        1.0 if equal == 1 else priors.SURE_OF_READINGS,  # that it is one of them
         (Value("present", 1.0, 0.0, "1"),),
         # the true rate is signs * reading[axes]
         {"axes": list(best.axes), "signs": list(best.signs)},
@@ -169,7 +153,7 @@ def _turned(track: Track, turned: Askew) -> Fact:
         "mag_gyro_misalignment",
         turned.words,
         Where(_whole(track), ("x", "y", "z"), "sensor" if turned.of_magnetometer else "gyro"),
-        _SURE,
+        priors.SURE_OF_READINGS,
         tuple(
             Value(name, float(value), 0.0, "rad")
             for name, value in zip(names, turned.rotation_rad, strict=True)
@@ -212,7 +196,7 @@ def _gyro_unit(track: Track, best: SignedPermutation) -> list[Fact]:
     name, factor = min(tried, key=lambda pair: abs(np.log(best.scale / pair[1])))
     large = best.scale < 1
     off = f"{1 / best.scale:.3g} times too large" if large else f"{best.scale:.3g} times too small"
-    if abs(np.log(best.scale / factor)) > np.log(_SAME_UNIT):
+    if abs(np.log(best.scale / factor)) > np.log(priors.SAME_UNIT):
         if _hidden(track) or _right_in_part(track):
             return []
         usual = 1 / factor if large else factor
@@ -239,7 +223,7 @@ def _hidden(track: Track) -> bool:
         return True
     means = np.nan_to_num(track.gyro_b_rad_s[:whole]).reshape(-1, rows, 3).mean(axis=1)
     noise = 3 * noise_of_differences(track)[1] ** 2 / rows
-    return bool(noise > _NOISE_SHARE * np.sum(np.var(means, axis=0)))
+    return bool(noise > priors.RATES_NOISE_SHARE * np.sum(np.var(means, axis=0)))
 
 
 def _right_in_part(track: Track) -> bool:
@@ -251,7 +235,10 @@ def _right_in_part(track: Track) -> bool:
     found = [windows(track, slice(int(a), int(b))) for a, b in itertools.pairwise(edges)]
     order = [frame for one in found if one is not None for frame in ranked(one)]
     return any(
-        one.is_identity and one.cost < _CLEARLY and 1 / _UNIT < one.scale < _UNIT for one in order
+        one.is_identity
+        and one.cost < priors.PART_EXPLAINED
+        and 1 / priors.OTHER_UNIT < one.scale < priors.OTHER_UNIT
+        for one in order
     )
 
 
@@ -260,7 +247,9 @@ def _unit_error(
 ) -> Fact:
     parameters = (Value("factor_less_one", too_large - 1, 0.0, "1"),)
     where = Where(_whole(track), ("x", "y", "z"), frame)
-    return Fact("unit_error", words, where, _SURE, parameters, dict(setting), stops=True)
+    return Fact(
+        "unit_error", words, where, priors.SURE_OF_READINGS, parameters, dict(setting), stops=True
+    )
 
 
 def _whole(track: Track) -> tuple[tuple[float, float], ...]:
@@ -452,7 +441,7 @@ def odd_magnetometer(track: Track, gyro: Array) -> Odd | None:
     if np.linalg.det(gyro) < 0.0 or not turns_gravity(track, np.eye(3)):
         return None
     ways = sorted((gyro.T, -gyro.T), key=_negations)
-    if _down(track, ways[0]) < -_STEEP:
+    if _down(track, ways[0]) < -priors.STEEP:
         ways.reverse()
     return Odd(ways[0], ways[1])
 
@@ -481,7 +470,9 @@ class Askew:
         vector = np.degrees(self.rotation_rad)
         angle = float(np.linalg.norm(vector))
         most = int(np.argmax(np.abs(vector)))
-        about = f" about its {_AXES[most]}" if abs(vector[most]) > _ABOUT * angle else ""
+        about = (
+            f" about its {_AXES[most]}" if abs(vector[most]) > priors.ASKEW_ABOUT * angle else ""
+        )
         numbers = ", ".join(f"{value:.1f}" for value in vector)
         rows = "; ".join(" ".join(f"{value:.3f}" for value in row) for row in self.turn.T)
         words = (
@@ -504,7 +495,11 @@ def askew(track: Track, worse: Callable[[float, float, int], bool]) -> Askew | N
     worse: (cost, best, windows) whether what costs so much is out beside the best
     """
     seen = np.isfinite(track.mag_b_gauss).all(axis=1)
-    found = ellipsoid(track.mag_b_gauss[seen]) if np.count_nonzero(seen) > _FEWEST else None
+    found = (
+        ellipsoid(track.mag_b_gauss[seen])
+        if np.count_nonzero(seen) > priors.ELLIPSOID_READINGS
+        else None
+    )
     if found is None:
         return None
     field = (track.mag_b_gauss - found[1]) @ np.linalg.inv(found[0])
@@ -514,21 +509,21 @@ def askew(track: Track, worse: Callable[[float, float, int], bool]) -> Askew | N
         return None
     gravity = turns_gravity(track, np.eye(3))
     right = replace(track, mag_b_gauss=field)
-    return Askew(turn, True if gravity else None, _down(right, turn.T) < -_STEEP)
+    return Askew(turn, True if gravity else None, _down(right, turn.T) < -priors.STEEP)
 
 
 def _turn(found: Windows, worse: Callable[[float, float, int], bool]) -> Array | None:
     """The rotation (3, 3) of the free map, where it is one, no quarter, and explains more."""
     free, order = linear_map(found), ranked(found)
     if (
-        free.cost > _GRAVITY_EXPLAINED
+        free.cost > priors.GRAVITY_EXPLAINED
         or not order
         or not worse(order[0].cost, free.cost, found.count)
     ):
         return None
     U, axes, V = np.linalg.svd(free.matrix)
     turn = U @ V
-    if np.linalg.det(turn) < 0.0 or axes[0] > _ROUND * axes[2]:
+    if np.linalg.det(turn) < 0.0 or axes[0] > priors.ASKEW_ROUND * axes[2]:
         return None
     quarter = order[0].matrix
     beyond = (
@@ -536,8 +531,8 @@ def _turn(found: Windows, worse: Callable[[float, float, int], bool]) -> Array |
         if (np.linalg.det(quarter) > 0.0)
         else np.pi
     )
-    told = beyond * axes[2] > _TOLD * free.deviation
-    return turn if told and np.degrees(beyond) > _ASKEW_DEG else None
+    told = beyond * axes[2] > priors.ASKEW_TOLD * free.deviation
+    return turn if told and np.degrees(beyond) > priors.ASKEW_DEG else None
 
 
 def turns_gravity(track: Track, P: Array) -> bool:
@@ -547,8 +542,8 @@ def turns_gravity(track: Track, P: Array) -> bool:
     order = [] if found is None else ranked(found)
     if (
         len(order) < 2
-        or order[0].cost > _GRAVITY_EXPLAINED
-        or order[1].cost < _GRAVITY_BETTER * order[0].cost
+        or order[0].cost > priors.GRAVITY_EXPLAINED
+        or order[1].cost < priors.GRAVITY_BETTER * order[0].cost
     ):
         return False
     return bool(np.array_equal(order[0].matrix, P))

@@ -37,6 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.data_quality.facts import Fact
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
@@ -45,39 +46,14 @@ from ahrsd.diagnosis.track import Track
 from ahrsd.printable import counted
 from ahrsd.samples import Array
 
-#: samples before and after a jump, and how many deviations of a mean a step's turn must have: over
-#: more samples there are fewer jumps by chance
-_AVERAGED = ((3, 7.0), (12, 5.0))
-_NEAR = 0.3  # of a whole number
-_FEWEST = 5
-_SURE_NATS = 12.0  # by which they must be whole steps rather than noise: others have 160 and more
-#: and that each must be in the mean: a gyro that reads 3 % too little is ahead all the time, and on
-#: a path through a room 13 jumps had 2.4 each; lost turns have 3.8 and more
-_EACH_NATS = 3.0
-#: deviations of a mean that no noise jumps by, and the part of such a jump that is across the turn,
-#: more than a lost one has
-_CLEAR, _ACROSS = 8.0, 0.5
-#: and those of a jump that many turns in a row were lost at, which nobody can count
-_LONG = 30.0
 #: entry of the setting: how many of these there are
 LONG = "long"
 #: entry of the setting where only all jumps together say that turns were lost: how many about
 UNSEEN = "unseen"
 _ROWS = (3, 6, 12, 24, 48)  # before and after a jump
 _ROUNDS = 20
-_BEYOND_SHARE_NATS = 3.0  # beyond the share
-_ENOUGH = 10  # times as many rows as are averaged: else their spread is not known
-LONGER_NATS = float(np.log(4.0))  # what each further step of a gap costs
 _SHARES = (0.01, 0.03, 0.1)  # of the rows, that a jump is so near that its mean is in it
-_ACROSS_CHI2 = 12.0  # chi square that one in 400 is beyond
 _BESIDE = 0.25  # of a mean's rows: so near to its jump is the step that made it
-_TWICE_NATS = 6.0  # that a step counts twice: one in twenty does, and must be surer than chance
-#: that one jump is worth at most: several must say it, not a field that jumps once
-_MOST_EACH_NATS = 6.0
-_PART, _OTHERS = 0.7, (0.3, 1.4)  # of a step, in the mean over the rows that have a part of it
-#: nats by which that must be, less so many times those backward: 3.5 is the most of 370 recordings
-#: with none lost
-_MANY_NATS, _BACKWARD = 12.0, 3.0
 #: below which a quarter of a normal deviate's sizes are
 QUARTER = 0.3186
 
@@ -95,13 +71,15 @@ def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
     and where too few stand out alone, all together.
     """
     track = done.track
-    for samples, least in _AVERAGED:
+    for samples, least in priors.LOST_TURN_AVERAGED:
         if len(track) < 10 * samples:
             break
         found = _jumps(done, rate_b_rad_s, samples, least)
-        enough = len(found.forward) >= _FEWEST + 3 * len(found.backward) + found.others
+        enough = (
+            len(found.forward) >= priors.LOST_TURNS_FEWEST + 3 * len(found.backward) + found.others
+        )
         jumps = found.forward
-        sure = max(_SURE_NATS, _EACH_NATS * len(jumps))
+        sure = max(priors.LOST_TURNS_NATS, priors.LOST_TURN_EACH_NATS * len(jumps))
         if enough and whole_nats(found.steps[jumps], found.scatter[jumps]) > sure:
             lost = np.zeros(len(track), dtype=np.int64)
             lost[jumps] = np.round(found.steps[jumps])
@@ -109,7 +87,7 @@ def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
             return [_fact(track, recovered(done, rate_b_rad_s, lost), setting)]
     if expected := some_lost(done, rate_b_rad_s):
         turns = recovered(done, rate_b_rad_s, np.zeros(len(track), dtype=np.int64), expected)
-        if np.count_nonzero(turns.lost) >= _FEWEST:
+        if np.count_nonzero(turns.lost) >= priors.LOST_TURNS_FEWEST:
             return [_fact(track, turns, {UNSEEN: expected})]
     return []
 
@@ -131,7 +109,7 @@ def price(facts: Sequence[Fact]) -> float:
     if not rows:
         return 0.0
     longer = float(np.sum(steps[steps > 0] - 1.0))
-    return rows * float(np.log(len(steps) / rows)) + longer * LONGER_NATS
+    return rows * float(np.log(len(steps) / rows)) + longer * priors.LONGER_GAP_NATS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,21 +148,25 @@ def _jumps(done: Filtered, rate_b_rad_s: Array, samples: int, least: float) -> _
     rest = np.linalg.norm(jump - steps[:, None] * v, axis=1)
     fresh = np.sum(behind * v, axis=1) < 0.5 * size**2
     tell = (size > least * sigma) & (rest < 5 * sigma) & complete & fresh
-    whole = np.abs(steps - np.round(steps)) < _NEAR
-    forward = _peaks(tell & whole & (steps > 1 - _NEAR), steps, samples)
+    whole = np.abs(steps - np.round(steps)) < priors.LOST_TURN_NEAR
+    forward = _peaks(tell & whole & (steps > 1 - priors.LOST_TURN_NEAR), steps, samples)
     far = np.linalg.norm(jump, axis=1)
-    clear = complete & (far > _CLEAR * sigma)
+    clear = complete & (far > priors.JUMP_CLEAR * sigma)
     for k in forward.tolist():  # before and behind a jump its mean is not along the turn
         clear[max(0, k - 2 * samples) : k + 2 * samples] = False
     sudden = clear & (np.linalg.norm(behind, axis=1) < 0.5 * far)
-    long = _peaks(sudden & (far > _LONG * sigma) & (steps > 1.0 + 2 * _NEAR), far, samples)
+    long = _peaks(
+        sudden & (far > priors.JUMP_LONG * sigma) & (steps > 1.0 + 2 * priors.LOST_TURN_NEAR),
+        far,
+        samples,
+    )
     # on its way back from a long one the filter makes many that no lost turn makes
-    across = (sudden if len(long) else clear) & ((rest > _ACROSS * far) | (steps < 0))
+    across = (sudden if len(long) else clear) & ((rest > priors.JUMP_ACROSS * far) | (steps < 0))
     return _Jumps(
         steps,
         sigma / np.maximum(size, 1e-300),
         forward,
-        _peaks(tell & whole & (steps < -1 + _NEAR), -steps, samples),
+        _peaks(tell & whole & (steps < -1 + priors.LOST_TURN_NEAR), -steps, samples),
         len(_peaks(across, far, samples)),
         len(long),
     )
@@ -196,7 +178,7 @@ def whole_nats(steps: Array, scatter: Array) -> float:
     Whole steps lie about their number; of noise only the tail counts as a jump, most of it hardly.
     """
     whole = -0.5 * ((steps - np.round(steps)) / scatter) ** 2
-    tail = -0.5 * (steps / scatter) ** 2 - log_ndtr(-(1 - _NEAR) / scatter)
+    tail = -0.5 * (steps / scatter) ** 2 - log_ndtr(-(1 - priors.LOST_TURN_NEAR) / scatter)
     return float(np.sum(whole - tail))
 
 
@@ -230,7 +212,14 @@ def _fact(track: Track, turns: Turns, setting: Mapping[str, float]) -> Fact:
     parameters = (Value("part", share, share / float(np.sqrt(len(rows))), "1"),)
     told = {"hidden": True, **setting}
     return Fact(
-        "dropped_samples", words, where, 0.98, parameters, told, turned=turned, unseen=missed
+        "dropped_samples",
+        words,
+        where,
+        priors.SURE_OF_NOISE,
+        parameters,
+        told,
+        turned=turned,
+        unseen=missed,
     )
 
 
@@ -351,7 +340,7 @@ def _means(done: Filtered, rate_b_rad_s: Array) -> Iterator[Means]:
     for length in _ROWS:
         k = np.arange(length, len(v) - length)
         k = k[usable[k + length] - usable[k - length] == 2 * length]
-        if len(k) < _ENOUGH * length:
+        if len(k) < priors.LOST_TURN_ROWS * length:
             break
         jump = (total[k + length] - 2 * total[k] + total[k - length]) / length
         s = float(np.quantile(np.abs(jump), 0.25)) / QUARTER
@@ -365,7 +354,7 @@ def some_lost(done: Filtered, rate_b_rad_s: Array) -> float:
     """How many turns all jumps together say are lost, though none may stand out alone; or 0."""
     told = [surplus(mean) for mean in _means(done, rate_b_rad_s)]
     nats, count = max(told, default=(0.0, 0.0))
-    return count if nats > _MANY_NATS else 0.0
+    return count if nats > priors.LOST_TURNS_TOGETHER_NATS else 0.0
 
 
 def surplus(mean: Means) -> tuple[float, float]:
@@ -376,19 +365,21 @@ def surplus(mean: Means) -> tuple[float, float]:
     """
     tells = mean.size > 1.0
     scale = float(np.median(mean.z[tells] / mean.size[tells])) if tells.any() else 0.0
-    like = mean.across < _ACROSS_CHI2
+    like = mean.across < priors.JUMP_ACROSS_CHI2
     z, size = mean.z[like] - scale * mean.size[like], mean.size[like]
 
     def nats(step: float) -> tuple[float, float]:
-        odds = np.exp(np.minimum(step * z - step**2 * size / 2, _MOST_EACH_NATS)) - 1.0
+        odds = np.exp(np.minimum(step * z - step**2 * size / 2, priors.JUMP_MOST_NATS)) - 1.0
         told = [(float(np.sum(np.log1p(share * odds))), share) for share in _SHARES]
         total, share = max(told)
         return total / mean.length, share * len(z) / mean.length
 
-    forward, count = nats(_PART)
-    if forward < _MANY_NATS or forward < max(nats(step)[0] for step in _OTHERS):
+    forward, count = nats(priors.LOST_TURN_PART)
+    if forward < priors.LOST_TURNS_TOGETHER_NATS or forward < max(
+        nats(step)[0] for step in priors.OTHER_PARTS
+    ):
         return 0.0, 0.0
-    return forward - _BACKWARD * max(nats(-_PART)[0], 0.0), count
+    return forward - priors.LOST_TURNS_BACKWARD * max(nats(-priors.LOST_TURN_PART)[0], 0.0), count
 
 
 def _jumps_of_rows(
@@ -399,15 +390,15 @@ def _jumps_of_rows(
     count: how many steps are known to be lost
     """
     n = len(done.track)
-    least = float(np.log(n / count)) + _BEYOND_SHARE_NATS
+    least = float(np.log(n / count)) + priors.LOST_TURN_BEYOND_SHARE_NATS
     one = np.ones(n, dtype=np.int64)
     out = _JumpsOfRows(one, np.full(n, -np.inf), one.copy(), np.ones(n))
     for mean in _means(done, rate_b_rad_s):
         z, size = mean.z, mean.size
-        steps = np.maximum(np.round((z - LONGER_NATS) / np.maximum(size, 1e-300)), 1.0)
-        nats = steps * z - steps**2 * size / 2 - least - LONGER_NATS * (steps - 1)
+        steps = np.maximum(np.round((z - priors.LONGER_GAP_NATS) / np.maximum(size, 1e-300)), 1.0)
+        nats = steps * z - steps**2 * size / 2 - least - priors.LONGER_GAP_NATS * (steps - 1)
         about = _about(lost, 1 + int(_BESIDE * mean.length))
-        back = np.where(about[mean.k], -z - size / 2 - _TWICE_NATS, -np.inf)
+        back = np.where(about[mean.k], -z - size / 2 - priors.COUNTED_TWICE_NATS, -np.inf)
         steps, nats = np.where(back > nats, -1, steps), np.maximum(nats, back)
         better = nats > out.nats[mean.k]
         at = mean.k[better]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.model import Term
@@ -42,25 +43,18 @@ class Fact:
     stops: bool = False
 
 
-#: samples that are missing by honest stamps, and stamps that scatter, are part of the recording and
-#: not a difference from its simulation, which has the same stamps, unless there are so many
-MISSING_SHARE = 0.02
-JITTER_SHARE = 0.05  # of the step
-#: s, all together: a reading that is held for less came late and is not used; that is no fault of
-#: the sensor, but again and again it is
-STUCK_S = 0.25
-
-
 def matters(fact: Fact) -> bool:
     """Whether the fact is a finding; else it is worth a note."""
     if fact.effect == "dropped_samples" and not fact.setting:
-        return fact.parameters[0].value > MISSING_SHARE
+        return fact.parameters[0].value > priors.MISSING_FINDING_SHARE
     if fact.effect == "stuck_magnetometer":
-        return fact.parameters[0].value >= STUCK_S
+        return fact.parameters[0].value >= priors.STUCK_FINDING_S
     if fact.effect == "stuck_gyro":  # no name of the library
         return False
     if fact.effect == "timestamp_jitter" and not fact.stops:
-        return fact.parameters[0].value > JITTER_SHARE * float(fact.setting["step_s"])
+        return fact.parameters[0].value > priors.JITTER_FINDING_SHARE * float(
+            fact.setting["step_s"]
+        )
     return True
 
 

@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis import priors, time_series
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.calibration_fit.null_fit import unusable
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.data_quality.axes_and_units import EXPLAINED, as_recorded, ranked, windows
+from ahrsd.diagnosis.data_quality.axes_and_units import as_recorded, ranked, windows
 from ahrsd.diagnosis.data_quality.facts import Fact, matters, of_fact, stopped
 from ahrsd.diagnosis.data_quality.range_and_resolution import clipping, quantisation
 from ahrsd.diagnosis.data_quality.stuck import dead, repeats, stuck_axes, stuck_gyro
@@ -135,14 +135,15 @@ def would_have_shown(track: Track) -> tuple[str, ...]:
     step = track.step_s
     found = windows(track)
     shown = [
-        f"a magnetometer stuck while the field turns by {1e3 * 8 * mag:.2g} mG",
-        f"readings in steps above {1e3 * 2 * mag:.2g} mG (noise {1e3 * mag:.2g} mG, "
-        f"{1e3 * gyro:.2g} mrad/s)",
-        f"time stamps that jitter by {1e3 * 0.03 * step:.2g} ms",
-        "1 sample in 1000 missing",
+        "a magnetometer stuck while the field turns by "
+        f"{1e3 * priors.STUCK_TURNED_NOISE * mag:.2g} mG",
+        f"readings in steps above {1e3 * priors.COARSE_STEPS * mag:.2g} mG "
+        f"(noise {1e3 * mag:.2g} mG, {1e3 * gyro:.2g} mrad/s)",
+        f"time stamps that jitter by {1e3 * priors.JITTER_SHARE * step:.2g} ms",
+        f"1 sample in {1.0 / priors.MISSING_SHARE:.0f} missing",
     ]
     axes = "swapped, negated or left-handed axes, wrong units of the gyro"
-    turned = found is not None and ranked(found) and ranked(found)[0].cost < EXPLAINED
+    turned = found is not None and ranked(found) and ranked(found)[0].cost < priors.FRAME_EXPLAINED
     if turned:
         shown.append(axes)
     said = f"would also have been seen: {'; '.join(shown)}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.data_quality.facts import Fact, spans_of
@@ -13,15 +14,7 @@ from ahrsd.printable import counted
 from ahrsd.samples import Array
 
 _AXES = ("x", "y", "z")
-_FEWEST, _SHARE = 8, 1e-3  # samples at the limit, and of all samples
-_PILED = 6.0  # times as many at the limit as at each number just inside it
-_MARGIN, _NEAR = 5.0, 0.02  # noise levels, and share of the limit, at which it begins to act
 _BESIDE = 2  # rows before and after such readings: noise that is added behind the limit hides a few
-_TOP_STEPS = 1.5  # of coarse numbers, as many at the top as one step below are no limit
-_HEAP = 7.0  # noise levels that hold a heap of readings at a limit that noise is added to
-_SIDES, _ALIKE = 3, 0.01  # sides of axes that end at a shared limit, and how alike they are
-_FINE = 0.5  # share of the readings that differ from all others, where numbers are fine
-_COARSE = 2.0  # steps of the quantisation over the noise's deviation that matter
 
 
 def clipping(track: Track) -> list[Fact]:
@@ -34,7 +27,7 @@ def clipping(track: Track) -> list[Fact]:
     ):
         fresh = np.r_[True, np.any(np.diff(values, axis=0) != 0, axis=1)]
         found = [
-            _flat_tops(column, fresh, max(noise, _TOP_STEPS * step_of(column)))
+            _flat_tops(column, fresh, max(noise, priors.LIMIT_TOP_STEPS * step_of(column)))
             for column in values.T
         ]
         if not any(rows.any() for rows, _ in found):
@@ -46,7 +39,11 @@ def clipping(track: Track) -> list[Fact]:
         found = [(rows | at_limit[:, axis], level) for axis, (rows, level) in enumerate(found)]
         rows = np.any([rows for rows, _ in found], axis=0)
         # of readings at the limit only those that noise made small are left: they are biased
-        near = np.any(np.abs(values) > limit - min(_MARGIN * noise, _NEAR * limit), axis=1)
+        near = np.any(
+            np.abs(values)
+            > limit - min(priors.LIMIT_MARGIN_NOISE * noise, priors.LIMIT_MARGIN_SHARE * limit),
+            axis=1,
+        )
         near = np.convolve(near, np.ones(2 * _BESIDE + 1), mode="same") > 0.5
         intervals = tuple(
             (float(track.time_s[a]), float(track.time_s[b - 1])) for a, b in spans_of(rows, 5)
@@ -62,7 +59,7 @@ def clipping(track: Track) -> list[Fact]:
                 effect,
                 words,
                 Where(intervals, axes, frame),
-                0.99,
+                priors.SURE_OF_READINGS,
                 (Value("limit", limit, max(noise, 1e-9), unit),),
                 {},
                 near if unit == "gauss" else None,
@@ -87,15 +84,17 @@ def _flat_tops(
     for sign in (1.0, -1.0):
         top = float(np.max(sign * finite)) if len(finite) else 0.0
         at = (sign * values == top) & fresh
-        if top <= 0 or np.count_nonzero(at) < max(_FEWEST, _SHARE * len(values)):
+        if top <= 0 or np.count_nonzero(at) < max(
+            priors.LIMIT_FEWEST, priors.LIMIT_SHARE * len(values)
+        ):
             continue
         longest = max(b - a for a, b in spans_of(at))
         width = noise or 1e-12
         inside = finite[(sign * finite < top) & (sign * finite > top - width)]
         usual = len(inside) / max(len(np.unique(inside)), 1)
-        if longest >= 3 and np.count_nonzero(at) > _PILED * max(usual, 1.0):
+        if longest >= 3 and np.count_nonzero(at) > priors.LIMIT_PILED * max(usual, 1.0):
             # coarse numbers of a sensor that lies still pile up at its largest reading
-            coarse = len(np.unique(finite)) < _FINE * len(finite)
+            coarse = len(np.unique(finite)) < priors.FINE_NUMBERS * len(finite)
             if coarse and float(finite.max() - finite.min()) < 20 * width:
                 continue
             rows |= at
@@ -117,36 +116,36 @@ def _one_limit(values: Array, noise: float) -> list[tuple[NDArray[np.bool], floa
         for sign in (1.0, -1.0)
         if (level := _heap(sign * values[:, axis], noise)) > 0.0
     ]
-    if len(heaps) < _SIDES:
+    if len(heaps) < priors.LIMIT_SIDES:
         return none
     usual = float(np.median([level for _, _, level in heaps]))
-    shared = [heap for heap in heaps if abs(heap[2] - usual) < _ALIKE * usual]
-    if len(shared) < _SIDES or len({axis for axis, _, _ in shared}) < 2:
+    shared = [heap for heap in heaps if abs(heap[2] - usual) < priors.LIMIT_ALIKE * usual]
+    if len(shared) < priors.LIMIT_SIDES or len({axis for axis, _, _ in shared}) < 2:
         return none
     # by its bias an axis reaches the limit at a little more on one side than on the other
     lowest = min(level for _, _, level in shared)
-    reach = lowest - _HEAP / 2 * noise
+    reach = lowest - priors.LIMIT_HEAP_NOISE / 2 * noise
     return [(np.abs(values[:, axis]) > reach, lowest) for axis in range(3)]
 
 
 def _heap(values: Array, noise: float) -> float:
     """Where the largest of (N,) values pile up within their noise; 0 where they do not."""
     known = values[np.isfinite(values)]
-    top, width = float(np.max(known, initial=0.0)), _HEAP * noise
+    top, width = float(np.max(known, initial=0.0)), priors.LIMIT_HEAP_NOISE * noise
     inside = known > top - width
     heaped = int(np.count_nonzero(inside))
     below = int(np.count_nonzero(known > top - 2 * width)) - heaped
-    if top < 4 * width or heaped < _PILED * max(below, 1):
+    if top < 4 * width or heaped < priors.LIMIT_PILED * max(below, 1):
         return 0.0
     longest = max((b - a for a, b in spans_of(values > top - width)), default=0)
-    return float(np.median(known[inside])) if longest >= _FEWEST else 0.0
+    return float(np.median(known[inside])) if longest >= priors.LIMIT_FEWEST else 0.0
 
 
 def quantisation(track: Track) -> list[Fact]:
     """A step of the magnetometer's numbers that is coarse against its noise."""
     noise = noise_of_differences(track)[0]
     steps = np.array([step_of(track.mag_b_gauss[:, axis]) for axis in range(3)])
-    coarse = steps > _COARSE * noise
+    coarse = steps > priors.COARSE_STEPS * noise
     if noise == 0.0:  # most seconds show no change at all: coarse, or stuck
         coarse &= [_one_by_one(track.mag_b_gauss[:, axis], steps[axis]) for axis in range(3)]
     if not coarse.any():
@@ -156,14 +155,14 @@ def quantisation(track: Track) -> list[Fact]:
     words = f"the magnetometer's readings come in steps of {1e3 * step:.3g} mG, coarser than noise"
     where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), axes, "sensor")
     parameters = (Value("step", step, 1e-6, "gauss"),)
-    return [Fact("mag_quantisation", words, where, 0.99, parameters)]
+    return [Fact("mag_quantisation", words, where, priors.SURE_OF_READINGS, parameters)]
 
 
 def _one_by_one(values: Array, step: float) -> bool:
     """Whether readings that change mostly change by one step; those that were stuck jump."""
     change = np.abs(np.diff(values))
     change = change[np.isfinite(change) & (change > 0)]
-    return bool(len(change) and np.median(change) < _TOP_STEPS * step)
+    return bool(len(change) and np.median(change) < priors.LIMIT_TOP_STEPS * step)
 
 
 def step_of(values: Array) -> float:

@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.calibration_fit.null_fit import sphere_centre
@@ -28,36 +29,8 @@ from ahrsd.printable import counted
 from ahrsd.samples import Array
 
 _AXES = ("x", "y", "z")
-_MOVED_SHARE = 0.1  # of the field, by which a reading should have moved
-_MOVED_NOISE = 8.0
-_MOVED_STEPS = 20.0  # of coarse readings, which repeat themselves where they turn the least
-_TURNED_RAD = 0.3
-_AXIS_STUCK_ROWS = 8
 _BLOCK = 10  # rows whose mean is one reading, to be above the noise
-_SHOWN_SHARE = 0.5  # of what is left of the field's changes, which lies as a turn about one axis
-_ABOVE_NOISE = 3.0  # times the noise of such readings, for what is left
-_TURNED_ABOUT_RAD = 0.1  # about one axis, by the field
-#: usual size of a reading in any unit of a field, from tesla to nanotesla
-_FIELDS = (1e-6, 1e6)
-#: readings so many times the usual field, rates so many times the quickest but for one in a
-#: thousand and beyond what is quick in any unit, are none
-_FAR_FIELD, _FAR_RATE, _QUICK = 100.0, 100.0, 40.0
-#: rows that a stuck reading lasts at least, and so many times as long as a reading usually does
-_STUCK_ROWS, _LONGER = 8, 5.0
-_MOVED = 8.0  # noise levels by which the field must have turned during the repetition
-_STEPS = 3.0  # steps of coarse numbers by which the field must turn to have a new reading
-_FEWEST_REPEATS = 20
-_MOVING_SHARE = 0.7  # of the share that repeats in all: where the sensor turns, numbers that are
-# coarse change, and a reading that is held does not
-#: s; magnetometers have rates of their own: 202 a second in all recordings of BROAD, rows at 286
-_ORDINARY_PERIOD_S = 0.01
-_CLOCKWORK = 0.3  # variance of the time from one new reading to the next, in that of chance
-#: sums by which that is told, where there are as many, and at least;  variances that one counts
-_SUMS, _FEWEST_SUMS, _MOST_VARIANCES = 20, 15, 4.0
-_DOUBLED_SHARE = 2e-3
-#: times as many as if each sensor repeated for itself: a slow turn makes it nearly two
-_BEYOND_CHANCE = 5.0
-_TURNING = 5.0  # gyro noise levels
+_SUMS = 20  # of times between new readings, where there are as many
 
 
 def dead(track: Track) -> str | None:
@@ -69,7 +42,7 @@ def dead(track: Track) -> str | None:
     mag, gyro = track.mag_b_gauss, track.gyro_b_rad_s
     seen = np.isfinite(mag).all(axis=1)
     size = track.usual_gauss
-    if not _FIELDS[0] < size < _FIELDS[1]:
+    if not priors.FIELD_READINGS[0] < size < priors.FIELD_READINGS[1]:
         return f"the magnetometer reads {size:.3g} in the middle: that is a field in no unit"
     if _constant(gyro) and np.ptp(mag[seen], axis=0).max() > _least_gauss(track):
         return (
@@ -82,7 +55,7 @@ def dead(track: Track) -> str | None:
             f"the magnetometer reads {_words(mag[seen][0])} gauss and the gyro {_words(gyro[0])} "
             "rad/s in every row: no sensor is so still, even at rest it scatters"
         )
-    if _constant(mag[seen]) and turned > _TURNED_RAD:
+    if _constant(mag[seen]) and turned > priors.STUCK_TURNED_RAD:
         return (
             f"the magnetometer reads {_words(mag[seen][0])} gauss in every row while the gyro "
             f"turns by {np.degrees(turned):.0f} deg: it is stuck or was not logged"
@@ -102,7 +75,10 @@ def _dead_axis(track: Track) -> str | None:
                 f"the magnetometer's {axis} reads {column[0] + 0.0:.4g} gauss in every row while "
                 f"the field on it changes by {moved:.2g} gauss: it is stuck or was not logged"
             )
-        if _constant(gyro[:, k]) and (turned := _turned_by_field(track, k)) > _TURNED_ABOUT_RAD:
+        if (
+            _constant(gyro[:, k])
+            and (turned := _turned_by_field(track, k)) > priors.DEAD_AXIS_TURNED_RAD
+        ):
             return (
                 f"the gyro's {axis} reads {gyro[0, k] + 0.0:.4g} rad/s in every row while the "
                 f"field turns by {np.degrees(turned):.0f} deg about it: it is stuck or was not "
@@ -143,7 +119,7 @@ def _turned_by_field(track: Track, k: int) -> float:
     left = rest - turn[:, None] * across
     noise = noise_of_differences(track)[0] * np.sqrt(2.0 / _BLOCK)
     shown = 1.0 - np.sum(left**2) / max(float(np.sum(rest**2)), 1e-300)
-    if shown < _SHOWN_SHARE or rest.std() < _ABOVE_NOISE * noise:
+    if shown < priors.DEAD_AXIS_SHOWN or rest.std() < priors.DEAD_AXIS_NOISE * noise:
         return 0.0
     return float(np.ptp(np.cumsum(turn)))
 
@@ -157,14 +133,16 @@ def without_impossible(track: Track) -> tuple[Track, tuple[str, ...]]:
     # in units of the largest number, so that no square overflows
     size = np.max(np.abs(np.nan_to_num(track.mag_b_gauss, posinf=1e308, neginf=-1e308)), axis=1)
     usual = float(np.median(size[size > 0.0])) if (size > 0.0).any() else 0.0
-    far = size > _FAR_FIELD * usual
+    far = size > priors.IMPOSSIBLE_FIELD * usual
     if far.any():
         track = replace(track, mag_b_gauss=np.where(far[:, None], np.nan, track.mag_b_gauss))
         notes.append(
-            _left_out("reading", "of the magnetometer ", far, track, f"{_FAR_FIELD:g} fields")
+            _left_out(
+                "reading", "of the magnetometer ", far, track, f"{priors.IMPOSSIBLE_FIELD:g} fields"
+            )
         )
     rate = np.max(np.abs(track.gyro_b_rad_s), axis=1)
-    limit = max(_FAR_RATE * float(np.quantile(rate, 0.999)), _QUICK)
+    limit = max(priors.IMPOSSIBLE_RATE * float(np.quantile(rate, 0.999)), priors.IMPOSSIBLE_RAD_S)
     fast = rate > limit
     if fast.any():
         dt_s = np.where(fast, np.nan, track.dt_s)
@@ -206,7 +184,7 @@ def stuck_axes(track: Track, bad: NDArray[np.bool]) -> list[Fact]:
     rows: dict[str, NDArray[np.bool]] = {}
     for k, axis in enumerate(_AXES):
         again = _again(track, mag[:, k : k + 1]) & ~bad
-        least = max(_least_gauss(track), _MOVED_STEPS * _coarseness(mag[:, k]))
+        least = max(_least_gauss(track), priors.STUCK_MOVED_STEPS * _coarseness(mag[:, k]))
         spans = [(a, b) for a, b in _long(again) if np.ptp(course[a - 1 : b, k]) > least]
         if spans and sum(b - a for a, b in spans) < len(track) - 1:
             rows[axis] = _marked(spans, len(track))
@@ -283,7 +261,9 @@ def _words(vector: Array) -> str:
 def _least_gauss(track: Track) -> float:
     """By how much a reading must move to have moved for certain."""
     return max(
-        _MOVED_SHARE * track.usual_gauss, _MOVED_NOISE * noise_of_differences(track)[0], 1e-6
+        priors.STUCK_MOVED_SHARE * track.usual_gauss,
+        priors.STUCK_MOVED_NOISE * noise_of_differences(track)[0],
+        1e-6,
     )
 
 
@@ -314,7 +294,7 @@ def _long(again: NDArray[np.bool]) -> list[tuple[int, int]]:
     usual = float(np.median(np.diff(np.flatnonzero(~again), append=len(again))))
     if usual > 1.0:
         return []
-    return [(a, b) for a, b in spans_of(again) if b - a >= _AXIS_STUCK_ROWS]
+    return [(a, b) for a, b in spans_of(again) if b - a >= priors.AXIS_STUCK_ROWS]
 
 
 def _marked(spans: Sequence[tuple[int, int]], count: int) -> NDArray[np.bool]:
@@ -378,11 +358,14 @@ def _stuck(track: Track, again: NDArray[np.bool]) -> tuple[list[Fact], NDArray[n
     bad = np.zeros(len(track), dtype=bool)
     intervals: list[tuple[float, float]] = []
     usual = float(np.median(np.diff(np.flatnonzero(~again), append=len(again))))
-    least = max(_STUCK_ROWS, _LONGER * usual)
+    least = max(priors.STUCK_ROWS, priors.STUCK_LONGER * usual)
     long = [(first, last) for first, last in spans_of(again) if last - first >= least]
     mag = track.mag_b_gauss
     centre = sphere_centre(mag[np.isfinite(mag).all(axis=1) & mag.any(axis=1)])
-    turned = [turned_gauss(track, centre, *span) >= _MOVED * _resolution(track) for span in long]
+    turned = [
+        turned_gauss(track, centre, *span) >= priors.STUCK_TURNED_NOISE * _resolution(track)
+        for span in long
+    ]
     fine = any(turned) and _step(track) == 0.0
     for (first, last), moved in zip(long, turned, strict=True):
         if moved or fine:
@@ -411,17 +394,17 @@ def _held(track: Track, again: NDArray[np.bool], expected: Array) -> list[Fact]:
 
     It repeats while the sensor turns as well, and new readings come as regularly as a clock.
     """
-    moving = expected > max(float(np.quantile(expected, 0.5)), _STEPS * _step(track))
+    moving = expected > max(float(np.quantile(expected, 0.5)), priors.HELD_STEPS * _step(track))
     fresh = np.flatnonzero(~again)
     repeated = int(np.count_nonzero(again))
-    if np.count_nonzero(moving) < 50 or len(fresh) < 10 or repeated < _FEWEST_REPEATS:
+    if np.count_nonzero(moving) < 50 or len(fresh) < 10 or repeated < priors.HELD_REPEATS:
         return []
     usual = len(again) / len(fresh)
-    if usual * track.step_s < _ORDINARY_PERIOD_S:
+    if usual * track.step_s < priors.HELD_ORDINARY_S:
         return []
-    if np.mean(again[moving]) < _MOVING_SHARE * repeated / len(again):
+    if np.mean(again[moving]) < priors.HELD_MOVING_SHARE * repeated / len(again):
         return []
-    if _irregularity(np.diff(fresh)) > _CLOCKWORK:
+    if _irregularity(np.diff(fresh)) > priors.HELD_CLOCKWORK:
         return []
     step = track.step_s
     words = (
@@ -450,11 +433,11 @@ def _irregularity(rows: Array) -> float:
     together = max(1, int(np.ceil(10.0 / chance)))
     together = min(together, max(int(np.ceil(1.0 / chance)), len(rows) // _SUMS))
     sums = np.add.reduceat(rows, np.arange(0, len(rows) - together + 1, together))[:-1]
-    if len(sums) < _FEWEST_SUMS:
+    if len(sums) < priors.HELD_FEWEST_SUMS:
         return 1.0
     variance = together * chance
     off = (sums - np.median(sums)) ** 2  # a gap, or a span without a new reading, is one sum
-    return float(np.mean(np.minimum(off, _MOST_VARIANCES * variance))) / variance
+    return float(np.mean(np.minimum(off, priors.HELD_MOST_VARIANCES * variance))) / variance
 
 
 def _doubled(track: Track, again: NDArray[np.bool]) -> list[Fact]:
@@ -464,13 +447,15 @@ def _doubled(track: Track, again: NDArray[np.bool]) -> list[Fact]:
     it does not turn about, each sensor's for itself: a sample that came twice repeats both.
     """
     rate = track.gyro_b_rad_s - np.median(track.gyro_b_rad_s, axis=0)
-    turning = np.max(np.abs(rate), axis=1) > _TURNING * noise_of_differences(track)[1]
+    turning = (
+        np.max(np.abs(rate), axis=1) > priors.DOUBLED_TURNING_NOISE * noise_of_differences(track)[1]
+    )
     mag, gyro = again & turning, _again(track, track.gyro_b_rad_s) & turning
     both = mag & gyro
     count, fresh = int(np.count_nonzero(both)), turning & ~mag
     alone = np.count_nonzero(gyro & fresh) / max(int(np.count_nonzero(fresh)), 1)
     chance = alone * np.count_nonzero(mag)
-    if count < max(3, _DOUBLED_SHARE * len(track), _BEYOND_CHANCE * chance):
+    if count < max(3, priors.DOUBLED_SHARE * len(track), priors.DOUBLED_BEYOND_CHANCE * chance):
         return []
     share = count / len(track)
     step = track.step_s
@@ -480,7 +465,7 @@ def _doubled(track: Track, again: NDArray[np.bool]) -> list[Fact]:
             "dropped_samples",
             f"{counted(count, 'sample')} as the one before, gyro and magnetometer: they came twice",
             Where(times, _AXES, "link"),
-            0.95,
+            priors.SURE_OF_DOUBLED,
             (Value("part", share, float(np.sqrt(share / len(track))), "1"),),
             {"doubled": True},
             both,

@@ -19,25 +19,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.data_quality.facts import Fact
 from ahrsd.diagnosis.track import Track
 from ahrsd.printable import counted
 from ahrsd.samples import Array, in_periods
 
-_MISSING_SHARE = 1e-3
-#: of the step, from which on scatter is jitter unless the field says that the steps are as stamped;
-#: below, only where the field says that they are even
-_JITTER = 0.03
 _PIECE = 30  # rows over which a host's clock is straight
-_OPPOSED = -0.25  # correlation of neighbouring steps
-_TRUE_NATS = 5.0  # for steps as stamped, against steps of a regular clock, or the reverse
-_OUTLIER = 5.0  # deviations
-_CLOCK = 2e-4  # relative rate between two clocks that is worth a word
 #: other clocks that a recording may carry
 CLOCKS = ("host_time_s", "host_s", "time_host_s", "device_time_s", "time_startup_s", "time_gps_s")
-#: a break that is believed whatever the recording's length, and what is left of one that is not
-BELIEVED_S, LEFT_S = 60.0, 10.0
 
 
 def stamps(track: Track) -> list[Fact]:
@@ -56,7 +47,9 @@ def _backwards(track: Track) -> list[Fact]:
     )
     value = float(np.max(np.abs(steps[wrong])))
     parameters = (Value("jitter", value, 0.0, "s"),)
-    return [Fact("timestamp_jitter", words, Where(times, (), "link"), 0.9, parameters, stops=True)]
+    where = Where(times, (), "link")
+    sure = priors.SURE_BACKWARDS
+    return [Fact("timestamp_jitter", words, where, sure, parameters, stops=True)]
 
 
 def _missing(track: Track) -> list[Fact]:
@@ -71,7 +64,7 @@ def _missing(track: Track) -> list[Fact]:
     long = (whole >= 2) & (np.abs(periods - whole) < 0.25 + 0.02 * whole)
     lost = int(np.sum(whole[long] - 1))
     share = lost / (lost + len(track))
-    if share < _MISSING_SHARE or np.count_nonzero(long) < 2:
+    if share < priors.MISSING_SHARE or np.count_nonzero(long) < 2:
         return []
     where = Where(
         tuple((float(track.time_s[k]), float(track.time_s[k + 1])) for k in np.flatnonzero(long)),
@@ -81,7 +74,7 @@ def _missing(track: Track) -> list[Fact]:
     words = f"missing: {counted(lost, 'sample')} at {counted(int(np.count_nonzero(long)), 'place')}"
     deviation = float(np.sqrt(share * (1 - share) / len(track)))
     parameters = (Value("part", share, deviation, "1"),)
-    return [Fact("dropped_samples", words, where, 0.99, parameters)]
+    return [Fact("dropped_samples", words, where, priors.SURE_OF_READINGS, parameters)]
 
 
 def _jitter(track: Track) -> list[Fact]:
@@ -96,14 +89,15 @@ def _jitter(track: Track) -> list[Fact]:
         return []
     opposed = float(np.mean(off[1:] * off[:-1])) / variance
     # scatter that is small for a clock is large beside a gyro that turns quickly
-    asked = -_TRUE_NATS if jitter < _JITTER * usual else _TRUE_NATS
-    if opposed > _OPPOSED or _stamped_well(track) > asked:
+    asked = -priors.STAMPED_NATS if jitter < priors.JITTER_SHARE * usual else priors.STAMPED_NATS
+    if opposed > priors.JITTER_OPPOSED or _stamped_well(track) > asked:
         return []
     where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), (), "link")
     words = f"the time stamps scatter by {1e3 * jitter:.2g} ms about a regular clock"
     deviation = jitter / float(np.sqrt(len(steps)))
     parameters = (Value("jitter", jitter, deviation, "s"),)
-    return [Fact("timestamp_jitter", words, where, 0.99, parameters, {"step_s": usual})]
+    sure = priors.SURE_OF_READINGS
+    return [Fact("timestamp_jitter", words, where, sure, parameters, {"step_s": usual})]
 
 
 def _clock(track: Track) -> tuple[float, float]:
@@ -147,7 +141,7 @@ def _stamped_well(track: Track) -> float:
     first, second = rest(stamped), rest(even)
     size = np.maximum(np.abs(first), np.abs(second))
     usual = 1.4826 * np.median(np.abs(first), axis=0)
-    quiet = (size <= _OUTLIER * usual).all(axis=1)
+    quiet = (size <= priors.STAMPED_OUTLIER * usual).all(axis=1)
     if np.count_nonzero(quiet) < 100:
         return 0.0
     # neighbouring differences share a reading: half of what they say is said twice
@@ -183,14 +177,15 @@ def _clocks(track: Track) -> list[Fact]:
         rest = theirs - slope * mine
         deviation = float(np.std(rest) / np.std(mine) / np.sqrt(len(mine) / 10))
         error = slope - 1
-        if abs(error) < max(_CLOCK, 5 * deviation):
+        if abs(error) < max(priors.CLOCK_RATE, 5 * deviation):
             continue
         words = (
             f"time_s runs {1e6 * abs(error):.0f} ppm {'slow' if error > 0 else 'fast'} on {name}"
         )
         where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), (), "link")
         parameters = (Value("rate_error", error, deviation, "1"),)
-        out.append(Fact("clock_rate", words, where, 0.95, parameters, {"clock": name}))
+        sure = priors.SURE_OF_CLOCK
+        out.append(Fact("clock_rate", words, where, sure, parameters, {"clock": name}))
     return out
 
 
@@ -205,16 +200,17 @@ def without_jumps(track: Track) -> tuple[Track, tuple[str, ...]]:
         return track, ()
     breaks_s = track.time_s[starts] - track.time_s[starts - 1]
     passed_s = sum(float(track.time_s[r.stop - 1] - track.time_s[r.start]) for r in track.runs)
-    jumps = (breaks_s <= 0.0) | (breaks_s > max(BELIEVED_S, passed_s))
+    jumps = (breaks_s <= 0.0) | (breaks_s > max(priors.BREAK_BELIEVED_S, passed_s))
     if not jumps.any():
         return track, ()
     moved = np.zeros(len(track))
-    moved[starts[jumps]] = LEFT_S - breaks_s[jumps]
+    moved[starts[jumps]] = priors.BREAK_LEFT_S - breaks_s[jumps]
     first = int(np.argmax(jumps))
     others = f" (and {np.count_nonzero(jumps) - 1} more)" if np.count_nonzero(jumps) > 1 else ""
     at_s = float(track.time_s[starts[first] - 1])
     words = (
         f"the clock jumps by {breaks_s[first]:+.6g} s behind {at_s:.13g} s{others}: "
-        f"taken as a break of {LEFT_S:g} s; times behind it are told as if no more had passed"
+        f"taken as a break of {priors.BREAK_LEFT_S:g} s; times behind it are told as if no more "
+        "had passed"
     )
     return replace(track, time_s=track.time_s + np.cumsum(moved)), (words,)

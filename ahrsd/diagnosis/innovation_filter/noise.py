@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.data_quality.facts import Fact, spans_of
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered
@@ -26,15 +27,6 @@ _FREQUENCIES = 4096  # of a spectrum
 _FLOOR = 1e-6  # white part of a colour, at least
 _BLOCK_S = 2.0
 _FINE_S, _PASSES = 1.0, 4  # in which bursts are told apart
-_FILLED = 0.7  # of a stretch that is loud throughout
-#: nats by which a change of level must be likelier than none: with the 20,000 stretches that 400 s
-#: have, one recording of one level in ten thousand has such a one
-_NATS = 17.0
-_RATIO = 1.3  # of the levels, at least
-_OUTLIER = 3.0  # deviations from which a reading is no more a sign of a louder noise
-_BURST_SHARE = 0.4  # of the recording that a burst may last
-_OPPOSED = -0.3  # correlation of successive differences, at most
-_LEVEL = 1.15  # times the spec's noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,23 +135,27 @@ def louder(done: Filtered) -> Louder | None:
     if len(middle) < 10 or not np.any(variance > 1e-18):
         return None
     # one reading far out is no louder noise
-    most = _OUTLIER**2 * 2.0 * _middle_variance(done) or np.inf
+    most = priors.LOUDER_OUTLIER**2 * 2.0 * _middle_variance(done) or np.inf
     clipped = levels(done, most=most)[1]
     first, last, gain = _loudest(clipped, size / _worth(done, most))
     inside = np.zeros(len(middle), dtype=bool)
     inside[first:last] = True
     sides = loud, quiet = _sides(variance, size, inside)
-    if gain <= _NATS or loud <= _RATIO * quiet or not _is_noise(done, middle[inside]):
+    if (
+        gain <= priors.LOUDER_NATS
+        or loud <= priors.LOUDER_RATIO * quiet
+        or not _is_noise(done, middle[inside])
+    ):
         return None
     stretch = (float(middle[first] - _BLOCK_S / 2), float(middle[last - 1] + _BLOCK_S / 2))
     spans, loud, quiet = _loud_spans(done, *_sides(clipped, size, inside), most)
     filled = sum(b - a for a, b in spans) / (stretch[1] - stretch[0])
     # what lasts from the beginning or to the end changed once
     amid = first > 0 and last < len(middle)
-    short = amid and last - first <= _BURST_SHARE * len(middle)
-    if loud < _RATIO * quiet:  # not two levels that come and go: the one stretch alone
+    short = amid and last - first <= priors.BURST_SHARE * len(middle)
+    if loud < priors.LOUDER_RATIO * quiet:  # not two levels that come and go: the one stretch alone
         spans, loud, quiet = [], *sides
-    if short or (len(spans) > 1 and filled < _FILLED):
+    if short or (len(spans) > 1 and filled < priors.BURST_FILLED):
         return Louder(tuple(spans or [stretch]), loud, quiet, burst=True)
     return Louder((stretch,), loud, quiet, burst=False)
 
@@ -173,7 +169,7 @@ def level_facts(done: Filtered, *, spec_given: bool = False) -> list[Fact]:
         return []
     # a few outliers are the power of a louder noise, but the level of most readings is the spec's
     overall = min(float(np.average(variance, weights=size)), _middle_variance(done))
-    if overall > _LEVEL and overall > 1 + 6 * np.sqrt(2 * _worth(done) / size.sum()):
+    if overall > priors.LEVEL_RATIO and overall > 1 + 6 * np.sqrt(2 * _worth(done) / size.sum()):
         whole = (float(middle[0] - _BLOCK_S / 2), float(middle[-1] + _BLOCK_S / 2))
         return [_level(done, Louder((whole,), overall, 1.0, burst=False))]
     return []
@@ -209,7 +205,7 @@ def _is_noise(done: Filtered, blocks: Array) -> bool:
     d = np.diff(done.whitened, axis=0)
     kept = (done.used & near)[2:] & done.used[1:-1] & done.used[:-2]
     square = float(np.sum(d[1:][kept] ** 2))
-    return square > 0 and float(np.sum((d[1:] * d[:-1])[kept])) / square < _OPPOSED
+    return square > 0 and float(np.sum((d[1:] * d[:-1])[kept])) / square < priors.NOISE_OPPOSED
 
 
 def _loudest(variance: Array, weight: Array) -> tuple[int, int, float]:
@@ -274,7 +270,7 @@ def _burst(done: Filtered, found: Louder) -> Fact:
         "noise_burst",
         words,
         Where(found.spans_s, ("x", "y", "z"), "noise"),
-        0.98,
+        priors.SURE_OF_NOISE,
         (Value("burst", sigma, sigma * 0.1, "gauss"),),
         {"onset_s": begin, "length_s": end - begin},
     )
@@ -290,7 +286,7 @@ def _level(done: Filtered, found: Louder) -> Fact:
     parameters = (Value("mag", sigma, sigma * 0.1, "gauss"),)
     falls = begin < done.track.time_s[0] + _BLOCK_S / 2 and end < done.track.time_s[-1]
     setting = {"onset_s": end if falls else begin}
-    return Fact("noise_level", words, where, 0.98, parameters, setting)
+    return Fact("noise_level", words, where, priors.SURE_OF_NOISE, parameters, setting)
 
 
 def _centred(done: Filtered) -> Array:

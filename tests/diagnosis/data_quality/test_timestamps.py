@@ -14,9 +14,10 @@ from told_facts import only, value
 from tracks import experiment, track_of
 
 from ahrsd import so3
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.data_quality.facts import matters
 from ahrsd.diagnosis.data_quality.preparation import facts_of, put_right
-from ahrsd.diagnosis.data_quality.timestamps import LEFT_S, regular, stamps, without_jumps
+from ahrsd.diagnosis.data_quality.timestamps import regular, stamps, without_jumps
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
@@ -92,7 +93,7 @@ def _jumping(by_s: float, samples: int = 1000) -> Track:
 def test_a_jump_is_a_short_break(by_s: float) -> None:
     track = _jumping(by_s)
     done, (words,) = without_jumps(track)
-    assert done.time_s[500] - done.time_s[499] == pytest.approx(LEFT_S)
+    assert done.time_s[500] - done.time_s[499] == pytest.approx(priors.BREAK_LEFT_S)
     assert np.diff(done.time_s).min() > 0.0
     assert words.startswith(f"the clock jumps by {by_s + 0.04:+.6g} s behind 20 s")
     assert without_jumps(done) == (done, ())
