@@ -13,14 +13,12 @@ from itertools import pairwise
 
 import numpy as np
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
 LONGEST_SHIFT_S = 5.0
-LEAST_OVERLAP_S = 20.0
-LEAST_CORRELATION = 0.8  # of the two gyros' magnitudes; another motion is far below
-SAME_SIGMAS = 4.0  # parameters that differ by less are the same effect
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,16 +35,16 @@ def align(real: Track, simulated: Track) -> Overlap:
     shift_s, correlation = _shift(real, simulated)
     begin = max(real.time_s[0], simulated.time_s[0] - shift_s)
     end = min(real.time_s[-1], simulated.time_s[-1] - shift_s)
-    if end - begin < LEAST_OVERLAP_S:
+    if end - begin < priors.OVERLAP_S:
         raise ValueError(
             f"overlaps the recording by {max(end - begin, 0.0):.1f} s only: it covers "
             f"{simulated.time_s[0]:.1f} to {simulated.time_s[-1]:.1f} s, the recording "
             f"{real.time_s[0]:.1f} to {real.time_s[-1]:.1f} s"
         )
-    if correlation < LEAST_CORRELATION:
+    if correlation < priors.SAME_MOTION:
         raise ValueError(
             f"is another motion: its rates correlate with the recording's by {correlation:.2f} "
-            f"at best, {LEAST_CORRELATION} is needed"
+            f"at best, {priors.SAME_MOTION} is needed"
         )
     notes = [f"compared over {end - begin:.1f} s, from {begin:.1f} to {end:.1f} s"]
     if abs(shift_s) > 0.5 * _step_s(real):
@@ -65,13 +63,13 @@ def _shift(real: Track, simulated: Track) -> tuple[float, float]:
     reach = round(LONGEST_SHIFT_S / step)
     begin = max(real.time_s[0], simulated.time_s[0])
     end = min(real.time_s[-1], simulated.time_s[-1])
-    if end - begin < LEAST_OVERLAP_S:
+    if end - begin < priors.OVERLAP_S:
         return 0.0, 1.0  # said by the caller
     grid = np.arange(begin, end, step)
     a, b = (_rates(track, grid) for track in (real, simulated))
     reach = min(reach, len(grid) // 4)
     found = _best(a, b, reach)
-    if found[1] < LEAST_CORRELATION:  # perhaps one has its axes swapped
+    if found[1] < priors.SAME_MOTION:  # perhaps one has its axes swapped
         found = max(found, _best(_size(a), _size(b), reach), key=lambda one: one[1])
     return found[0] * step, found[1]
 
@@ -144,7 +142,7 @@ def _same(one: Finding, other: Finding) -> bool:
         if twin is None:
             return False
         sigma = float(np.hypot(value.std, twin.std))
-        if not abs(value.value - twin.value) <= SAME_SIGMAS * max(sigma, 1e-12):
+        if not abs(value.value - twin.value) <= priors.SAME_SIGMAS * max(sigma, 1e-12):
             return False
     return True
 

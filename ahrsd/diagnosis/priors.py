@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import exp, log
 
+import numpy as np
+
 from ahrsd.estimator import locked
 
 
@@ -198,6 +200,130 @@ PASSING_S = 30.0
 #: probability by chance, and correlation, of a logged column that is said to move with a course
 CHANCE, ALIKE = 0.2, 0.5
 
+# --- simulations against which an answer is held -------------------------------------------------
+# Smaller probabilities and more nats make the engine more silent (`answer/null_simulations.py`).
+#: probability by chance below which an answer that tells nothing is held against simulations all
+#: the same;  chosen
+FAMILY_P = 1e-3
+#: nats that simulations of the calibration alone are taken to show at least;  source: of 300 nulls
+#: of five noise laws three have more, errors of a gyro whose bias walks
+ALONE_NATS = 9.0
+#: gyro beside magnetometer: turns of the field by its noise in a step, in the deviations of a
+#: reading, from which on evidence is held against simulations;  source: above every real recording
+#: that was looked at, below the simulations that were told to differ from themselves
+CHANCE_LOUD = 2.0
+#: the same where the gyro's noise moves the calibration by so many deviations to which it is known;
+#: source: simulations that hardly tilt have .6 to .9, those that do .2 at most, real recordings
+#: next to nothing but one that never moves
+CHANCE_BENT = 0.3
+#: simulations to which the calibration alone is fitted, for the bands in which the recording's own
+#: fit has to be where nothing is told;  and how many of these are diagnosed at most;  chosen
+CHANCE_FITS, CHANCE_COPIES = 16, 5
+#: of what chance makes, the part that is told when all of these were asked, and when so many fewer
+#: were that the rest need not be;  source: an exponential tail of unknown scale, four times the
+#: largest of five and 43 times the larger of two
+CHANCE_P, CHANCE_EARLY_P = 1 / 126, 1e-3
+
+# --- checks of what is left ----------------------------------------------------------------------
+#: probability that any statistic of a simulation is outside of its band
+CHECKS_OUTSIDE = 0.01
+#: deviations beyond the mean of the largest values of 16 copies that one more is below in 999 of
+#: 1000 draws, a thousandth for each of ten statistics;  source: Gumbel's law, drawn in
+#: tests/diagnosis/answer/test_predictive_checks.py
+CHECKS_LARGEST_REACH = 6.5
+#: times the power that noise has in means over segments, beyond which these are no noise;  chosen
+SLOW_BEYOND = 2.0
+#: mean square of the innovations below which an assumed noise is not there;  source: two of the
+#: three axes have the gyro's, 2 / 3 where the magnetometer has none
+ABSENT_NOISE = 0.8
+#: probability by chance below which a test of the innovations is said to fail;  chosen
+TEST_FAILED = 1e-4
+
+# --- what is said of a finding -------------------------------------------------------------------
+#: log odds: none is told surer;  chosen
+SUREST_ODDS = 30.0
+#: probability from which on another name is told beside one;  chosen
+SMALLEST_SHARE = 0.01
+#: part of the squares that may be left where one component's columns hold another's;  chosen
+COLUMNS_ALIKE = 1e-3
+#: deviation of each number of a setting, in the changes of which its slopes are made
+#: (`inference/search/near_settings.py`);  chosen
+SETTING_OFF = 25.0
+#: settings that an onset which was sought finely counts for at least;  onsets among which one that
+#: the data proposed was chosen
+SOUGHT_SETTINGS, PROPOSED_ONSETS = 40, 200
+#: part of the largest axis that an axis has on which a term acts;  part of the largest stretch that
+#: a stretch has in which it does;  part of the whole time, from where on it is everywhere
+ACTS_ON_AXIS, ACTS_IN_STRETCH, ACTS_EVERYWHERE = 0.2, 0.15, 0.6
+#: part of a course's largest departure from its usual level, from which on it is away;  deviations
+#: by which its beginning and end are still away
+DEPARTED, STILL_DEPARTED = 0.25, 2.0
+#: range that a quantity has at least for what is left to be told by it, in its unit
+REGIME_RANGE: Mapping[str, float] = {
+    "heading_deg": 60.0,
+    "pitch_deg": 10.0,
+    "roll_deg": 10.0,
+    "rate_rad_s": 0.05,
+}
+#: horizontal part of the field where no accelerometer says what is level: at 60 degrees of dip;
+#: and the smallest in which a heading is told
+LEVEL_SHARE, LEVEL_LEAST_SHARE = 0.5, 0.1
+
+# --- a narrow band -------------------------------------------------------------------------------
+#: times as loud as both sides;  source: the colour of a few coefficients is not so steep
+BAND_STANDS_OUT = 3.0
+#: Hz below which none is sought: there are courses in time and the motion's own rates
+BAND_LOWEST_HZ = 0.75
+#: part of the power that is along the field, at most, in an error of the gyro; else about a third
+BAND_ALONG = 0.1
+
+# --- a simulation that somebody brought ----------------------------------------------------------
+#: s that it has in common with the recording, at least;  chosen
+OVERLAP_S = 20.0
+#: correlation of the two gyros that is the same motion; another motion is far below
+SAME_MOTION = 0.8
+#: deviations: parameters that differ by less are the same effect;  chosen
+SAME_SIGMAS = 4.0
+
+# --- the calibration -----------------------------------------------------------------------------
+#: prior deviations of the 11: soft iron about I, hard iron (gauss) about 0, gyro bias (rad/s);
+#: source: a thousand times too wide to matter where the motion shows anything
+CALIBRATION_DEVIATION = np.array([0.15] * 5 + [0.5] * 3 + [0.03] * 3)
+CALIBRATION_DEVIATION.flags.writeable = False
+#: scatter of the field over its size that shows the iron; below, the prior is narrower
+IRON_TURNED = 0.1
+#: of how many data one says something new, from which on the prior is made to count
+REPEATED = 3.0
+#: rad/s that the mean of a resting gyro may differ from its bias, where the field shows that it
+#: rests
+STILL_BIAS_RAD_S = 1e-3
+#: rows that a recording counts for where the centre of its sphere is sought, and how far it is from
+#: a sphere, of the mean square;  chosen
+SPHERE_ROWS, SPHERE_OFF = 100, 0.1
+#: steps that a fit needs;  chosen
+FIT_STEPS = 15
+#: deviation of the field at the first row of a run that has no reading, of its size, in all
+#: directions
+UNSEEN_FIELD = 0.5
+
+# --- levels of noise -----------------------------------------------------------------------------
+#: times the gyro's differenced noise that its noise may be at most;  source: free, it swallows
+#: every drift of the gyro
+GYRO_NOISE_CAP = 1.5
+#: deviation of the logarithm of the gyro's noise from its differenced one before the data speak;
+#: the same below that where the differences are mostly of the motion
+GYRO_NOISE_TRUST, SHAKEN_TRUST = 0.25, 1.5
+#: random walk of the bias, rad/s per square root of a second, beyond which it is no longer noise:
+#: 50 deg/h after 400 s
+WALK_CAP_RAD_S_SQRT_S = 1.2e-5
+#: nats that a wandering bias must gain;  source: two standard deviations are not enough
+WALK_NATS = 6.0
+#: noise of a magnetometer whose readings are too far apart to be compared with each other, gauss
+USUAL_MAG_GAUSS = 1e-3
+#: least noise of the magnetometer, gauss, and of the gyro, rad/s;  source: below the
+#: magnetometer's, what the filter leaves out (it is linear) would be more than the noise
+FLOOR_MAG_GAUSS, FLOOR_GYRO_RAD_S = 2e-5, 1e-5
+
 # --- noise that is louder for a while ------------------------------------------------------------
 #: nats by which a change of level must be likelier than none;  source: with the 20,000 stretches
 #: that 400 s have, one recording of one level in ten thousand has such a one
@@ -213,6 +339,93 @@ BURST_SHARE, BURST_FILLED = 0.4, 0.7
 NOISE_OPPOSED = -0.3
 #: variance over the spec's, from which on the noise is above it;  chosen
 LEVEL_RATIO = 1.15
+
+# --- what a gyro's readings are ------------------------------------------------------------------
+#: a gyro's noise per sample, rad/s, below which none is;  coning that is no more than so many times
+#: its square, summed, is lost even in this and left
+CONING_QUIETEST_RAD_S, CONING_LOST = 1e-4, 10.0
+#: deviations that none and all of it must be apart to be told;  deviations beyond all of it from
+#: which on it is something else
+CONING_RESOLVED, CONING_OFF = 3.0, 4.0
+#: change of the rate from step to step over the rate, root mean squares, beyond which the product
+#: of neighbours says nothing of what was between them
+CONING_UNRESOLVED = 0.5
+#: of the usual level, what the quiet seconds of noise are at least; a motion's are quieter;
+#: source: of twelve real recordings eleven have a tenth of their seconds below .67, of 120
+#: simulated motions none below .76
+SHAKEN_STEADY = 0.7
+#: noise of the magnetometer over its differences beyond which something else is wrong;  noise of
+#: the gyro over its differences below which these were the motion's
+SHAKEN_WRONG, SHAKEN_QUIETER = 1.5, 0.7
+
+# --- a gyro that stands still --------------------------------------------------------------------
+#: 1 - |mean direction| of the field in the sensor, below which it hardly turns: directions within
+#: about 5 degrees
+REST_SPREAD = 4e-3
+#: walk of an ordinary gyro's bias, rad/s per square root of a second: 20 deg/h in 400 s is noise
+#: and gets no name
+ORDINARY_WALK_RAD_S_SQRT_S = 5e-6
+#: what may move the bias, and log prior odds;  source: that the recording began when the power came
+#: on, as a start-up needs, is seldom so
+REST_CAUSES: Mapping[str, float] = {
+    "gyro_bias_temperature": 0.0,
+    "gyro_bias_drift": 0.0,
+    "gyro_bias_step": 0.0,
+    "gyro_startup": -5.0,
+}
+#: prior deviation of the bias itself, rad/s
+REST_BIAS_RAD_S = 1e-2
+#: seconds of standing that are needed;  how far a still second's scatter may be, of the usual one,
+#: and its mean, rad/s
+REST_S, REST_SCATTER, REST_AWAY_RAD_S = 60, 3.0, 0.01
+#: nats over its walk alone for a cause of the bias: odds 50 to 1 for every candidate's size
+REST_NATS = 4.0
+#: deviations of an ordinary walk: a change below is one
+REST_LARGE = 3.0
+#: probability from which on another cause is told beside one;  chosen
+REST_SMALLEST_SHARE = 0.005
+#: share of the gyro's integral that the field follows, beyond which the vehicle does turn
+REST_TURNS = 0.3
+
+# --- a delay -------------------------------------------------------------------------------------
+#: part of the middle step within which steps are alike, and so many must be
+STEPS_ALIKE, STEPS_ALIKE_SHARE = 0.25, 0.95
+#: part of half a step within which a delay is one: then it is the gyro's
+HALF_STEP_WITHIN = 0.1
+#: s that a magnetometer is ordinarily late at most: readings so near to a run's first row are left
+#: out;  source: BROAD 11 ms, a VN-100 by hand 25 to 40, a flight 50 to 100
+BEGIN_S = 0.1
+#: part of a run from which on its first readings are too many to be left out.  Chosen, not measured
+BEGIN_SHARE = 0.1
+
+# --- logged columns ------------------------------------------------------------------------------
+#: s without values that are filled;  source: a column of 1 Hz beside samples of 25 Hz has them, a
+#: failed logger has more
+COLUMN_GAP_S = 2.0
+#: part of the rows without a value beyond which a column is left out;  chosen
+COLUMN_MISSING = 0.98
+#: the same of a column with long holes, whose other readings are used: with more holes than values
+#: it says too little
+COLUMN_HOLES = 0.5
+#: rows that a 0/1 column stays on, beyond which it is a switch, else a train of pulses
+SWITCH_ROWS = 4
+#: s between a column's values, at most: what changes more seldom is a level
+COLUMN_HELD_S = 5.0
+#: share of the values that come after one period, and by how much of one they may miss it
+COLUMN_REGULAR, COLUMN_MISS = 0.6, 0.25
+#: fewest values that tell how a column was logged
+COLUMN_UPDATES = 20
+#: deviations of its own scatter by which a logger's noise may depart from flat, and from Gaussian
+COLUMN_NOISE_SCATTER = 3.0
+#: part of a column's power that its course has at least, where its noise is taken off
+COLUMN_COURSE = 0.8
+#: share of an unknown course that a column of another clock must explain, and deviations of what it
+#: explains at other times
+CLOCK_SHARE, CLOCK_SURE = 0.5, 4.0
+#: nats of a column's clock over the column as logged, and of a drift over a lag that stays
+CLOCK_NATS = 30.0
+#: s: a column's lag below is none
+CLOCK_SMALLEST_S = 0.1
 
 # --- data quality: how sure a fact is ------------------------------------------------------------
 #: probability of a name that was counted and compared: a limit, coarse steps, stamps, axes, units
@@ -373,42 +586,3 @@ DOUBLED_SHARE = 2e-3
 DOUBLED_BEYOND_CHANCE = 5.0
 #: noise levels of the gyro beyond which the sensor turns;  chosen
 DOUBLED_TURNING_NOISE = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Smaller probabilities and more nats make the engine more silent.
-
-    family_p:       probability by chance below which an answer that tells nothing is held against
-                    simulations all the same
-    evidence_nats:  evidence over its walk alone for a cause of the bias of a gyro that stands: odds
-                    50 to 1 for every candidate's size
-    alone_nats:     what simulations of the calibration alone are taken to show at least: of 300
-                    nulls of five noise laws three have more, errors of a gyro whose bias walks
-    chance_loud:    gyro beside magnetometer: turns of the field by its noise in a step, in the
-                    deviations of a reading, from which on evidence is held against simulations.
-                    Above every real recording that was looked at, below the simulations that
-                    were told to differ from themselves
-    chance_bent:    the same where the gyro's noise moves the calibration by so many deviations to
-                    which it is known.  Simulations that hardly tilt have .6 to .9, those that do
-                    .2 at most, real recordings next to nothing but one that never moves
-    chance_fits:    simulations to which the calibration alone is fitted, for the bands in which the
-                    recording's own fit has to be where nothing is told
-    chance_copies:  how many of these are diagnosed at most
-    chance_p, chance_early_p: of what chance makes, the part that is told when all of these were
-                    asked, and when so many fewer were that the rest need not be
-                    (`null_simulations`)
-    """
-
-    family_p: float = 1e-3
-    evidence_nats: float = 4.0
-    alone_nats: float = 9.0
-    chance_loud: float = 2.0
-    chance_bent: float = 0.3
-    chance_fits: int = 16
-    chance_copies: int = 5
-    chance_p: float = 1 / 126
-    chance_early_p: float = 1e-3
-
-
-LIMITS = Limits()

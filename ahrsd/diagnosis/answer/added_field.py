@@ -9,13 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.model import Context, NullModel
 from ahrsd.samples import Array
-
-#: where no accelerometer says what is level: the horizontal part of the field at 60 degrees of dip
-LEVEL_SHARE = 0.5
-#: smallest horizontal part of the field in which a heading is told
-LEAST_SHARE = 0.1
 
 
 def calibration_of(context: Context) -> Array:
@@ -50,11 +46,11 @@ def heading_off_deg(added: Array, context: Context) -> float:
     read = context.field_b @ context.model.soft_iron.T
     if not context.world_levelled:
         size = float(np.median(np.linalg.norm(read, axis=1)))
-        return float(np.degrees(deviation(added) / np.sqrt(3.0) / (LEVEL_SHARE * size)))
+        return float(np.degrees(deviation(added) / np.sqrt(3.0) / (priors.LEVEL_SHARE * size)))
     outside, in_world = (_turned(context.R_nb, vectors) for vectors in (read, added))
     north, east, _ = mean = outside.mean(axis=0)
     level = float(np.hypot(north, east))
-    least = max(level, LEAST_SHARE * float(np.linalg.norm(mean)))
+    least = max(level, priors.LEVEL_LEAST_SHARE * float(np.linalg.norm(mean)))
     across = in_world[:, :2] @ np.array([-east, north]) / max(level, 1e-300)
     return float(np.degrees(np.std(across) / least))
 

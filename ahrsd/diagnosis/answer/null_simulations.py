@@ -35,10 +35,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis import priors, time_series
 from ahrsd.diagnosis.answer.diagnosis import Check, Diagnosis, Finding, Unexplained
 from ahrsd.diagnosis.answer.predictive_checks import beside_refitted, checks, usual_noise
-from ahrsd.diagnosis.calibration_fit.noise_fit import FLOOR_MAG_GAUSS
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null
 from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate, problem_of
 from ahrsd.diagnosis.data_quality.preparation import would_have_shown
@@ -57,7 +56,6 @@ from ahrsd.diagnosis.innovation_filter.innovation import (
     sensitivities,
 )
 from ahrsd.diagnosis.model import Noise, NullModel
-from ahrsd.diagnosis.priors import LIMITS, Limits
 from ahrsd.diagnosis.repaired_model import forward
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
@@ -116,32 +114,30 @@ class Alone:
         return any(not check.inside_after for check in self.checks.values())
 
 
-def beyond_chance(
-    track: Track, ask: Callable[[Track], Answered], limits: Limits = LIMITS
-) -> Diagnosis:
+def beyond_chance(track: Track, ask: Callable[[Track], Answered]) -> Diagnosis:
     """The answer about a track; beside a loud gyro only what is clearly beyond chance is told.
 
     ask: answers about a track.  Where the gyro is loud, by itself or for this motion, and something
-    is told or a check fails, the calibration is fitted to `limits.chance_fits` copies (seeds 0, 1
-    and so on); where the recording's fit is not like theirs, `limits.chance_copies` of these at
-    most are asked about as well
+    is told or a check fails, the calibration is fitted to `CHANCE_FITS` copies (seeds 0, 1 and so
+    on); where the recording's fit is not like theirs, `CHANCE_COPIES` of these at most are asked
+    about as well
     """
     first = ask(track)
     found, problem, start = first.found, first.problem, first.start
     told = max(_told(found), default=0.0)
-    seen = told > 0.0 or found.failed_checks or found.p_value < limits.family_p
+    seen = told > 0.0 or found.failed_checks or found.p_value < priors.FAMILY_P
     if problem is None or start is None or not seen:
         return found
     recorded = problem.recorded
     models = [model_at_rate(start.model, problem), *([found.model] if found.model else [])]
     model = max(models, key=lambda one: loudness(recorded, one))
-    loud = loudness(recorded, model) >= limits.chance_loud
-    if not loud and bent(start) < limits.chance_bent:
+    loud = loudness(recorded, model) >= priors.CHANCE_LOUD
+    if not loud and bent(start) < priors.CHANCE_BENT:
         return found
     why = LOUD if loud else BENT
     truth = motion_of(recorded, model)
     for noise in _noises_of(model, start):
-        copies = [copy_of(recorded, truth, noise, seed) for seed in range(limits.chance_fits)]
+        copies = [copy_of(recorded, truth, noise, seed) for seed in range(priors.CHANCE_FITS)]
         alone = Alone.of(problem, start, copies)
         if not alone.differs:
             break
@@ -151,7 +147,7 @@ def beyond_chance(
         )
     if told <= 0.0:
         return replace(found, posterior_predictive=alone.checks)
-    shown, bound = _shown(copies[: limits.chance_copies], ask, found, limits)
+    shown, bound = _shown(copies[: priors.CHANCE_COPIES], ask, found)
     said = _words(why, found, told, shown, bound)
     if told <= bound:
         untold = None if np.isfinite(bound) else NOT_DIAGNOSED
@@ -199,7 +195,7 @@ def _noises_of(model: NullModel, start: NullFit) -> list[Noise]:
     """The noise of a model; where the magnetometer has less than a fit believes at least, how much
     is not known: what the innovations say, and none."""
     noise = forward.noise_of(model)
-    if start.model.sigma_mag_gauss > FLOOR_MAG_GAUSS:
+    if start.model.sigma_mag_gauss > priors.FLOOR_MAG_GAUSS:
         return [noise]
     less = min(1.0, usual_noise(start).mag_gauss / forward.noise_of(start.model).mag_gauss)
     return [replace(noise, mag_gauss=less * noise.mag_gauss), replace(noise, mag_gauss=0.0)]
@@ -275,15 +271,15 @@ def times_beyond(copies: int, chance: float) -> float:
 
 
 def _shown(
-    copies: Sequence[Track], ask: Callable[[Track], Answered], found: Diagnosis, limits: Limits
+    copies: Sequence[Track], ask: Callable[[Track], Answered], found: Diagnosis
 ) -> tuple[list[float], float]:
     """What copies show, nats, until that decides; and up to how many nats it may be chance."""
-    told, last = _told(found), times_beyond(len(copies), limits.chance_p)
-    largest, shown = limits.alone_nats, list[float]()
+    told, last = _told(found), times_beyond(len(copies), priors.CHANCE_P)
+    largest, shown = priors.ALONE_NATS, list[float]()
     for count, copy in enumerate(copies[:-1], 1):
         shown.append(_shown_by(copy, ask))
         largest = max(largest, shown[-1])
-        early = largest * times_beyond(count, limits.chance_early_p)
+        early = largest * times_beyond(count, priors.CHANCE_EARLY_P)
         if min(told) > early:
             return shown, early
         if max(told) <= last * largest:

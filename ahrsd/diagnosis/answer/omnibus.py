@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ahrsd.diagnosis.calibration_fit.noise_fit import FLOOR_MAG_GAUSS
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered
 from ahrsd.diagnosis.innovation_filter.regression_statistics import (
     chi2_above,
@@ -21,9 +21,6 @@ from ahrsd.diagnosis.innovation_filter.regression_statistics import (
 from ahrsd.diagnosis.model import Context
 from ahrsd.samples import Array
 
-#: mean square of the innovations below which an assumed noise is not there; two of the three axes
-#: have the gyro's: 2 / 3 where the magnetometer has none
-_QUIETER = 0.8
 LAGS = 20
 
 
@@ -50,8 +47,8 @@ def omnibus(done: Filtered, context: Context | None = None) -> tuple[Test, ...]:
     rows = done.whitened[done.used]
     if len(rows) < 100 or np.any(np.std(rows, axis=0) < 1e-9):
         return ()
-    assumed = done.model.sigma_mag_gauss <= FLOOR_MAG_GAUSS
-    if assumed and np.mean(rows**2) < _QUIETER:
+    assumed = done.model.sigma_mag_gauss <= priors.FLOOR_MAG_GAUSS
+    if assumed and np.mean(rows**2) < priors.ABSENT_NOISE:
         return ()
     out = [_level(rows), _ljung_box(done), _periodogram(done), _normal(rows)]
     if context is not None:

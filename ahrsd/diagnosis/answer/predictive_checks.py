@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis import priors, time_series
 from ahrsd.diagnosis.answer.diagnosis import Check
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.calibration_fit.quantisation_noise import (
@@ -43,11 +43,6 @@ from ahrsd.samples import Array
 COPIES = 16
 # simulations by which the noise's colour is found, and how many rows are enough
 _TRIED, _TRIED_ROWS, _TRIAL_SEED = 8, 40_000, 2
-_OUTSIDE = 0.01
-#: deviations beyond the mean of COPIES largest values that one more is below in 999 of 1000 draws,
-#: by Gumbel's law (drawn in tests/diagnosis/answer/test_predictive_checks.py): a thousandth for
-#: each of ten
-_LARGEST_REACH = 6.5
 _SEGMENT_S = 20.0
 _LAGS = 50
 _LEAST = 1e-12
@@ -55,7 +50,6 @@ _TWO_SIDED = ("normalised_innovation", "autocorrelation", "tail")
 _ROUNDED = "mag_quantisation"
 _ACROSS = 2.0 / 3.0  # of an innovation's three parts are across the field
 _QUIETEST = 1e-3  # of an innovation's deviation: the least that the magnetometer scatters by
-_BEYOND = 2.0  # times what noise has in means over segments
 
 
 def checks(null: NullFit) -> dict[str, Check]:
@@ -117,7 +111,7 @@ def noise_law(
     """
     done, quick = fit.filtered, _quick(fit, fit.filtered.whitened)
     slow = done.normalised_innovation - quick.normalised_innovation
-    if slow > _BEYOND * _slow_power(quick, segments_of(done.track)):
+    if slow > priors.SLOW_BEYOND * _slow_power(quick, segments_of(done.track)):
         done = quick
     within = np.zeros(len(done.track), dtype=bool)
     for begin, end in loud:
@@ -386,7 +380,7 @@ def bands(
     by_factor: whether the largest of many differences are spread in the logarithm as well
     """
     count, names = len(found), list(found[0])
-    outside = _OUTSIDE / len(names)
+    outside = priors.CHECKS_OUTSIDE / len(names)
     two_sided = student_quantile(1 - outside / 2, count - 1) * np.sqrt(1 + 1 / count)
     out = {}
     for name in names:
@@ -397,9 +391,12 @@ def bands(
             width = two_sided * spread
             out[name] = (float(np.exp(middle - width)), float(np.exp(middle + width)))
         elif by_factor:
-            out[name] = (0.0, float(np.exp(middle + _LARGEST_REACH * spread)))
+            out[name] = (0.0, float(np.exp(middle + priors.CHECKS_LARGEST_REACH * spread)))
         else:
-            out[name] = (0.0, float(values.mean() + _LARGEST_REACH * values.std(ddof=1)))
+            out[name] = (
+                0.0,
+                float(values.mean() + priors.CHECKS_LARGEST_REACH * values.std(ddof=1)),
+            )
     return out
 
 

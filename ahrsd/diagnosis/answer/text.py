@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import (
     Component,
     Diagnosis,
@@ -46,7 +47,6 @@ _SPOKEN_UNITS = {
     "1": ("%", 100.0),
 }
 _LIMITS_SHOWN = 6
-_FAILED = 1e-4
 #: said of a simulation that leaves what a real recording may
 SIMULATED = "a simulated recording, its truth is beside it: nothing that is left there is ordinary"
 
@@ -74,8 +74,8 @@ def lines(found: Diagnosis) -> list[str]:
 
 def _whiteness(found: Diagnosis) -> str:
     """Which of the omnibus tests the model failed, and which the repaired one still fails."""
-    before = [name for name, test in found.omnibus.items() if test.p_before < _FAILED]
-    after = [name for name, test in found.omnibus.items() if test.p_after < _FAILED]
+    before = [name for name, test in found.omnibus.items() if test.p_before < priors.TEST_FAILED]
+    after = [name for name, test in found.omnibus.items() if test.p_after < priors.TEST_FAILED]
     if not before and not after:
         return "white, Gaussian and even"
     left = f"still {', '.join(after)}" if after else "nothing with the repaired model"

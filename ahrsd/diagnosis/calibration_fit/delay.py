@@ -27,21 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd import so3
-from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis import priors, time_series
 from ahrsd.diagnosis.effects.effect import readings_of
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
-
-#: steps within this part of the middle one are alike, and so many must be
-ALIKE, ALIKE_SHARE = 0.25, 0.95
-#: a lag is half a step within this share of it
-HALF_A_STEP = 0.1
-#: s that a magnetometer is ordinarily late at most: BROAD 11 ms, a VN-100 by hand 25 to 40,
-#: a flight 50 to 100
-BEGIN_S = 0.1
-#: part of a run from which on its first readings are too many to be left out.  Chosen, not measured
-BEGIN_SHARE = 0.1
 
 
 def without_lag(track: Track, lag_s: float, *, instants: bool = False) -> Track:
@@ -70,8 +60,8 @@ def after_columns_begin(track: Track) -> Track:
         return track
     mag = track.mag_b_gauss.copy()
     for run in time_series.runs(track.dt_s):
-        before = track.time_s[run] - track.time_s[run.start] < BEGIN_S
-        if np.mean(before) < BEGIN_SHARE:
+        before = track.time_s[run] - track.time_s[run.start] < priors.BEGIN_S
+        if np.mean(before) < priors.BEGIN_SHARE:
             mag[run][before] = np.nan
     return replace(track, mag_b_gauss=mag)
 
@@ -79,15 +69,15 @@ def after_columns_begin(track: Track) -> Track:
 def of_magnetometer(track: Track, lag_s: float) -> bool:
     """Whether a lag is one of all that the magnetometer measures, and not of the gyro alone."""
     step_s = usual_step(track.dt_s)
-    half = step_s is not None and abs(lag_s / (step_s / 2) - 1.0) < HALF_A_STEP
+    half = step_s is not None and abs(lag_s / (step_s / 2) - 1.0) < priors.HALF_STEP_WITHIN
     return lag_s > 0.0 and not half
 
 
 def usual_step(dt_s: Array) -> float | None:
     """The step that nearly all rows (N,) have, seconds; None where there is none."""
     middle = float(np.nanmedian(dt_s))
-    alike = np.abs(np.nan_to_num(dt_s, nan=0.0) / middle - 1.0) < ALIKE
-    return middle if np.mean(alike) > ALIKE_SHARE else None
+    alike = np.abs(np.nan_to_num(dt_s, nan=0.0) / middle - 1.0) < priors.STEPS_ALIKE
+    return middle if np.mean(alike) > priors.STEPS_ALIKE_SHARE else None
 
 
 def earlier(track: Track, values: Array, ago_s: float) -> Array:

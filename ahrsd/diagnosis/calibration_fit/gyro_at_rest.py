@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.special import logsumexp
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Finding, Share, Value, Where
 from ahrsd.diagnosis.answer.text import separating_manoeuvre
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
@@ -27,35 +28,14 @@ from ahrsd.diagnosis.innovation_filter.regression_statistics import (
     total_score,
 )
 from ahrsd.diagnosis.model import Context
-from ahrsd.diagnosis.priors import LIMITS
 from ahrsd.samples import Array
 
-#: 1 - |mean direction| of the field in the sensor: directions within about 5 degrees
-REST_SPREAD = 4e-3
 HARDLY_TURNED = (
     "the sensor hardly turned: only the gyro, a logged current, switches and alternating fields "
     "can be told"
 )
-#: a gyro bias that wanders by 20 deg/h in 400 s is noise of an ordinary gyro and gets no name
-ORDINARY_WALK_RAD_S_SQRT_S = 5e-6
-#: what may move the bias of a gyro that stands, and log prior odds: that the recording began when
-#: the power came on, as a start-up needs, is seldom so
-CAUSES: Mapping[str, float] = {
-    "gyro_bias_temperature": 0.0,
-    "gyro_bias_drift": 0.0,
-    "gyro_bias_step": 0.0,
-    "gyro_startup": -5.0,
-}
-WALKS = ORDINARY_WALK_RAD_S_SQRT_S * np.array([1.0, 2.0, 4.0])
-#: prior deviation of the bias itself, rad/s
-BIAS_RAD_S = 1e-2
-#: seconds of standing that are needed, and how far a still second's scatter and mean may be
-FEWEST, SCATTER, AWAY_RAD_S = 60, 3.0, 0.01
-#: a change below this many deviations of an ordinary walk is one
-LARGE = 3.0
-SMALLEST_SHARE = 0.005
-#: share of the gyro's integral that the field follows, beyond which the vehicle does turn
-TURNS = 0.3
+#: sizes of the walk that are weighed, rad/s per square root of a second
+WALKS = priors.ORDINARY_WALK_RAD_S_SQRT_S * np.array([1.0, 2.0, 4.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +57,7 @@ def at_rest(fit: NullFit) -> bool:
     """Whether the field hardly turns in the sensor: then only the gyro can be told about."""
     field = fit.filtered.nominal_b
     unit = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-300)
-    return bool(1.0 - np.linalg.norm(unit.mean(axis=0)) < REST_SPREAD)
+    return bool(1.0 - np.linalg.norm(unit.mean(axis=0)) < priors.REST_SPREAD)
 
 
 def told_at_rest(library: Mapping[str, Effect], still: Sequence[Finding]) -> Mapping[str, Effect]:
@@ -86,19 +66,19 @@ def told_at_rest(library: Mapping[str, Effect], still: Sequence[Finding]) -> Map
     still: what a gyro that stands tells of its bias, which is not asked of the field again
     The delays stay: their rows make the column that a model always has.
     """
-    asked = {k: one for k, one in library.items() if not (still and k in CAUSES)}
+    asked = {k: one for k, one in library.items() if not (still and k in priors.REST_CAUSES)}
     return {k: e for k, e in asked.items() if e.family == "gyro" or e.rides or e.quick or e.delay}
 
 
 def resting(context: Context, library: Mapping[str, Effect]) -> tuple[Finding, ...]:
     """The name for what moves the bias of a gyro that stands, with what is as likely; or none."""
     rest = _rest(context)
-    if rest is None or _turning(rest, context) > TURNS:
+    if rest is None or _turning(rest, context) > priors.REST_TURNS:
         return ()
     best: dict[str, tuple[float, Setting]] = {}
     roots = [_roots(rest, walk) for walk in WALKS]
     weight = np.array([_log_likelihood(rest, root) for root in roots])
-    for name in CAUSES:
+    for name in priors.REST_CAUSES:
         options = library[name].settings(context) if name in library else ()
         if options:
             best[name] = max(
@@ -107,14 +87,16 @@ def resting(context: Context, library: Mapping[str, Effect]) -> tuple[Finding, .
             )
             best[name] = (best[name][0] - float(np.log(len(options))), best[name][1])
     evidence = {name: nats for name, (nats, _) in best.items()}
-    if not evidence or max(evidence.values()) < LIMITS.evidence_nats:
+    if not evidence or max(evidence.values()) < priors.REST_NATS:
         return ()
-    shares = dict(sorted(posterior(evidence, CAUSES).items(), key=lambda item: -item[1]))
+    shares = dict(
+        sorted(posterior(evidence, priors.REST_CAUSES).items(), key=lambda item: -item[1])
+    )
     name = next(iter(shares))
     setting, root = best[name][1], roots[int(np.argmax(weight))]
     value, deviation, course = _fitted(rest, context, library[name], setting, root)
-    usual = ORDINARY_WALK_RAD_S_SQRT_S * np.sqrt(rest.time_s[-1] - rest.time_s[0])
-    if np.ptp(course, axis=0).max() < LARGE * usual:
+    usual = priors.ORDINARY_WALK_RAD_S_SQRT_S * np.sqrt(rest.time_s[-1] - rest.time_s[0])
+    if np.ptp(course, axis=0).max() < priors.REST_LARGE * usual:
         return ()
     return (_finding(rest, library, shares, best[name], value, deviation, course),)
 
@@ -131,7 +113,7 @@ def _finding(
     name, *others = shares
     effect = library[name]
     size = np.ptp(course, axis=0)
-    close = [other for other in others if shares[other] > SMALLEST_SHARE]
+    close = [other for other in others if shares[other] > priors.REST_SMALLEST_SHARE]
     return Finding(
         effect=name,
         confidence=shares[name],
@@ -160,13 +142,13 @@ def _rest(context: Context) -> _Rest | None:
     track = context.track
     second = np.floor(track.time_s - track.time_s[0]).astype(np.intp)
     known = np.flatnonzero(np.bincount(second) > 2)
-    if len(known) < FEWEST:  # rows that come more slowly
+    if len(known) < priors.REST_S:  # rows that come more slowly
         return None
     means = np.stack([track.gyro_b_rad_s[second == k].mean(axis=0) for k in known])
     scatter = np.array([track.gyro_b_rad_s[second == k].std(axis=0).max() for k in known])
-    still = scatter < SCATTER * np.median(scatter)
-    still &= np.abs(means - np.median(means, axis=0)).max(axis=1) < AWAY_RAD_S
-    if np.count_nonzero(still) < FEWEST:
+    still = scatter < priors.REST_SCATTER * np.median(scatter)
+    still &= np.abs(means - np.median(means, axis=0)).max(axis=1) < priors.REST_AWAY_RAD_S
+    if np.count_nonzero(still) < priors.REST_S:
         return None
     mean = means[still]
     noise = np.sqrt(np.mean(np.diff(mean, axis=0) ** 2, axis=0) / 2)
@@ -193,7 +175,7 @@ def _turning(rest: _Rest, context: Context) -> float:
 def _roots(rest: _Rest, walk: float) -> list[Array]:
     """Per axis the Cholesky factor (n, n) of noise, walk and the bias' own prior."""
     since = rest.time_s - rest.time_s[0]
-    common = walk**2 * np.minimum.outer(since, since) + BIAS_RAD_S**2
+    common = walk**2 * np.minimum.outer(since, since) + priors.REST_BIAS_RAD_S**2
     return [linalg.cholesky(common + np.diag(np.full(len(since), s**2)), lower=True)
             for s in rest.noise]  # fmt: skip
 

@@ -22,7 +22,7 @@ from math import comb
 
 import numpy as np
 
-from ahrsd.diagnosis import time_series
+from ahrsd.diagnosis import priors, time_series
 from ahrsd.diagnosis.calibration_fit import noise_fit
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null, unusable
@@ -32,19 +32,8 @@ from ahrsd.diagnosis.model import Columns, NullModel
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.samples import Array
 
-#: a gyro's noise per sample, rad/s, below which none is: coning that is lost even in this is left
-_QUIETEST_RAD_S, _LOST = 1e-4, 10.0
-_RESOLVED = 3.0  # deviations that 0 and 1 must be apart to be told
-_OFF = 4.0  # deviations from 1 beyond which f is something else
-#: change of the rate from step to step over the rate, root mean squares, beyond which the product
-#: of neighbours says nothing of what was between them
-_UNRESOLVED = 0.5
 _FEWEST = 25  # samples whose scatter is compared with that of others
-_STEADY = 0.7  # of the usual level, what the quiet seconds of noise are at least
 _TURNS = 4  # of noise and calibration, found one after the other
-#: noise of the magnetometer over its differences beyond which something else is wrong, and of the
-#: gyro below which its differences were the motion's
-_WRONG, QUIETER = 1.5, 0.7
 
 
 def with_delta_angles(track: Track, model: NullModel) -> Track:
@@ -56,11 +45,18 @@ def with_delta_angles(track: Track, model: NullModel) -> Track:
     if not _resolved(track.gyro_b_rad_s - model.gyro_bias_rad_s):
         return track
     product = _half_turns(track, model.gyro_bias_rad_s)
-    if float(np.sum((product - product.mean(axis=0)) ** 2)) < _LOST * _QUIETEST_RAD_S**2:
+    if (
+        float(np.sum((product - product.mean(axis=0)) ** 2))
+        < priors.CONING_LOST * priors.CONING_QUIETEST_RAD_S**2
+    ):
         return track
     mended = replace(track, gyro_b_rad_s=track.gyro_b_rad_s + product)
     part, deviation = _part(track, mended, model)
-    if deviation * _RESOLVED > 1.0 or part < 0.5 or part > 1.0 + _OFF * deviation + 0.5:
+    if (
+        deviation * priors.CONING_RESOLVED > 1.0
+        or part < 0.5
+        or part > 1.0 + priors.CONING_OFF * deviation + 0.5
+    ):
         return track
     return mended
 
@@ -68,7 +64,7 @@ def with_delta_angles(track: Track, model: NullModel) -> Track:
 def _resolved(rate_b_rad_s: Array) -> bool:
     """Whether the samples follow the motion."""
     change = np.diff(rate_b_rad_s, axis=0)
-    return bool(np.mean(change**2) < _UNRESOLVED**2 * np.mean(rate_b_rad_s**2))
+    return bool(np.mean(change**2) < priors.CONING_UNRESOLVED**2 * np.mean(rate_b_rad_s**2))
 
 
 def _half_turns(track: Track, bias_rad_s: Array) -> Array:
@@ -121,7 +117,7 @@ def quieter(
 
     work: the recording at the working rate;  spec, model: of its rows, noise from differences
     """
-    most_gauss = _WRONG * noise_of_differences(work)[0]
+    most_gauss = priors.SHAKEN_WRONG * noise_of_differences(work)[0]
     if spec.sigma_gyro_rad_s is not None or unusable(work) or not shaken(recorded):
         return None
     level = model.sigma_gyro_rad_s
@@ -133,7 +129,7 @@ def quieter(
         if turn > 0 and again.sigma_mag_gauss > most_gauss:
             return None
         model = fit_null(work, known, again, noise=False).model
-    found = model.sigma_gyro_rad_s < QUIETER * level
+    found = model.sigma_gyro_rad_s < priors.SHAKEN_QUIETER * level
     return (known, model) if found else None
 
 
@@ -153,7 +149,7 @@ def shaken(track: Track) -> bool:
     third, sixth = (_per_second(track, order) for order in (3, 6))
     if not len(third):
         return False
-    return bool(np.quantile(sixth, 0.1) < _STEADY**2 * np.median(third))
+    return bool(np.quantile(sixth, 0.1) < priors.SHAKEN_STEADY**2 * np.median(third))
 
 
 def _per_second(track: Track, order: int) -> Array:

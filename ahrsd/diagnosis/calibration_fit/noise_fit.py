@@ -7,26 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.calibration_fit.resampling import decimated, decimation
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.samples import Array
 
-#: times the gyro's differenced noise that its noise may be at most
-CAP = 1.5
-#: random walk of the bias beyond which it is no longer noise: 50 deg/h after 400 s
-WALK_CAP_RAD_S_SQRT_S = 1.2e-5
-#: how far (log) the gyro's noise is believed to be from its differenced one before the data speak
-_TRUST = 0.25
-#: the same below that where the differences are mostly of the motion
-_SHAKEN_TRUST, _SHAKEN_STARTS = 1.5, (0.0, 1.4, 2.8, 4.2, 5.6)
+#: logarithms below its differences from which a shaken gyro's noise is sought
+_SHAKEN_STARTS = (0.0, 1.4, 2.8, 4.2, 5.6)
 _WALKS = (-3.6, -2.4, -1.2, 0.0)  # levels tried, log below the cap
-_WALK_GAIN = 6.0  # nats that a wandering bias must gain: two standard deviations are not enough
-#: where readings are too far apart to be compared with each other
-_USUAL_MAG_GAUSS = 1e-3
-#: below the magnetometer's, what the filter leaves out (it is linear) would be more than the noise
-FLOOR_MAG_GAUSS, _FLOOR_GYRO_RAD_S = 2e-5, 1e-5
 _PIECES, _PIECE_ROWS = 6, 400
 _FINE = 0.1  # of a logarithm: where no common scale puts right by how much a coarse parabola is off
 SAME = 0.02  # relative change of a noise level that changes nothing
@@ -39,8 +29,9 @@ def first_guess(track: Track, spec: Spec) -> NullModel:
         np.eye(3),
         np.zeros(3),
         np.zeros(3),
-        spec.sigma_mag_gauss or (max(mag, FLOOR_MAG_GAUSS) if mag else _USUAL_MAG_GAUSS),
-        spec.sigma_gyro_rad_s or max(gyro, _FLOOR_GYRO_RAD_S),
+        spec.sigma_mag_gauss
+        or (max(mag, priors.FLOOR_MAG_GAUSS) if mag else priors.USUAL_MAG_GAUSS),
+        spec.sigma_gyro_rad_s or max(gyro, priors.FLOOR_GYRO_RAD_S),
     )
 
 
@@ -80,12 +71,12 @@ def rescaled(filtered: Filtered, spec: Spec) -> NullModel:
     if spec.sigma_mag_gauss or not np.isfinite(factor) or factor == 0.0:
         return model
     mag = model.sigma_mag_gauss * factor
-    if mag < FLOOR_MAG_GAUSS:
-        return replace(model, sigma_mag_gauss=FLOOR_MAG_GAUSS)
+    if mag < priors.FLOOR_MAG_GAUSS:
+        return replace(model, sigma_mag_gauss=priors.FLOOR_MAG_GAUSS)
     gyro = model.sigma_gyro_rad_s
     if not spec.sigma_gyro_rad_s:
         differenced = spec.shaken_gyro_rad_s or noise_of_differences(filtered.track)[1]
-        gyro = float(np.clip(gyro * factor, _FLOOR_GYRO_RAD_S, _cap(differenced)))
+        gyro = float(np.clip(gyro * factor, priors.FLOOR_GYRO_RAD_S, _cap(differenced)))
     return replace(model, sigma_mag_gauss=mag, sigma_gyro_rad_s=gyro)
 
 
@@ -129,14 +120,14 @@ def pieces(track: Track) -> Track:
 
 
 def _cap(differenced: float) -> float:
-    return max(CAP * differenced, _FLOOR_GYRO_RAD_S)
+    return max(priors.GYRO_NOISE_CAP * differenced, priors.FLOOR_GYRO_RAD_S)
 
 
 def _white(track: Track, model: NullModel, spec: Spec, differenced: float) -> NullModel:
     """Both levels, sigma_gyro drawn to the gyro's differenced noise and within its cap."""
     base = replace(model, gyro_walk_rad_s_sqrt_s=0.0)
     given_mag, given_gyro = spec.sigma_mag_gauss, spec.sigma_gyro_rad_s
-    below = _SHAKEN_TRUST if spec.shaken_gyro_rad_s else _TRUST
+    below = priors.SHAKEN_TRUST if spec.shaken_gyro_rad_s else priors.GYRO_NOISE_TRUST
     if given_mag and given_gyro:
         return replace(base, sigma_mag_gauss=given_mag, sigma_gyro_rad_s=given_gyro)
     if given_gyro:
@@ -144,21 +135,21 @@ def _white(track: Track, model: NullModel, spec: Spec, differenced: float) -> Nu
     if given_mag:
         return _gyro_alone(track, replace(base, sigma_mag_gauss=given_mag), differenced, below)
     free = _by_ratio(track, base, differenced, below)
-    if free.sigma_mag_gauss < FLOOR_MAG_GAUSS:
-        at_floor = replace(base, sigma_mag_gauss=FLOOR_MAG_GAUSS)
+    if free.sigma_mag_gauss < priors.FLOOR_MAG_GAUSS:
+        at_floor = replace(base, sigma_mag_gauss=priors.FLOOR_MAG_GAUSS)
         return _gyro_alone(track, at_floor, differenced, below)
     if free.sigma_gyro_rad_s <= _cap(differenced):
-        return replace(free, sigma_gyro_rad_s=max(free.sigma_gyro_rad_s, _FLOOR_GYRO_RAD_S))
+        return replace(free, sigma_gyro_rad_s=max(free.sigma_gyro_rad_s, priors.FLOOR_GYRO_RAD_S))
     return _mag_alone(track, replace(free, sigma_gyro_rad_s=_cap(differenced)))
 
 
 def _prior(sigma_gyro: float, differenced: float, below: float) -> float:
-    trust = below if sigma_gyro < differenced else _TRUST
+    trust = below if sigma_gyro < differenced else priors.GYRO_NOISE_TRUST
     return -0.5 * float(np.square(np.log(sigma_gyro / differenced) / trust))
 
 
 def _by_ratio(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
-    most = np.log(_cap(differenced) / FLOOR_MAG_GAUSS)
+    most = np.log(_cap(differenced) / priors.FLOOR_MAG_GAUSS)
 
     def scaled(level: float) -> tuple[NullModel, float]:
         ratio = float(np.exp(min(level, most)))
@@ -177,7 +168,7 @@ def _by_ratio(track: Track, model: NullModel, differenced: float, below: float) 
         return fitted, value + _prior(fitted.sigma_gyro_rad_s, differenced, below)
 
     start = np.log(model.sigma_gyro_rad_s / model.sigma_mag_gauss)
-    if below > _TRUST:  # far below there may be another maximum
+    if below > priors.GYRO_NOISE_TRUST:  # far below there may be another maximum
         start = max((start - down for down in _SHAKEN_STARTS), key=lambda level: scaled(level)[1])
     return scaled(_highest(lambda level: scaled(level)[1], start))[0]
 
@@ -187,7 +178,7 @@ def _mag_alone(track: Track, model: NullModel) -> NullModel:
         return _likelihood(track, replace(model, sigma_mag_gauss=float(np.exp(level))))
 
     best = _highest(of_mag, np.log(model.sigma_mag_gauss))
-    return replace(model, sigma_mag_gauss=max(float(np.exp(best)), FLOOR_MAG_GAUSS))
+    return replace(model, sigma_mag_gauss=max(float(np.exp(best)), priors.FLOOR_MAG_GAUSS))
 
 
 def _gyro_alone(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
@@ -198,7 +189,7 @@ def _gyro_alone(track: Track, model: NullModel, differenced: float, below: float
     rough = _highest(of_gyro, np.log(differenced))
     best = float(np.exp(_highest(of_gyro, rough, _FINE)))
     return replace(
-        model, sigma_gyro_rad_s=float(np.clip(best, _FLOOR_GYRO_RAD_S, _cap(differenced)))
+        model, sigma_gyro_rad_s=float(np.clip(best, priors.FLOOR_GYRO_RAD_S, _cap(differenced)))
     )
 
 
@@ -208,14 +199,14 @@ def _walking(track: Track, model: NullModel) -> NullModel:
     coarse = decimated(track, size)
     rate = replace(model, sigma_gyro_rad_s=model.sigma_gyro_rad_s / np.sqrt(size))
     still = _likelihood(coarse, rate)
-    top = np.log(WALK_CAP_RAD_S_SQRT_S)
+    top = np.log(priors.WALK_CAP_RAD_S_SQRT_S)
 
     def of_walk(level: float) -> float:
         return _likelihood(coarse, replace(rate, gyro_walk_rad_s_sqrt_s=float(np.exp(level))))
 
     tried = [of_walk(top + level) for level in _WALKS]
     at = int(np.argmax(tried))
-    if tried[at] < still + _WALK_GAIN:
+    if tried[at] < still + priors.WALK_NATS:
         return model
     level = _WALKS[at]
     if 0 < at < len(_WALKS) - 1:

@@ -14,9 +14,9 @@ matter where the motion shows anything.  Where it does not, it keeps the calibra
 after slow noise: at rest A and b would go anywhere.
 
 Noise by innovation likelihood: the filter's gain is a function of sigma_gyro / sigma_mag, the
-scale follows from the mean square.  sigma_gyro is never more than CAP times what the gyro's own
-differences say: free, it swallows every drift of the gyro.  For the same reason the bias wanders
-only when the likelihood says so, and not faster than WALK_CAP.
+scale follows from the mean square.  sigma_gyro is never more than GYRO_NOISE_CAP times what the
+gyro's own differences say: free, it swallows every drift of the gyro.  For the same reason the bias
+wanders only when the likelihood says so, and not faster than WALK_CAP_RAD_S_SQRT_S.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Baseline
 from ahrsd.diagnosis.calibration_fit import noise_fit
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
@@ -49,23 +50,13 @@ from ahrsd.samples import Array
 #: inflations of the gyro's noise by which a cold start descends, and most steps at each; where no
 #: start of the first comes to what explains the data, from a shorter memory and with more steps
 _LADDERS = (((30.0, 10.0, 3.0), 2), ((100.0, 30.0, 10.0, 3.0), 6))
-_FEWEST = 15  # steps that a fit needs
 _SHORTEST_RUN = 8  # samples of a run that the linear start can use
 _STEPS = 60  # most; a fit ends where it has converged
 _REESTIMATE = 0.3  # normalised innovation (log) beyond which the noise is found from the beginning
 _GOOD = 1.5  # normalised innovation of a start that needs no rival
 _WORTH = 10.0  # by which a further start's cost must be lower
 _FARTHEST_GAUSS = 3.0  # hard iron of a start: beyond, the start is nonsense
-#: prior deviations of the 11: soft iron about I, hard iron (gauss) about 0, gyro bias (rad/s)
-PRIOR = np.array([0.15] * 5 + [0.5] * 3 + [0.03] * 3)
-PRIOR.flags.writeable = False
-#: scatter of the field over its size that shows the iron
-TURNED = 0.1
 _BLOCKS = 40  # in which the scores are summed
-_REPEATED = 3.0  # repetition from which the prior is made to count
-#: what the mean of a resting gyro may differ from its bias, where the field shows that it rests
-_AT_REST_RAD_S = 1e-3
-_SPHERE_ROWS, _NO_SPHERE = 100, 0.1  # rows that a recording counts for, and how far from a sphere
 _DONE = 0.05  # largest step in standard deviations
 _NEAR = 3.0  # largest step in standard deviations behind which the gains are as before it
 _HALVINGS = 3
@@ -118,8 +109,9 @@ def unusable(track: Track) -> str | None:
     if track.usual_gauss == 0.0:
         return "the magnetometer has no readings: nothing can be said about the field"
     steps = np.isfinite(track.dt_s) & np.isfinite(track.mag_b_gauss).all(axis=1)
-    if np.count_nonzero(steps) < _FEWEST:
-        return f"samples that follow another one: {np.count_nonzero(steps)}, {_FEWEST} are needed"
+    count, least = np.count_nonzero(steps), priors.FIT_STEPS
+    if count < least:
+        return f"samples that follow another one: {count}, {least} are needed"
     return None
 
 
@@ -181,7 +173,7 @@ def _starts(track: Track, base: NullModel) -> list[NullModel]:
     out = []
     out.append(replace(base, hard_iron_gauss=sphere_centre(mag)))
     out.append(base)
-    well = turned(mag) > TURNED and seen.all()
+    well = turned(mag) > priors.IRON_TURNED and seen.all()
     linear = linear_start(_epochs(track)) if well else None
     if linear is not None:
         A = chain.symmetric(linear[:6])
@@ -236,7 +228,7 @@ class Prior:
 
     def sharper(self, repetition: float) -> Prior:
         """For data of which only one in `repetition` says anything new; itself where all do."""
-        if repetition < _REPEATED:
+        if repetition < priors.REPEATED:
             return self
         sharp = self.deviation / np.sqrt(repetition / self.repetition)
         return Prior(self.mean, sharp, repetition)
@@ -248,12 +240,14 @@ def prior_of(track: Track) -> Prior:
     Iron shows itself by turning only.  Without turning, slow noise of the magnetometer would be
     laid at its door, so the less the field turned, the closer the iron is held.
     """
-    mean, deviation = np.zeros(11), PRIOR.copy()
-    deviation[:8] *= np.clip(turned(track.mag_b_gauss) / TURNED, 0.02, 1.0)
+    mean, deviation = np.zeros(11), priors.CALIBRATION_DEVIATION.copy()
+    deviation[:8] *= np.clip(turned(track.mag_b_gauss) / priors.IRON_TURNED, 0.02, 1.0)
     rest = rate_at_rest(track)
     if rest is not None:
         mean[8:] = rest.rate_rad_s
-        deviation[8:] = np.minimum(np.hypot(_AT_REST_RAD_S, rest.unseen_rad_s), PRIOR[8:])
+        deviation[8:] = np.minimum(
+            np.hypot(priors.STILL_BIAS_RAD_S, rest.unseen_rad_s), priors.CALIBRATION_DEVIATION[8:]
+        )
     return Prior(mean, deviation)
 
 
@@ -311,8 +305,8 @@ def sphere_centre(mag: Array) -> Array:
         return np.zeros(3)
     square = np.sum(mag**2, axis=1)
     off = 2 * (mag - mag.mean(axis=0))
-    weight = _SPHERE_ROWS / len(mag) / (_NO_SPHERE * float(np.mean(square))) ** 2
-    gram = weight * off.T @ off + np.diag(1 / PRIOR[5:8] ** 2)
+    weight = priors.SPHERE_ROWS / len(mag) / (priors.SPHERE_OFF * float(np.mean(square))) ** 2
+    gram = weight * off.T @ off + np.diag(1 / priors.CALIBRATION_DEVIATION[5:8] ** 2)
     return np.asarray(np.linalg.solve(gram, weight * off.T @ (square - square.mean())))
 
 
@@ -346,7 +340,7 @@ def repetition_of(done: Filtered) -> float:
     edges = np.linspace(0, len(score), _BLOCKS + 1).astype(int)[:-1]
     sums = np.add.reduceat(score, edges, axis=0)
     flat = X.reshape(-1, 11)
-    ridge = np.diag(1.0 / PRIOR**2)
+    ridge = np.diag(1.0 / priors.CALIBRATION_DEVIATION**2)
     ratio = np.trace(np.linalg.solve(flat.T @ flat + ridge, sums.T @ sums))
     return float(ratio / 11 / (1 - 11 / _BLOCKS))
 

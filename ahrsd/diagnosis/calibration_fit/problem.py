@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.calibration_fit.delay import (
     after_columns_begin,
     earlier,
@@ -14,7 +15,6 @@ from ahrsd.diagnosis.calibration_fit.delay import (
     without_lag,
 )
 from ahrsd.diagnosis.calibration_fit.gyro_readings import (
-    QUIETER,
     carrying,
     quieter,
     with_delta_angles,
@@ -115,7 +115,7 @@ def problem_of(track: Track, spec: Spec) -> tuple[Problem, NullModel]:
         known, start = found
     elif (
         spec.sigma_gyro_rad_s is None
-        and start.sigma_gyro_rad_s < QUIETER * noise_of_differences(work)[1]
+        and start.sigma_gyro_rad_s < priors.SHAKEN_QUIETER * noise_of_differences(work)[1]
     ):
         # the gyro's differences at the working rate are its motion's
         known = replace(known, sigma_gyro_rad_s=start.sigma_gyro_rad_s)

@@ -16,6 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.columns.roles import shown
 from ahrsd.diagnosis.external_simulation import cut
@@ -26,12 +27,8 @@ from ahrsd.samples import Array
 LONGEST_S, STEP_S = 60.0, 0.5
 #: drifts from one end to the other, seconds
 DRIFTS_S = (1.0, 2.0, 4.0, 6.0, 9.0, 13.0, 19.0, 28.0, 40.0)
-#: share of the course that it must explain, and deviations of what it explains at other times
-SHARE, SURE = 0.5, 4.0
-#: nats over the column as logged, and of a drift over a lag that stays
-NATS = 30.0
-#: half the range and step in which a clock is first sought;  a lag below is none
-COARSE_S, SMALLEST_S = (8.0, 0.5), 0.1
+#: half the range and step in which a clock is first sought
+COARSE_S = (8.0, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +72,9 @@ def suspects(course: Located, track: Track) -> list[tuple[float, str]]:
         lags = np.arange(-reach_s, reach_s + STEP_S, STEP_S)
         share = held.shares(lags)
         most, lag_s = float(share.max()), float(lags[int(np.argmax(share))])
-        if most > SHARE and np.arctanh(most**0.5) > SURE * held.usual(lag_s):
+        if most > priors.CLOCK_SHARE and np.arctanh(most**0.5) > priors.CLOCK_SURE * held.usual(
+            lag_s
+        ):
             found.append((most, lag_s, name))
     return [(lag_s, name) for _, lag_s, name in sorted(found, reverse=True)]
 
@@ -103,13 +102,13 @@ def likeliest_clock(asked: ColumnEvidence, around_s: float) -> Late | None:
     near = np.arange(-COARSE_S[0], COARSE_S[0] + 0.1, 2.0)
     wider = [(at[0] + float(k), slope) for slope in slopes for k in near]
     drifting, more = _best(asked, wider)
-    if more > most + NATS:
+    if more > most + priors.CLOCK_NATS:
         at, most = drifting, more
     for step_s in (0.5, 0.15, 0.05):
         slope = 2 * step_s / asked.duration_s if at[1] else 0.0
         slopes = [at[1] + k * slope for k in (-2, -1, 0, 1, 2)] if slope else [0.0]
         at, most = _best(asked, [(at[0] + k * step_s, b) for k in range(-3, 4) for b in slopes])
-    if most < none + NATS or (abs(at[0]) < SMALLEST_S and not at[1]):
+    if most < none + priors.CLOCK_NATS or (abs(at[0]) < priors.CLOCK_SMALLEST_S and not at[1]):
         return None
     return Late(asked.column, round(at[0], 3), at[1], asked.middle_s)
 

@@ -25,23 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.columns.roles import role_of
 from ahrsd.diagnosis.time_series import SPECTRUM_ROWS, denoised
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
-#: seconds between values, at most: what changes more seldom is a level
-LONGEST_S = 5.0
-#: share of the values that come after one period, and by how much of one they may miss it
-REGULAR, MISS = 0.6, 0.25
-#: fewest values that tell how a column was logged
-FEWEST_UPDATES = 20
 #: columns of two levels, whose edges are as they are
 EDGES = ("switch", "ping")
-#: deviations of its own scatter by which the noise may depart from flat, and from Gaussian
-SCATTER = 3.0
-#: part of a column's power that its course has at least
-COURSE = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,13 +63,17 @@ def _held(name: str, values: Array, track: Track) -> HeldColumn | None:
     if role_of(name, values) in (None, *EDGES) or not np.isfinite(values).all():
         return None
     rows = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
-    if len(rows) < FEWEST_UPDATES:
+    if len(rows) < priors.COLUMN_UPDATES:
         return None
     lengths = np.diff(rows)
     period = float(np.median(lengths))
-    miss = max(MISS * period, 1.0)
+    miss = max(priors.COLUMN_MISS * period, 1.0)
     usual = np.abs(lengths - period) <= miss
-    if period < 2.0 or period * track.step_s > LONGEST_S or usual.mean() < REGULAR:
+    if (
+        period < 2.0
+        or period * track.step_s > priors.COLUMN_HELD_S
+        or usual.mean() < priors.COLUMN_REGULAR
+    ):
         return None
     # a value that came again is no change: it was new one period before the next as well
     again = rows[1:][lengths > period + miss] - round(period)
@@ -133,7 +128,7 @@ def without_noise(values: Array) -> Array | None:
     if len(own) < SPECTRUM_ROWS or not _is_noise(own):
         return None
     course = denoised(own[:, None])[:, 0]
-    if np.var(course) < COURSE * np.var(own):
+    if np.var(course) < priors.COLUMN_COURSE * np.var(own):
         return None
     return how.between(course, len(values))
 
@@ -144,10 +139,10 @@ def _is_noise(values: Array) -> bool:
     half, rest = len(cosines) // 2, len(cosines) * 3 // 4
     third, fourth = np.mean(cosines[half:rest] ** 2), np.mean(cosines[rest:] ** 2)
     # a mean of k squares of normal numbers scatters by sqrt(2 / k), a fourth moment by sqrt(24 / k)
-    flat = abs(third - fourth) < SCATTER * np.sqrt(16.0 / len(values)) * fourth
+    flat = abs(third - fourth) < priors.COLUMN_NOISE_SCATTER * np.sqrt(16.0 / len(values)) * fourth
     quick = fft.idct(np.where(np.arange(len(cosines)) < half, 0.0, cosines), norm="ortho")
     fourth_moment = np.mean(quick**4) / max(float(np.mean(quick**2) ** 2), 1e-300)
-    gaussian = abs(fourth_moment - 3.0) < SCATTER * np.sqrt(24.0 / half)
+    gaussian = abs(fourth_moment - 3.0) < priors.COLUMN_NOISE_SCATTER * np.sqrt(24.0 / half)
     return bool(flat and gaussian)
 
 

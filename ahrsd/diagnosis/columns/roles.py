@@ -16,13 +16,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
-_SHORT_GAP_S = 2.0  # a column of 1 Hz beside samples of 25 Hz is filled, a failed logger is not
-_MOST_MISSING = 0.98
-_MOST_HOLES = 0.5  # of the rows: with more holes than values a column says too little
-_LONG_ON_ROWS = 4  # a 0/1 column that stays on longer is a switch, else a train of pulses
 _ATTITUDE = re.compile(r"^(ref_q[wxyz]|vn_|ref_|est_)")
 # an attitude measured by others: the motion, and the cause of nothing that is read
 _REFERENCE = re.compile(r"^ref_q[wxyz]$")
@@ -117,7 +114,7 @@ def role_of(name: str, values: Array) -> str | None:
         return named
     known = values[np.isfinite(values)]
     if len(known) and np.isin(known, (0.0, 1.0)).all() and known.any():
-        return "switch" if _longest_on(known) > _LONG_ON_ROWS else "ping"
+        return "switch" if _longest_on(known) > priors.SWITCH_ROWS else "ping"
     return None
 
 
@@ -202,15 +199,15 @@ def holed(track: Track) -> dict[str, Holed]:
     for name, values in track.covariates.items():
         good, time_s = np.isfinite(values), track.time_s
         share = 1.0 - np.count_nonzero(good) / max(len(values), 1)
-        if not _filled(name, values, time_s)[1] or share > _MOST_HOLES:
+        if not _filled(name, values, time_s)[1] or share > priors.COLUMN_HOLES:
             continue
         filled = np.interp(time_s, time_s[good], values[good])
         if role_of(name, filled) is None or fault(name, filled):
             continue
         before = np.maximum.accumulate(np.where(good, time_s, -np.inf))
         after = np.minimum.accumulate(np.where(good, time_s, np.inf)[::-1])[::-1]
-        missing = ~good & (after - before > _SHORT_GAP_S)
-        if np.count_nonzero(missing) > _MOST_HOLES * len(values):
+        missing = ~good & (after - before > priors.COLUMN_GAP_S)
+        if np.count_nonzero(missing) > priors.COLUMN_HOLES * len(values):
             continue
         first = int(np.argmax(missing))
         words = (
@@ -228,16 +225,17 @@ def _filled(name: str, values: Array, time_s: Array) -> tuple[Array, str]:
     if good.all():
         return values, ""
     share = 1.0 - np.count_nonzero(good) / max(len(values), 1)
-    if share > _MOST_MISSING:
+    if share > priors.COLUMN_MISSING:
         return values, f"column {shown(name)} was left out: {share:.0%} of its values are missing"
     known_s = np.concatenate([time_s[:1], time_s[good], time_s[-1:]])
     widest = int(np.argmax(np.diff(known_s)))
     hole_s = float(known_s[widest + 1] - known_s[widest])
     usual_s = float(np.median(np.diff(time_s)))
-    if hole_s > _SHORT_GAP_S + usual_s and not _same_hole(time_s, known_s[widest], hole_s):
+    if hole_s > priors.COLUMN_GAP_S + usual_s and not _same_hole(time_s, known_s[widest], hole_s):
         return values, (
             f"column {shown(name)} was left out: no values from {known_s[widest]:.1f} to "
-            f"{known_s[widest + 1]:.1f} s; holes of more than {_SHORT_GAP_S:g} s are not guessed"
+            f"{known_s[widest + 1]:.1f} s; holes of more than {priors.COLUMN_GAP_S:g} s are not "
+            "guessed"
         )
     nearest = _longest_on(values[good]) and np.isin(values[good], (0.0, 1.0)).all()
     if nearest:  # a switch is on or off, never half

@@ -39,6 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd import so3
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.innovation_filter.parallel_scan import (
     Gains,
     Layout,
@@ -54,9 +55,6 @@ from ahrsd.diagnosis.track import Track
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
-#: of the field's direction where it is not taken from the first reading
-#: of the field's size, in all directions, where a run's first row has no reading
-_UNSURE = 0.5
 #: gauss; what is left of the nearest reading where it is many hundred rows away: squares of smaller
 #: numbers are none
 _OUT_OF_REACH = 1e-100
@@ -368,7 +366,7 @@ def _linear(
     C = np.linalg.inv(model.soft_iron)
     process[opens, :3, :3] = model.sigma_mag_gauss**2 * C @ C.T
     lost = opens & blind
-    process[lost, :3, :3] = np.eye(3) * (_UNSURE * size[lost, :, None]) ** 2
+    process[lost, :3, :3] = np.eye(3) * (priors.UNSEEN_FIELD * size[lost, :, None]) ** 2
     return Linear(transition, process, model.soft_iron, model.sigma_mag_gauss**2, opens, blind)
 
 

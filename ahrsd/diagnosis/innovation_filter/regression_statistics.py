@@ -13,9 +13,10 @@ score s_i in its observable directions, in prior deviations, and prior N(0, k^2)
 
     log BF(k) = 1/2 sum_i s_i^2 / (l_i + k^-2) - 1/2 sum_i log(1 + k^2 l_i)
 
-averaged over the sizes k of `SIZES`: how large an effect is on a given vehicle is hardly known.
-The same field may be a hundredth of a usual coefficient per ampere (the motor draws fifty) and a
-third of one per turn of its shaft; the sizes reach far enough down that neither pays for its unit.
+averaged over the sizes k of `priors.EFFECT_GRID`: how large an effect is on a given vehicle is
+hardly known.  The same field may be a hundredth of a usual coefficient per ampere (the motor draws
+fifty) and a third of one per turn of its shaft; the sizes reach far enough down that neither pays
+for its unit.
 The second sum is the price of a parameter, by which the one-parameter time lag beats nine
 eddy-current coefficients that contain it.
 """
@@ -28,11 +29,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
+from ahrsd.diagnosis import priors
 from ahrsd.samples import Array
 
 #: Directions with less information than this share of the group's own are dropped: not observable.
 _RANK_SHARE = 1e-7
-SIZES = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
 
 
 def chi2_above(value: float, freedom: float) -> float:
@@ -114,9 +115,9 @@ def log_bayes(what: Score) -> float:
     if what.rank == 0:
         return 0.0
     l, s = what.information, what.score  # noqa: E741
-    k2 = np.square(np.asarray(SIZES))[:, None]
+    k2 = np.square(np.asarray(priors.EFFECT_GRID))[:, None]
     terms = 0.5 * np.sum(s**2 / (l + 1.0 / k2), axis=1) - 0.5 * np.sum(np.log1p(k2 * l), axis=1)
-    return float(np.logaddexp.reduce(terms) - np.log(len(SIZES)))
+    return float(np.logaddexp.reduce(terms) - np.log(len(priors.EFFECT_GRID)))
 
 
 def posterior(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Where
 from ahrsd.diagnosis.columns.roles import shown
 from ahrsd.diagnosis.effects.effect import Setting
@@ -18,19 +19,12 @@ from ahrsd.samples import Array
 
 AXES = ("x", "y", "z")
 _STRETCHES = 100
-#: parts of the largest axis, and of the largest stretch, that count;  of the whole time, from where
-#: on it is everywhere
-_AXIS, _STRETCH, _EVERYWHERE = 0.2, 0.15, 0.6
-#: of the largest departure: from which on it is one
-AWAY = 0.25
-#: deviations by which a course's beginning and end are still away from its usual level
-STILL = 2.0
 
 
 def where_of(track: Track, added: Array, setting: Setting, frame: str) -> Where:
     """The address of a term that adds (N, 3) gauss or rad/s to the readings."""
     spread = np.sqrt(np.mean(added**2, axis=0))
-    axes = tuple(AXES[k] for k in range(3) if spread[k] > _AXIS * spread.max())
+    axes = tuple(AXES[k] for k in range(3) if spread[k] > priors.ACTS_ON_AXIS * spread.max())
     frequency = setting.get("frequency_hz")
     width = 1.0 / max(track.duration_s, 1e-9)
     return Where(
@@ -52,8 +46,8 @@ def _when(track: Track, added: Array, setting: Setting) -> tuple[tuple[float, fl
             for k in range(len(cut))
         ]
     )
-    found = spans(cut.edges_s, size > _STRETCH * size.max())
-    if sum(b - a for a, b in found) > _EVERYWHERE * track.duration_s:
+    found = spans(cut.edges_s, size > priors.ACTS_IN_STRETCH * size.max())
+    if sum(b - a for a, b in found) > priors.ACTS_EVERYWHERE * track.duration_s:
         found = [(float(track.time_s[0]), float(track.time_s[-1]))]
     return tuple(found)
 
@@ -76,16 +70,18 @@ def _regime(track: Track, added: Array, setting: Setting) -> str | None:
 def departures(edges_s: Array, course: Array, deviation: Array) -> list[tuple[float, float]]:
     """Spans in which a course (J, axes) is away from the level that is in force for longest.
 
-    Away: by more than `AWAY` of the largest departure and 3 deviations (J,), and on either side as
-    far as the course still shows it (`reaching`).  The whole span where the course
-    has no usual level: where none is in force for 40 % of the time.
+    Away: by more than `DEPARTED` of the largest departure and 3 deviations (J,), and on either side
+    as far as the course still shows it (`reaching`).  The whole span where the course has no usual
+    level: where none is in force for 40 % of the time.
     """
     length = np.diff(edges_s)
     distance = np.linalg.norm(course[:, None] - course[None], axis=2)
     largest = float(distance.max(initial=0.0))
     if largest == 0.0:
         return [(float(edges_s[0]), float(edges_s[-1]))]
-    alike = distance <= np.maximum(AWAY * largest, 3.0 * np.minimum.outer(deviation, deviation))
+    alike = distance <= np.maximum(
+        priors.DEPARTED * largest, 3.0 * np.minimum.outer(deviation, deviation)
+    )
     usual = alike @ length
     home = int(np.argmax(usual))
     if usual[home] < 0.4 * length.sum():
@@ -98,7 +94,8 @@ def reaching(inside: Array, course: Array, deviation: Array) -> Array:
     """(J,) `inside` (J,) with the segments beside each span that still go its way.
 
     What comes and goes slowly has no level of its own at its beginning and end: a segment belongs
-    to it as long as its course (J, axes) is `STILL` deviations (J,) away in the span's direction.
+    to it as long as its course (J, axes) is `STILL_DEPARTED` deviations (J,) away in the span's
+    direction.
     """
     out = np.asarray(inside, bool).copy()
     padded = np.concatenate([[False], out, [False]]).astype(int)
@@ -106,8 +103,8 @@ def reaching(inside: Array, course: Array, deviation: Array) -> Array:
     for start, end in zip(starts, ends, strict=True):
         mean = course[start:end].mean(axis=0)
         along = course @ mean / max(float(np.linalg.norm(mean)), 1e-300) / deviation
-        before = np.flatnonzero(along[:start] <= STILL)
-        after = np.flatnonzero(along[end:] <= STILL)
+        before = np.flatnonzero(along[:start] <= priors.STILL_DEPARTED)
+        after = np.flatnonzero(along[end:] <= priors.STILL_DEPARTED)
         out[before[-1] + 1 if len(before) else 0 : start] = True
         out[end : end + after[0] if len(after) else len(out)] = True
     return out

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Unexplained, Where
 from ahrsd.diagnosis.data_quality.facts import spans_of
 from ahrsd.diagnosis.model import Context
@@ -17,10 +18,6 @@ from ahrsd.samples import Array
 
 BAND_HZ, _FEWEST_BINS = 0.25, 30
 _SIDE = 8  # bands in which a side's quietest one is sought
-_STANDS_OUT = 3.0  # times as loud as both sides: colour of a few coefficients is not so steep
-_LOWEST_HZ = 0.75  # below, courses in time and the motion's own rates are sought
-#: part of the power that is along the field, at most, in an error of the gyro; else about a third
-_ALONG = 0.1
 _AXES = ("x", "y", "z")
 
 
@@ -65,9 +62,9 @@ def loudest_band(
         return None
     bands = power[: count * bins].reshape(count, bins).mean(axis=1)
     level = _usual(bands)
-    out = np.isfinite(level) & (bands > _STANDS_OUT * level)
+    out = np.isfinite(level) & (bands > priors.BAND_STANDS_OUT * level)
     edges = np.arange(count + 1) * bins * width_hz
-    out &= (edges[:-1] >= _LOWEST_HZ) & (edges[1:] <= highest_hz)
+    out &= (edges[:-1] >= priors.BAND_LOWEST_HZ) & (edges[1:] <= highest_hz)
     ratio = np.where(out, bands / np.where(out, level, 1.0), 1.0)
     nats = 3.0 * bins * (ratio - 1.0 - np.log(ratio))
     runs = spans_of(out)
@@ -102,7 +99,7 @@ def _frame(context: Context, inside: Array, outside: Array) -> Frame:
     louder = float(np.sum(inside**2)) - float(np.sum(outside**2))
     along = float(np.sum(np.sum(inside * unit, axis=1) ** 2))
     along -= float(np.sum(np.sum(outside * unit, axis=1) ** 2))
-    if along < _ALONG * louder:
+    if along < priors.BAND_ALONG * louder:
         return "gyro"
     world = np.einsum("nij,nj->ni", context.R_nb, inside)
     sensor, there = (np.linalg.slogdet(one.T @ one)[1] for one in (inside, world))

@@ -18,14 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.columns.roles import shown
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 BINS = {"heading_deg": 12}
 OTHER_BINS = 6
-#: log of the relevant quantity must move at least this much to be binned
-MINIMUM_RANGE = {"heading_deg": 60.0, "pitch_deg": 10.0, "roll_deg": 10.0, "rate_rad_s": 0.05}
 #: waves in a turn, at most; the variance of each falls with the square of its number
 HARMONICS = 6
 
@@ -80,7 +79,7 @@ def regime_columns(regime: Regime) -> Columns:
 def _binned(name: str, values: Array) -> Regime | None:
     known = np.isfinite(values)
     span = float(np.ptp(values[known])) if known.any() else 0.0
-    if span <= MINIMUM_RANGE.get(name, 0.0):
+    if span <= priors.REGIME_RANGE.get(name, 0.0):
         return None
     count = BINS.get(name, OTHER_BINS)
     edges = np.unique(np.quantile(values[known], np.linspace(0.0, 1.0, count + 1)))

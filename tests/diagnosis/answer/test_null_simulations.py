@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of, true_model
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Unexplained, Where
 from ahrsd.diagnosis.answer.null_simulations import (
     Answered,
@@ -22,14 +23,17 @@ from ahrsd.diagnosis.answer.null_simulations import (
 from ahrsd.diagnosis.answer.text import verdict
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
-from ahrsd.diagnosis.priors import LIMITS
 from ahrsd.diagnosis.repaired_model.forward import noise_of
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.simulation import Experiment
 
 STEP_GAUSS = np.array([1.6e-3, -1.2e-3, 0.0])
-#: what is tested here needs no sixteen of them
-FEW_FITS = replace(LIMITS, chance_fits=5)
+
+
+@pytest.fixture
+def few_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is tested here needs no sixteen of them."""
+    monkeypatch.setattr(priors, "CHANCE_FITS", 5)
 
 
 def _made(
@@ -61,6 +65,7 @@ def _stepped() -> tuple[Track, Callable[[float], Answered]]:
     return track, answered
 
 
+@pytest.mark.usefixtures("few_fits")
 def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> None:
     """How much of such chance makes is then not known either."""
     track, answered = _stepped()
@@ -70,13 +75,14 @@ def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> 
             raise np.linalg.LinAlgError("Eigenvalues did not converge")
         return answered(2000.0)
 
-    found = beyond_chance(track, ask, FEW_FITS)
+    found = beyond_chance(track, ask)
     assert not found.unexplained.detected
     assert verdict(found) == (
         "nothing can be told: a simulation of the model alone with this noise cannot be diagnosed"
     )
 
 
+@pytest.mark.usefixtures("few_fits")
 @pytest.mark.parametrize(
     ("nats", "is_told", "chance", "asked"),
     [
@@ -99,7 +105,7 @@ def test_what_simulations_show_is_said_beside_what_is_told(
         copies.append(one)
         return answered(12.0)
 
-    found = beyond_chance(track, ask, FEW_FITS)
+    found = beyond_chance(track, ask)
     assert found.unexplained.detected == is_told
     assert len(copies) == asked
     (note,) = found.notes[:1]
@@ -119,8 +125,8 @@ def test_with_every_early_look_one_in_94_of_what_chance_makes_is_told() -> None:
     """Of exponential draws beside five others: 1 in 126 at the last, 1 in 1000 at each before."""
     told, *others = np.random.default_rng(5).exponential(size=(6, 500_000))
     largest = np.maximum.accumulate(others)
-    early = [times_beyond(count, LIMITS.chance_early_p) for count in (1, 2, 3, 4)]
-    beyond = told > np.array([*early, times_beyond(5, LIMITS.chance_p)])[:, None] * largest
+    early = [times_beyond(count, priors.CHANCE_EARLY_P) for count in (1, 2, 3, 4)]
+    beyond = told > np.array([*early, times_beyond(5, priors.CHANCE_P)])[:, None] * largest
     assert np.mean(beyond[-1]) == pytest.approx(1 / 126, rel=0.05)
     assert np.mean(beyond.any(axis=0)) == pytest.approx(1 / 94, rel=0.05)
 

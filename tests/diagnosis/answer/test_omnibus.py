@@ -8,8 +8,8 @@ import numpy as np
 from scipy import stats
 from tracks import experiment, track_of, true_model
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.omnibus import Test, omnibus, variance_test
-from ahrsd.diagnosis.calibration_fit.noise_fit import FLOOR_MAG_GAUSS
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
@@ -99,10 +99,12 @@ def test_too_few_samples_give_no_tests() -> None:
 def test_noise_that_is_only_assumed_is_not_tested() -> None:
     """A simulation without noise of the magnetometer: along the field nothing scatters."""
     made = experiment("mam", seed=0, samples=1500, sigma_mag=0.0, sigma_gyro=5e-3)
-    model = replace(true_model(made), sigma_mag_gauss=FLOOR_MAG_GAUSS)
+    model = replace(true_model(made), sigma_mag_gauss=priors.FLOOR_MAG_GAUSS)
     done = run_filter(track_of(made), model)
     assert float(np.mean(done.whitened[done.used] ** 2)) < 0.75
     assert omnibus(done, _context(done)) == ()
-    louder = experiment("mam", seed=0, samples=1500, sigma_mag=FLOOR_MAG_GAUSS, sigma_gyro=5e-3)
+    louder = experiment(
+        "mam", seed=0, samples=1500, sigma_mag=priors.FLOOR_MAG_GAUSS, sigma_gyro=5e-3
+    )
     done = run_filter(track_of(louder), model)
     assert {test.p_value > 1e-4 for test in omnibus(done, _context(done))} == {True}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from effect_motion import moving
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer import predictive_checks
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.effects.library import EFFECTS
@@ -168,9 +169,7 @@ def test_the_largest_of_many_is_below_its_band_as_often_as_is_said():
     """One more largest value beyond 16: at most once in 1,000 by Gumbel's law, in 10 statistics."""
     drawn = np.random.default_rng(5).gumbel(size=(200_000, predictive_checks.COPIES + 1))
     known, other = drawn[:, :-1], drawn[:, -1]
-    beyond = other > known.mean(axis=1) + predictive_checks._LARGEST_REACH * known.std(
-        axis=1, ddof=1
-    )
+    beyond = other > known.mean(axis=1) + priors.CHECKS_LARGEST_REACH * known.std(axis=1, ddof=1)
     assert np.mean(beyond) == pytest.approx(1e-3, rel=0.1)
     for size in (60, 5000):  # segments in three axes; lines of a periodogram
         share = np.random.default_rng(size).random((8_000, predictive_checks.COPIES + 1))

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.calibration_fit.noise_fit import WALK_CAP_RAD_S_SQRT_S, noise_of_differences
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.track import Spec
 
@@ -25,7 +26,7 @@ def test_the_gyros_noise_does_not_swallow_a_drift_of_the_gyro() -> None:
     ramp = np.linspace(-1, 1, 3000)[:, None] * np.array([3e-3, -2e-3, 4e-3])
     fit = fit_null(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + ramp))
     assert fit.model.sigma_gyro_rad_s <= 1.5 * noise_of_differences(track)[1] * 1.01
-    assert fit.model.gyro_walk_rad_s_sqrt_s <= WALK_CAP_RAD_S_SQRT_S * 1.01
+    assert fit.model.gyro_walk_rad_s_sqrt_s <= priors.WALK_CAP_RAD_S_SQRT_S * 1.01
 
 
 def test_what_the_spec_says_stays() -> None:

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from tracks import experiment, recorded, track_of, true_model
 
-from ahrsd.diagnosis.calibration_fit.noise_fit import WALK_CAP_RAD_S_SQRT_S
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null, rate_at_rest
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.model import NullModel
@@ -43,7 +43,7 @@ def test_a_cold_start_finds_the_truth(scenario: str, motion: str, sigma_gyro: fl
         assert fit.converged
         assert abs(fit.model.sigma_mag_gauss / 1e-3 - 1) < 0.04
         assert abs(fit.model.sigma_gyro_rad_s / sigma_gyro - 1) < 0.35
-        assert fit.model.gyro_walk_rad_s_sqrt_s < WALK_CAP_RAD_S_SQRT_S / 3
+        assert fit.model.gyro_walk_rad_s_sqrt_s < priors.WALK_CAP_RAD_S_SQRT_S / 3
         assert abs(fit.filtered.normalised_innovation - 1) < 0.04
     assert 1e-3 < stats.chi2.sf(sum(squares), 22) < 1 - 1e-3
 

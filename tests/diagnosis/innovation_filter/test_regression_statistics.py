@@ -7,10 +7,10 @@ import pytest
 from scipy import stats
 from scipy.signal import lfilter
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation_filter import regression_statistics
 from ahrsd.diagnosis.innovation_filter.regression_statistics import (
-    SIZES,
     log_bayes,
     posterior,
     solve,
@@ -59,8 +59,11 @@ def test_evidence_is_the_closed_form_of_one_size():
     X = slow(rng, 1)
     what = scored(X, 0.02 * X[:, 0] + rng.standard_normal(4800), [1.0])
     information, s = float(what.information[0]), float(what.score[0])
-    sized = [0.5 * s**2 / (information + k**-2) - 0.5 * np.log1p(information * k**2) for k in SIZES]
-    expected = np.logaddexp.reduce(sized) - np.log(len(SIZES))
+    sized = [
+        0.5 * s**2 / (information + k**-2) - 0.5 * np.log1p(information * k**2)
+        for k in priors.EFFECT_GRID
+    ]
+    expected = np.logaddexp.reduce(sized) - np.log(len(priors.EFFECT_GRID))
     assert log_bayes(what) == pytest.approx(expected, rel=1e-12)
 
 

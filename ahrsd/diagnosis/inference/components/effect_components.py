@@ -28,8 +28,6 @@ from ahrsd.samples import Array
 LAG = "delay"
 LAG_FORM = "form of the delay"
 _BESIDE = ", beside the delay"
-#: part of the squares that may be left where one component's columns hold another's
-_ALIKE = 1e-3
 #: parts in which the transition of a step is free
 PIECES = 20
 #: pieces of a pulse's form
@@ -67,7 +65,7 @@ def in_time(context: Context, effect: Effect, setting: Setting) -> tuple[Setting
         return (setting,)
     logged = _flat(effect.columns(context, setting))
     most = _flat(effect.columns(context, {**setting, "late_s": max(priors.LOGGED_LATE_S)}))
-    if float(np.sum((most - logged) ** 2)) < _ALIKE * float(np.sum(logged**2)):
+    if float(np.sum((most - logged) ** 2)) < priors.COLUMNS_ALIKE * float(np.sum(logged**2)):
         return (setting,)
     return (setting, *({**setting, "late_s": late_s} for late_s in priors.LOGGED_LATE_S))
 
@@ -138,7 +136,7 @@ def plain_delay(library: Mapping[str, Effect], sign: float) -> Effect | None:
     return next(plain, None)
 
 
-def holds(one: Component, part: Component, least: float = _ALIKE) -> bool:
+def holds(one: Component, part: Component, least: float = priors.COLUMNS_ALIKE) -> bool:
     """Whether a component can be all that another is: its columns are among the first's.
 
     least: of the other's power that may be beyond

@@ -26,10 +26,6 @@ from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.where_and_when.address import where_of
 from ahrsd.samples import Array
 
-#: odds are told no surer than this
-_SUREST = 30.0
-_SMALLEST_SHARE = 0.01
-
 
 def as_finding(
     all_sets: Hypotheses, space: Space, best: Hypothesis, key: str, odds: float,
@@ -76,10 +72,10 @@ def _found(
     setting: Setting, odds: float, library: Mapping[str, Effect],
 ) -> Finding:  # fmt: skip
     """A finding with what it may be in its place, and what to drive to tell."""
-    sure = float(1.0 / (1.0 + np.exp(-min(odds, _SUREST))))
+    sure = float(1.0 / (1.0 + np.exp(-min(odds, priors.SUREST_ODDS))))
     others = tuple(
         Share(other, share * sure) for other, share in shares.items()
-        if other != effect.identifier and share > _SMALLEST_SHARE
+        if other != effect.identifier and share > priors.SMALLEST_SHARE
     )  # fmt: skip
     close = [one.effect for one in others]
     told = zip(effect.parameters, value, deviation, strict=True)

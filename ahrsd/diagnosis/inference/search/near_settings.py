@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.effects.effect import ANGLES, SCALES, Setting
 from ahrsd.diagnosis.inference.components.component import MOMENTS, Component, Fixed
 from ahrsd.diagnosis.model import Columns, Context
@@ -22,8 +23,6 @@ from ahrsd.samples import Array
 #: changes of which slopes are made: part of the recording, part of a scale, degrees, s, part of
 #: what may be remembered
 _ONSET, _SCALE, _TURN_DEG, _LATE_S, _MEMORY = 1 / 2000, 0.02, 1.0, 0.02, 0.01
-#: of each, how far it may be off in such changes
-_FAR = 25.0
 
 
 def changed(one: Component, context: Context) -> dict[str, Setting]:
@@ -62,7 +61,7 @@ def opened(
     mag = _with_slopes(one.columns.mag, here.mag, [each.mag for each in found], value)
     gyro = _with_slopes(one.columns.gyro, here.gyro, [each.gyro for each in found], value)
     largest = one.law.log_variance(one.law.high)
-    law = Fixed(np.concatenate([np.exp(largest), np.full(len(nearby), _FAR**2)]))
+    law = Fixed(np.concatenate([np.exp(largest), np.full(len(nearby), priors.SETTING_OFF**2)]))
     key = f"{one.key}, open in {', '.join(nearby)} at {np.array2string(value, precision=6)}"
     return replace(one, key=key, columns=Columns(mag, gyro), law=law)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.effects.effect import Effect, Setting
 from ahrsd.diagnosis.inference.components.component import Component
 from ahrsd.diagnosis.inference.components.effect_components import (
@@ -35,10 +36,6 @@ from ahrsd.diagnosis.inference.search.switching_sources import switching
 COURSES = ("free sensor", "free world", "free gyro")
 #: columns that are made before the first of them pass the filter
 _TOGETHER = 500
-#: settings that an onset which was sought finely counts for at least
-_SOUGHT = 40
-#: onsets among which one that the data proposed was chosen
-_ONSETS = 200
 
 
 def best_at(
@@ -138,7 +135,7 @@ def space_at(
     def made_of(one: Component, settings: Iterable[Setting]) -> list[Component]:
         if one.row is None or one.key == LAG:
             return []
-        row, tried = one.row, max(_SOUGHT, len(effects[one.row.identifier]))
+        row, tried = one.row, max(priors.SOUGHT_SETTINGS, len(effects[one.row.identifier]))
         return [component(context, row, one, tried).lightly(context) for one in settings]
 
     def finer(one: Component, round_: int) -> list[Component]:
@@ -153,10 +150,13 @@ def space_at(
     def steps_at(time_s: float) -> list[Component]:
         setting = {"onset_s": round(time_s, 3)}
         jumping = [row for row in library.values() if row.jumps]
-        return [component(context, row, setting, _ONSETS).lightly(context) for row in jumping]
+        return [
+            component(context, row, setting, priors.PROPOSED_ONSETS).lightly(context)
+            for row in jumping
+        ]
 
     def come_and_gone(begins: Component, ends: Component) -> list[Component]:
-        return while_there(begins, ends, context, library, _SOUGHT**2)
+        return while_there(begins, ends, context, library, priors.SOUGHT_SETTINGS**2)
 
     space = Space(effects, COURSES, finer, closer, left_of, steps_at, come_and_gone)
     return all_sets, space
