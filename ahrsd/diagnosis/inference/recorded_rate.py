@@ -81,6 +81,7 @@ def quick(
     fast, all_sets, space, found = _searched(point, library, real=real)
     for _ in range(LEVELLED if found.names else 0):  # rows far off for what is found are not now
         point = relevelled(fast, found.keys, found.at)
+        del fast, all_sets, space  # what was asked at the point before is as much again
         fast, all_sets, space, found = _searched(point, library, real=real)
     all_sets.unknown_nats = source_nats
     answer = decision.decided(all_sets, space, found, library)
@@ -126,6 +127,7 @@ def _searched_in(
         left = [(one.key, form_of(one, fast.context, library)) for one in unlogged]
         forms |= {key: form for key, form in left if form is not None}
         fast.add(parts)
+        fast.keep_lightly(parts)
         if parts:
             candidates[name] = [one.key for one in parts]
     step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN

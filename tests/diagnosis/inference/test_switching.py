@@ -103,15 +103,20 @@ def test_spells_are_found_to_a_second_and_what_was_tried_is_not_kept():
     assert not np.any(comes[0].columns.mag[at_rows])
 
 
-def test_what_runs_for_seven_seconds_once_is_unknown_where_it_does():
-    """Iron that turns one way and the other, twice a second or less: a single spell is a source."""
+def runs_once(begin_s: float, end_s: float, gauss: float):
+    """A recording beside iron that turns to and fro, twice a second or less; and its field."""
     track = replace(track_of(experiment("wam", seed=23, samples=3000)), accel_b_m_s2=None)
     since_s = track.time_s - track.time_s[0]
-    runs = (since_s >= 56.0) & (since_s < 63.0)
     turned = np.random.default_rng(4).standard_normal((len(track), 3))
     turned = np.apply_along_axis(np.convolve, 0, turned, np.hanning(13) / 2.0, "same")
-    added = 0.005 * runs[:, None] * turned
-    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    added = gauss * ((since_s >= begin_s) & (since_s < end_s))[:, None] * turned
+    return replace(track, mag_b_gauss=track.mag_b_gauss + added), added
+
+
+def test_what_runs_for_seven_seconds_once_is_unknown_where_it_does():
+    """A single spell is a source."""
+    track, _ = runs_once(56.0, 63.0, 0.005)
+    found = diagnose(track)
     left = found.unexplained
     assert found.findings == ()
     assert left.detected
@@ -119,3 +124,15 @@ def test_what_runs_for_seven_seconds_once_is_unknown_where_it_does():
     assert left.evidence_nats > 30.0
     told_s = np.array(left.where.intervals_s) - track.time_s[0]
     np.testing.assert_allclose([told_s.min(), told_s.max()], [56.0, 63.0], atol=1.0)
+
+
+def test_a_short_spell_has_the_size_and_direction_that_it_has():
+    """It is drawn within itself: moments of the whole recording would lie beside it."""
+    track, added = runs_once(60.0, 62.0, 0.01)
+    left = diagnose(track).unexplained
+    assert left.detected
+    (span,) = np.array(left.where.intervals_s) - track.time_s[0]
+    np.testing.assert_allclose(span, [60.0, 62.0], atol=1.0)
+    along = added @ np.array(left.where.direction)
+    assert left.size == pytest.approx(np.ptp(along), rel=0.4)
+    assert along.std() > 0.8 * np.linalg.norm(added.std(axis=0)) / np.sqrt(3)

@@ -22,7 +22,8 @@ from ahrsd.diagnosis.where_and_when.address import AXES, departures
 from ahrsd.diagnosis.where_and_when.locate import Frame, single_source, unit_columns
 from ahrsd.samples import Array
 
-_PIECES = 80
+#: moments at which a course is drawn over a recording, and at least in a spell
+_PIECES, _IN_SPELL = 80, 8
 
 
 def left_beyond_ordinary(
@@ -92,12 +93,14 @@ def _other(all_sets: Hypotheses, best: Hypothesis, keys: Sequence[str], odds: fl
     added = sum(added_by(all_sets, best, key)[0] for key in keys)
     turned = np.einsum("nia,ni->na", unit_columns(context, cast("Frame", one.frame)), added)
     time_s = context.track.time_s
-    at = np.linspace(time_s[0], time_s[-1], _PIECES)
+    spans = one.setting.get("spans_s", ())
+    within = [np.linspace(a, b, max(_IN_SPELL, _PIECES // len(spans))) for a, b in spans]
+    at = np.unique(np.concatenate([np.linspace(time_s[0], time_s[-1], _PIECES), *within]))
 
     def drawn(times_s: Array) -> Array:
         return np.column_stack([np.interp(times_s, time_s, column) for column in turned.T])
 
-    spans = one.setting.get("spans_s", ((float(time_s[0]), float(time_s[-1])),))
+    spans = spans or ((float(time_s[0]), float(time_s[-1])),)
     if "edges_s" in one.setting:  # where its levels are not the usual one
         edges = np.array(one.setting["edges_s"])
         levels = drawn((edges[1:] + edges[:-1]) / 2)

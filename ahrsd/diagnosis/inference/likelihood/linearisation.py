@@ -37,7 +37,8 @@ from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
 CALIBRATION = "calibration"
-_BATCH = 96
+#: columns that pass the filter together, at most, and numbers that they have
+_BATCH, _NUMBERS = 96, 4_000_000
 #: number of the readings among the batches
 _Y = -1
 #: rows whose products are made at once
@@ -123,7 +124,7 @@ class Linearised:
         new = list(reversed(first.values()))
         parts = [Columns(one.columns.mag, one.columns.gyro) for one in new]
         amplitude = self.point.loud.amplitude[:, None, None]
-        for batch in batches(parts, _BATCH):
+        for batch in batches(parts, self._together()):
             cube = sensitivities(self.regressing, joined([parts[k] for k in batch]))
             rows = by_frequency(np.divide(cube, amplitude, dtype=np.float32, casting="same_kind"))
             self.batches.append(rows)
@@ -135,6 +136,10 @@ class Linearised:
         for one in unknown:
             twin = self.seen[first[id(one.columns)].key]
             self.seen[one.key] = replace(twin, component=one)
+
+    def _together(self) -> int:
+        """Columns that pass the filter together: fewer of a long recording, to save memory."""
+        return int(np.clip(_NUMBERS // (3 * len(self.point.loud.amplitude)), 1, _BATCH))
 
     def copied(self) -> Linearised:
         """The same, to which components can be added that end with it."""
