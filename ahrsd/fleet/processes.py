@@ -170,6 +170,8 @@ class Guard:
         while not wait([future], _LOOKS_S).done:
             if self._closed:  # the pool leaves what it was at without an answer
                 raise CancelledError
+            if future.running():  # pebble would cancel it all the same, and kill its process
+                continue
             if time.monotonic() > until and future.cancel():
                 return _NotBegunError()
         return future.exception()

@@ -129,6 +129,22 @@ def test_a_task_that_no_process_can_take_is_lost_and_the_others_go_on(jobs):
     assert found == {number: number for number in (0, 2, 3, 4)}
 
 
+def for_seconds(task: tuple[int, float]) -> int:
+    time.sleep(task[1])
+    return task[0]
+
+
+def of_seconds(_: tuple[int, float], loss: Loss) -> int:
+    raise AssertionError(loss)
+
+
+def test_a_task_may_take_longer_than_a_process_has_to_begin_with_it():
+    limits = Limits(begin_s=4.0)
+    with crew(Place(1), limits) as workers:
+        found = [answer for _, answer in workers.map(for_seconds, [(1, 7.0), (2, 0.0)], of_seconds)]
+    assert sorted(found) == [1, 2]
+
+
 def told(_: GoneThere, loss: Loss) -> tuple[str, str, int]:
     return loss.outcome, loss.words, loss.tries
 

@@ -109,8 +109,10 @@ def _searched(
     band = loudest_band(plain.left_by(known.keys, known.at), rate_hz, highest_hz)
     if band is None:
         return first
+    names = first[3].names
+    del plain, first, known  # at a recording's own rate each is a hundred megabytes
     beside = linearised(point, point.context, band[:2])
-    return _searched_in(beside, library, [first[3].names], real=real)
+    return _searched_in(beside, library, [names], real=real)
 
 
 def _searched_in(
