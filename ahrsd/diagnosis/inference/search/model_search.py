@@ -368,14 +368,18 @@ def _propose_steps(all_sets: Hypotheses, space: Space, here: Hypothesis) -> None
 
 
 def surprises(residual: Array, time_s: Array) -> list[float]:
-    """Moments of the largest squares of a residual (N, 3) without colour, apart from each other."""
+    """Moments of the largest squares of a residual (N, 3) without colour, apart from each other.
+
+    None so near to the beginning or the end that a step there is no more than some wild readings.
+    """
     power = np.sum(residual**2, axis=1)
     power = power + np.roll(power, -1)  # the row of a jump, and the next
     found: list[float] = []
     near = APART * float(time_s[-1] - time_s[0])
     for row in np.argsort(-power)[: 20 * MOMENTS]:
         at = float(time_s[row])
-        if at > time_s[0] and all(abs(at - other) > near for other in found):
+        inside = min(at - time_s[0], time_s[-1] - at) > priors.TRANSITION_S
+        if inside and all(abs(at - other) > near for other in found):
             found.append(at)
         if len(found) == MOMENTS:
             break
