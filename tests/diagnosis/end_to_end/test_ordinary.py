@@ -44,3 +44,21 @@ def test_a_rotated_board_is_ordinary_and_a_watch_beside_a_sensor_is_not():
     watch = diagnose(recorded("vn100_distorters/vn7Hard"))
     assert watch.unexplained.detected
     assert "a course in time on the sensor" in watch.unexplained.ordinary.why
+
+
+@pytest.mark.slow
+@pytest.mark.recordings
+def test_a_step_that_is_ordinary_is_in_what_is_left_with_its_time_and_size():
+    """It is not told, being no larger than what such recordings have, and not silent either."""
+    track = recorded("broad/02_undisturbed_slow_rotation_B")
+    middle_s = float(np.mean(track.time_s[[0, -1]]))
+    step = np.array([12e-3, -4e-3, -10e-3])
+    found = diagnose(with_field(track, (track.time_s > middle_s)[:, None] * step))
+    left = found.unexplained
+    assert "hard_iron_step" not in [one.effect for one in found.findings]
+    assert not left.detected
+    (there,) = [one for one in left.ordinary.components if "hard_iron_step" in one.component]
+    assert there.there
+    assert f"at {middle_s:.0f} s" in there.words
+    assert there.size == pytest.approx(np.linalg.norm(step) / 2, rel=0.25)  # about its mean
+    assert left.ordinary.field_gauss > there.size / 2

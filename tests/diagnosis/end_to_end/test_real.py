@@ -41,7 +41,10 @@ def track_of(name: str) -> Track:
 def diagnosed(name: str, *withheld: str) -> Diagnosis:
     track = track_of(name)
     kept = {key: column for key, column in track.covariates.items() if key not in withheld}
-    return diagnose(replace(track, covariates=kept))
+    found = diagnose(replace(track, covariates=kept))
+    for one in found.findings:  # what is told is no less likely than what it may be instead
+        assert all(other.confidence <= one.confidence for other in one.alternatives), one
+    return found
 
 
 def named(found: Diagnosis, effect: str) -> list[Finding]:

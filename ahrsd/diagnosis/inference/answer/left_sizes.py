@@ -39,6 +39,8 @@ from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.decision.members import (
     added_by,
     coefficients,
+    is_ordinary,
+    library_members,
     size_of,
 )
 from ahrsd.diagnosis.inference.likelihood.candidates import beside
@@ -95,12 +97,15 @@ def left_sizes(
     """Everything that is left beside the names.
 
     why: it is not ordinary, None where it is;  keys: of a course that is left besides
+    A name that is not told, being no larger than what such recordings have of its kind, is left.
     """
+    untold = [key for key in library_members(all_sets, best) if is_ordinary(all_sets, best, key)]
+    besides = dict.fromkeys((*keys, *untold))
     context = all_sets.made.context
     take, nats = calibration_of(context), _nats(all_sets, best)
     whole = {unit: np.zeros((len(context.track), 3)) for unit in ("gauss", "rad/s")}
     parts = []
-    for key in (*all_sets.remainder, *(key for key in keys if key not in all_sets.remainder)):
+    for key in (*all_sets.remainder, *(key for key in besides if key not in all_sets.remainder)):
         added, unit = added_by(all_sets, best, key)
         added = less_calibration(added, take) if unit == "gauss" else added
         whole[unit] += added
@@ -141,6 +146,9 @@ def _words(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
     one, effect = all_sets.component(key), key.split(maxsplit=1)[0]
     if not best.names.isdisjoint(form_keys(key)):
         return f"what {effect} stands in for"
+    if one.row is not None and is_ordinary(all_sets, best, key):
+        when = " and ".join(f"{time_s:.0f} s" for time_s in one.moments_s)
+        return f"{one.row.words}{f' at {when}' if when else ''} ({effect})"
     if one.row is not None:
         return f"one of the steps of a source that changes ({effect})"
     words = _WORDS.get(key) or _WORDS.get(key.removeprefix("free "))
@@ -154,7 +162,9 @@ def _together(limits: Sequence[float]) -> float:
 
 def _to_limit(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     """How many times as large a part is ordinarily at most; 0 of what is not ordinary."""
-    law = all_sets.component(key).law
+    law, row = all_sets.component(key).law, all_sets.component(key).row
+    if row is not None:
+        return row.ordinary / max(size_of(all_sets, best, key), 1e-12)
     if isinstance(law, Fixed):
         value, _ = coefficients(all_sets, best, key)
         return _WITHIN / max(float(np.sqrt(np.mean(value**2 / law.variance))), 1e-12)

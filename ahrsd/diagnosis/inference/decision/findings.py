@@ -119,6 +119,8 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
         by_name = {name: nats + off for name, nats in by_name.items()}
         instead = all_sets.judge(all_sets.with_(fewer.names, rival), best)
         by_name[named_so] = instead.score - fewer.score
+    if all_sets.is_real(best.names):  # what is not exchanged there is no likelier (`exchanged`)
+        by_name = {name: min(nats, by_name[mine]) for name, nats in by_name.items()}
     for name, keys in space.effects.items():
         wider = all_sets.component(keys[0])
         if name in by_name and name != mine and holds(wider, own, TO_THE_DIGIT):
