@@ -21,6 +21,8 @@ from ahrsd.samples import Array
 
 #: linearisations with a search each, at most
 ROUNDS = 3
+#: s before and after a spell in which its source is as well
+_BESIDE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +53,28 @@ def answered(found: richest_model.Judged, library: Mapping[str, Effect]) -> Sear
         answer = decision.decided(all_sets, space, best, library)
         if members.names_of(all_sets, answer.best) == before and not spans:
             break
-    return Searched(answer, all_sets, space)
+    return _while_moved(Searched(answer, all_sets, space), library)
+
+
+def _while_moved(found: Searched, library: Mapping[str, Effect]) -> Searched:
+    """The search anew without the readings of a spell of seconds, where a step began in it.
+
+    What a hand brings passes the sensor before it stays, and the passing is louder than the step:
+    a source that is there for a spell, and beside it no step would be told.
+    """
+    all_sets, unknown = found.all_sets, found.answer.unknown
+    spells = [all_sets.component(key).setting.get("spans_s", ()) for key in unknown]
+    spans = [(a - _BESIDE_S, b + _BESIDE_S) for one in spells for a, b in one]
+    if not 0 < len(spans) < priors.CHANGES or max(np.ptp(spans, axis=1)) > 2 * priors.APPROACH_S:
+        return found
+    rich = richest_model.settled(unread(all_sets.made.point, spans), library, ())
+    anew, space, best = best_at(rich, library, (), was_real=True)
+    answer = decision.decided(anew, space, best, library)
+    steps = [one for key in answer.keys if (one := anew.component(key)).jumps]
+    begun = [time_s for one in steps for time_s in one.moments_s]
+    if any(a - _BESIDE_S <= time_s <= b + _BESIDE_S for time_s in begun for a, b in spans):
+        return Searched(answer, anew, space)
+    return found
 
 
 def moved_in(all_sets: Hypotheses, best: Hypothesis) -> list[tuple[float, float]]:
