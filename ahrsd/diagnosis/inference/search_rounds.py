@@ -21,8 +21,6 @@ from ahrsd.samples import Array
 
 #: linearisations with a search each, at most
 ROUNDS = 3
-#: s before and after a spell in which its source is as well
-_BESIDE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,9 +60,9 @@ def _while_moved(found: Searched, library: Mapping[str, Effect]) -> Searched:
     What a hand brings passes the sensor before it stays, and the passing is louder than the step:
     a source that is there for a spell, and beside it no step would be told.
     """
-    all_sets, unknown = found.all_sets, found.answer.unknown
+    all_sets, unknown, near_s = found.all_sets, found.answer.unknown, priors.TRANSITION_S / 2
     spells = [all_sets.component(key).setting.get("spans_s", ()) for key in unknown]
-    spans = [(a - _BESIDE_S, b + _BESIDE_S) for one in spells for a, b in one]
+    spans = [(a - near_s, b + near_s) for one in spells for a, b in one]
     if not 0 < len(spans) < priors.CHANGES or max(np.ptp(spans, axis=1)) > 2 * priors.APPROACH_S:
         return found
     rich = richest_model.settled(unread(all_sets.made.point, spans), library, ())
@@ -72,7 +70,7 @@ def _while_moved(found: Searched, library: Mapping[str, Effect]) -> Searched:
     answer = decision.decided(anew, space, best, library)
     steps = [one for key in answer.keys if (one := anew.component(key)).jumps]
     begun = [time_s for one in steps for time_s in one.moments_s]
-    if any(a - _BESIDE_S <= time_s <= b + _BESIDE_S for time_s in begun for a, b in spans):
+    if any(a - near_s <= time_s <= b + near_s for time_s in begun for a, b in spans):
         return Searched(answer, anew, space)
     return found
 

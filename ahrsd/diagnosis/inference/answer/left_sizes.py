@@ -34,7 +34,7 @@ from ahrsd.diagnosis.inference.components.alternatives import (
     QUICK,
     form_keys,
 )
-from ahrsd.diagnosis.inference.components.component import Fixed
+from ahrsd.diagnosis.inference.components.component import Fixed, Sized
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.decision.members import (
     added_by,
@@ -99,13 +99,17 @@ def left_sizes(
     why: it is not ordinary, None where it is;  keys: of a course that is left besides
     A name that is not told, being no larger than what such recordings have of its kind, is left.
     """
-    untold = [key for key in library_members(all_sets, best) if is_ordinary(all_sets, best, key)]
-    besides = dict.fromkeys((*keys, *untold))
+    untold = [
+        key
+        for key in library_members(all_sets, best)
+        if key not in keys and is_ordinary(all_sets, best, key)
+    ]
     context = all_sets.made.context
     take, nats = calibration_of(context), _nats(all_sets, best)
     whole = {unit: np.zeros((len(context.track), 3)) for unit in ("gauss", "rad/s")}
     parts = []
-    for key in (*all_sets.remainder, *(key for key in besides if key not in all_sets.remainder)):
+    besides = [key for key in keys if key not in all_sets.remainder]
+    for key in (*all_sets.remainder, *besides, *untold):
         added, unit = added_by(all_sets, best, key)
         added = less_calibration(added, take) if unit == "gauss" else added
         whole[unit] += added
@@ -115,7 +119,7 @@ def left_sizes(
         there = nats[key] > priors.ODDS_REAL
         row = Component(
             key,
-            _words(all_sets, best, key),
+            _untold(all_sets, key) if key in untold else _words(all_sets, best, key),
             frame,
             size,
             up_to,
@@ -146,13 +150,18 @@ def _words(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
     one, effect = all_sets.component(key), key.split(maxsplit=1)[0]
     if not best.names.isdisjoint(form_keys(key)):
         return f"what {effect} stands in for"
-    if one.row is not None and is_ordinary(all_sets, best, key):
-        when = " and ".join(f"{time_s:.0f} s" for time_s in one.moments_s)
-        return f"{one.row.words}{f' at {when}' if when else ''} ({effect})"
     if one.row is not None:
         return f"one of the steps of a source that changes ({effect})"
     words = _WORDS.get(key) or _WORDS.get(key.removeprefix("free "))
     return words or f"a course in time {_COURSES[one.frame]}"
+
+
+def _untold(all_sets: Hypotheses, key: str) -> str:
+    """What a name is that is not told, being ordinary, with its moments."""
+    one = all_sets.component(key)
+    when = " and ".join(f"{time_s:.0f} s" for time_s in one.moments_s)
+    words = "" if one.row is None else one.row.words
+    return f"{f'at {when} ' if when else ''}{words} ({one.effect})"
 
 
 def _together(limits: Sequence[float]) -> float:
@@ -163,8 +172,9 @@ def _together(limits: Sequence[float]) -> float:
 def _to_limit(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     """How many times as large a part is ordinarily at most; 0 of what is not ordinary."""
     law, row = all_sets.component(key).law, all_sets.component(key).row
-    if row is not None:
-        return row.ordinary / max(size_of(all_sets, best, key), 1e-12)
+    if row is not None and isinstance(law, Sized):
+        value, _ = coefficients(all_sets, best, key)
+        return row.ordinary / max(float(np.max(np.abs(value) / law.scale)), 1e-12)
     if isinstance(law, Fixed):
         value, _ = coefficients(all_sets, best, key)
         return _WITHIN / max(float(np.sqrt(np.mean(value**2 / law.variance))), 1e-12)
