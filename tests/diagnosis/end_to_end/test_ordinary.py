@@ -61,4 +61,5 @@ def test_a_step_that_is_ordinary_is_in_what_is_left_with_its_time_and_size():
     assert there.there
     assert f"at {middle_s:.0f} s" in there.words
     assert there.size == pytest.approx(np.linalg.norm(step) / 2, rel=0.25)  # about its mean
+    assert there.size < there.up_to < 4 * there.size
     assert left.ordinary.field_gauss > there.size / 2

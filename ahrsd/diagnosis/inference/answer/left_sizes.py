@@ -173,8 +173,9 @@ def _to_limit(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     """How many times as large a part is ordinarily at most; 0 of what is not ordinary."""
     law, row = all_sets.component(key).law, all_sets.component(key).row
     if row is not None and isinstance(law, Sized):
-        value, _ = coefficients(all_sets, best, key)
-        return row.ordinary / max(float(np.max(np.abs(value) / law.scale)), 1e-12)
+        value, deviation = coefficients(all_sets, best, key)
+        limit = row.ordinary * law.scale + 2.0 * deviation  # beyond, it is told (`size_of`)
+        return 1.0 / max(float(np.max(np.abs(value) / limit)), 1e-12)
     if isinstance(law, Fixed):
         value, _ = coefficients(all_sets, best, key)
         return _WITHIN / max(float(np.sqrt(np.mean(value**2 / law.variance))), 1e-12)
