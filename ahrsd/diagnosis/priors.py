@@ -143,6 +143,14 @@ FREEDOMS = (3.0, 5.0, 8.0, 15.0)
 LEVEL_S, LEVELS = 4.0, (0.02, 50.0)
 #: octaves of the noise's spectrum, at most
 BANDS = 7
+#: deviation of the log power of a magnetometer's axis from the mean of the three;  source: .1 to .5
+#: on eleven untouched recordings
+AXES_DIFFER = 0.4
+#: power of a source of one direction, relative to the noise's in an octave: where there is one
+DIRECTED_SHARES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
+#: nats of such a source beside what real recordings leave, from which it is unknown;  source:
+#: eleven untouched recordings have up to 106
+DIRECTED_REAL = 200.0
 
 #: size of a free course, by frame, that one in ten untouched recordings is beyond beside the
 #: remainder, gauss or rad/s: it is a finding only where it is larger;  source: the same command.

@@ -53,5 +53,5 @@ def _without_quick(
 def _quick(found: Searched, library: Mapping[str, Effect], *, real: bool) -> Quick:
     answer = found.answer
     switches = any(key in found.space.sources for key in answer.unknown)
-    nats = answer.unexplained.evidence_nats if switches else 0.0
+    nats = answer.unexplained.evidence_nats if switches else found.all_sets.unknown_nats
     return quick(found.all_sets.made, answer.best, library, real=real, source_nats=nats)

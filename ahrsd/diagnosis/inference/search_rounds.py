@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,8 @@ from ahrsd.diagnosis.inference.components.component import Component
 from ahrsd.diagnosis.inference.components.effect_components import LAG, PIECES
 from ahrsd.diagnosis.inference.decision import decision, members
 from ahrsd.diagnosis.inference.likelihood import richest_model
-from ahrsd.diagnosis.inference.likelihood.linearisation import unread
+from ahrsd.diagnosis.inference.likelihood.directed_noise import Directed
+from ahrsd.diagnosis.inference.likelihood.linearisation import along_one_direction, unread
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.inference.search.search_space import best_at
 from ahrsd.samples import Array
@@ -40,18 +41,27 @@ def answered(found: richest_model.Judged, library: Mapping[str, Effect]) -> Sear
         before = members.names_of(all_sets, answer.best)
         there = [all_sets.component(key) for key in sorted(answer.best.names)]
         named = [one for one in there if one.effect is not None and one.key != LAG]
-        if not named:
-            break
         real = all_sets.is_real(answer.best.names)
+        point = all_sets.made.point
+        source, known = _source(all_sets, answer.best, real=real), point.directed
+        other_noise = (source is None) != (known is None)
+        if not (named or other_noise):
+            break
         spans = moved_in(all_sets, answer.best)
-        point = unread(all_sets.made.point, spans) if spans else all_sets.made.point
+        point = replace(unread(point, spans) if spans else point, directed=source)
         del all_sets, space  # what was asked at the point before is as much again
         found = richest_model.settled(point, library, named)
         all_sets, space, best = best_at(found, library, named, real)
         answer = decision.decided(all_sets, space, best, library)
-        if members.names_of(all_sets, answer.best) == before and not spans:
+        if members.names_of(all_sets, answer.best) == before and not (spans or other_noise):
             break
     return _while_moved(Searched(answer, all_sets, space), library)
+
+
+def _source(all_sets: Hypotheses, best: Hypothesis, *, real: bool) -> Directed | None:
+    """What is louder along one direction than a sensor's noise is, None where that is not sure."""
+    found = along_one_direction(all_sets.made, best.keys, best.at)
+    return found if found.nats > (priors.DIRECTED_REAL if real else priors.UNKNOWN_ODDS) else None
 
 
 def _while_moved(found: Searched, library: Mapping[str, Effect]) -> Searched:

@@ -198,7 +198,7 @@ class WhiteRows:
         made, found = self.made, []
         for batch in batches(columns, _BATCH):
             cube = sensitivities(made.regressing, joined([columns[k] for k in batch]))
-            cube = by_frequency(cube / made.point.loud.amplitude[:, None, None])
+            cube = made.as_loud(by_frequency(cube / made.point.loud.amplitude[:, None, None]))
             found.append((batch, self.like(cube)))
         cut = {
             number: part

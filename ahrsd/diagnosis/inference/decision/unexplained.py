@@ -24,6 +24,8 @@ from ahrsd.samples import Array
 
 #: moments at which a course is drawn over a recording, and at least in a spell
 _PIECES, _IN_SPELL = 80, 8
+#: power of an octave that has a source, of the loudest's
+_OF_LOUDEST = 0.1
 
 
 def left_beyond_ordinary(
@@ -69,6 +71,32 @@ def changing_source(
     frame = all_sets.component(keys[0]).frame
     nats = sum(odds.get(key, 0.0) for key in keys)
     return tuple(keys), _described(at, course, frame, nats, ((onsets[0], float(time_s[-1])),))
+
+
+def along_its_direction(all_sets: Hypotheses, best: Hypothesis) -> Unexplained:
+    """A source along whose direction the noise is louder: the octaves that have most of it."""
+    made = all_sets.made
+    source, rate_hz = made.point.directed, made.point.problem.rate_hz
+    if source is None:
+        return Unexplained(False)
+    count = int(made.edges[-1])
+    edges_hz = made.edges * rate_hz / (2.0 * count)
+    power = source.power((edges_hz[1:] + edges_hz[:-1]) / 2, np.exp(best.at.log_noise))
+    power = power * np.diff(made.edges) / count
+    loud = np.flatnonzero(power > _OF_LOUDEST * power.max())
+    band_hz = (float(edges_hz[loud[0]]), float(edges_hz[loud[-1] + 1]))
+    x, y, z = (float(part) for part in source.direction)
+    axes = tuple(axis for axis, part in zip(AXES, (x, y, z), strict=True) if abs(part) > 0.3)
+    time_s = made.context.track.time_s
+    return Unexplained(
+        detected=True,
+        where=Where(
+            ((float(time_s[0]), float(time_s[-1])),), axes, "sensor", None, band_hz, (x, y, z)
+        ),
+        size=float(np.sqrt(2.0 * power.sum())) * made.context.model.sigma_mag_gauss,
+        unit="gauss",
+        evidence_nats=source.nats,
+    )
 
 
 def _course(all_sets: Hypotheses, best: Hypothesis, key: str, odds: float) -> Unexplained:

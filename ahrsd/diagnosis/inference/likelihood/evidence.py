@@ -72,7 +72,8 @@ class Products:
 class At:
     """The model at one point of its hyperparameters.
 
-    nats: log likelihood and log priors;  gradient (k,), curvature (k, k): in (log v, psi)
+    nats: log likelihood and log priors; -inf where rounding is more than what is left
+    gradient (k,), curvature (k, k): in (log v, psi)
     mean, deviation: (q,) of the coefficients
     """
 
@@ -117,12 +118,10 @@ def evaluated(products: Products, laws: Sequence[Law], log_noise: Array, psi: Ar
     noise = _noise(products, found, m * deviation, deviation)
     by_noise = 0.5 * (noise.expected * inverse - products.rows)
     of_noise, slope_of_noise = noise_model.log_prior(log_noise, products.step, products.alone)
-    likelihood = 0.5 * (float(m @ scaled) - log_det)
-    likelihood -= 0.5 * float(
-        products.rows @ (log_noise + np.log(2 * np.pi)) + products.square @ inverse
-    )
+    left = float(products.square @ inverse) - float(m @ scaled)
+    likelihood = -0.5 * float(products.rows @ (log_noise + np.log(2 * np.pi)) + log_det + left)
     return At(
-        likelihood + prior.nats + of_noise,
+        likelihood + prior.nats + of_noise if left > 0.0 else -np.inf,
         np.concatenate([by_noise + slope_of_noise, prior.slopes.T @ by_phi + prior.gradient]),
         _curvature(products, prior, noise, found, m, inverse),
         m * deviation,

@@ -20,6 +20,7 @@ from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
 from ahrsd.diagnosis.calibration_fit.problem import Problem
 from ahrsd.diagnosis.inference.components.component import Component, Fixed
 from ahrsd.diagnosis.inference.likelihood import noise_model
+from ahrsd.diagnosis.inference.likelihood.directed_noise import Directed, directed
 from ahrsd.diagnosis.inference.likelihood.evidence import At, Products
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import (
@@ -62,6 +63,7 @@ class Point:
     exact: components that are taken out of the track itself: the delay
     misread: (N, 3) rad/s of terms_gyro that a name stands for.  Columns are made of rates without
              it, but with all that has none: of rates less their own squares, squares run away
+    directed: what makes the noise louder along one direction, None where nothing does
     """
 
     problem: Problem
@@ -72,6 +74,7 @@ class Point:
     loud: noise_model.Loudness
     exact: tuple[str, ...] = ()
     misread: Array | None = None
+    directed: Directed | None = None
 
     @property
     def context(self) -> Context:
@@ -96,6 +99,7 @@ class Linearised:
              in single precision, which is one part in ten million of a column
     apart: what has a batch of its own: each that was a member of a model
     alone: numbers of bands of the noise that stand alone, None where there are none
+    whitening: (B, 3, 3) that make each band alike on all axes, None where it is
     """
 
     point: Point
@@ -107,6 +111,7 @@ class Linearised:
     batches: list[Array] = field(default_factory=list)
     blocks: dict[tuple[int, int], Array] = field(default_factory=dict)
     alone: slice | None = None
+    whitening: Array | None = None
     apart: set[str] = field(default_factory=set)
 
     def add(self, components: Sequence[Component]) -> None:
@@ -127,7 +132,7 @@ class Linearised:
         for batch in batches(parts, self._together()):
             cube = sensitivities(self.regressing, joined([parts[k] for k in batch]))
             rows = by_frequency(np.divide(cube, amplitude, dtype=np.float32, casting="same_kind"))
-            self.batches.append(rows)
+            self.batches.append(self.as_loud(rows))
             at = 0
             for k in batch:
                 columns = slice(at, at + new[k].width)
@@ -136,6 +141,15 @@ class Linearised:
         for one in unknown:
             twin = self.seen[first[id(one.columns)].key]
             self.seen[one.key] = replace(twin, component=one)
+
+    def as_loud(self, rows: Array) -> Array:
+        """Rows by frequency (3 M, p) in axes along which the noise is alike."""
+        if self.whitening is None:
+            return rows
+        out = rows.reshape(-1, 3, rows.shape[1])
+        for T, a, b in zip(self.whitening, self.edges[:-1], self.edges[1:], strict=True):
+            out[a:b] = np.einsum("ij,njp->nip", T.astype(rows.dtype), out[a:b])
+        return out.reshape(rows.shape)
 
     def _together(self) -> int:
         """Columns that pass the filter together: fewer of a long recording, to save memory."""
@@ -249,7 +263,11 @@ class Linearised:
         """By how much the rows are denser than readings, nats: makes points comparable."""
         done, used, loud = self.point.filtered, self.point.filtered.used, self.point.loud
         own = done.log_likelihood + 0.5 * np.sum(done.whitened**2, axis=1) + 1.5 * np.log(2 * np.pi)
-        return float(loud.tails + np.sum(own[used]) - 3.0 * np.sum(np.log(loud.amplitude[used])))
+        nats = float(loud.tails + np.sum(own[used]) - 3.0 * np.sum(np.log(loud.amplitude[used])))
+        if self.whitening is not None:
+            share = float(np.count_nonzero(used)) / int(self.edges[-1])
+            nats += share * float(np.diff(self.edges) @ np.linalg.slogdet(self.whitening)[1])
+        return nats
 
     def candidates(
         self, keys: Sequence[str], others: Sequence[str], inverse: Array
@@ -381,7 +399,12 @@ def linearised(
         low, high = (round(2 * count * one / point.problem.rate_hz) for one in band_hz)
         width = round(2 * count * BAND_HZ / point.problem.rate_hz)
         edges, alone = noise_model.with_band(edges, low, min(high, count), width)
-    made = Linearised(point, context, smooth, edges, white, alone=alone)
+    whitening = None
+    if point.directed is not None:
+        edges_hz = edges.astype(float) * point.problem.rate_hz / (2.0 * count)
+        whitening = point.directed.whitening((edges_hz[1:] + edges_hz[:-1]) / 2.0)
+    made = Linearised(point, context, smooth, edges, white, alone=alone, whitening=whitening)
+    made.y = made.as_loud(white[:, None])[:, 0]
     prior = prior_of(point.problem.track)
     law = Fixed(prior.deviation**2)
     made.add([Component(CALIBRATION, "sensor", nuisance_columns(smooth), law)])
@@ -450,7 +473,8 @@ def moved(
     filtered = run_filter(problem.track, model, mag, gyro, held=point.filtered)
     named = {key: value for key, value in out.items() if known[key].effect is not None}
     _, misread = added(len(made.context.track), known, named)
-    return Point(problem, filtered, values, mag, gyro, point.loud, point.exact, misread)
+    rest = point.loud, point.exact, misread, point.directed
+    return Point(problem, filtered, values, mag, gyro, *rest)
 
 
 def relevelled(made: Linearised, keys: Sequence[str], at: At) -> Point:
@@ -458,6 +482,20 @@ def relevelled(made: Linearised, keys: Sequence[str], at: At) -> Point:
     left, point = made.left_by(keys, at), made.point
     loud = noise_model.loudness(left, point.filtered.used, point.problem.rate_hz)
     return replace(point, loud=loud)
+
+
+def along_one_direction(made: Linearised, keys: Sequence[str], at: At) -> Directed:
+    """What is louder along one direction of the sensor, of what a model leaves."""
+    point = made.point
+    left = made.left_by(keys, at) / point.loud.amplitude[:, None]
+    left = np.where(point.filtered.used[:, None], left, 0.0)
+    if made.whitening is not None:
+        rows = dct(left, n=int(made.edges[-1]), axis=0, norm="ortho")
+        for T, a, b in zip(made.whitening, made.edges[:-1], made.edges[1:], strict=True):
+            rows[a:b] = np.linalg.solve(T, rows[a:b].T).T
+        left = np.asarray(idct(rows, axis=0, norm="ortho")[: len(left)])
+    used = float(np.mean(point.filtered.used))
+    return directed(left, made.context.field_b, point.problem.rate_hz, used)
 
 
 def step_of(made: Linearised, keys: Sequence[str], at: At) -> tuple[Array, Array]:

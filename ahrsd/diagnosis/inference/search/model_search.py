@@ -57,7 +57,8 @@ class Hypotheses:
     forms: key of what a component leaves of its form, which comes and goes with it
     holding: key of what contains a delay, and of the same beside one, without it
     real: whether all sets are of a recording that leaves what real ones do, whatever is in them
-    unknown_nats: evidence of a source that switches and was taken out: a rest of it is left
+    unknown_nats: evidence of a source that is no member: one that switches and was taken out, of
+                  which a rest is left, or one along whose direction the noise is louder
     too_wide: sets that were not compared, having too many coefficients
     """
 

@@ -130,6 +130,7 @@ def space_at(
     psi = psi_by_key(made, base.whole, rich.at)
     holding = {one.key: beside_key(one.key) for one in whole}
     all_sets = Hypotheses(made, base.remainder, rich.at.log_noise, psi, forms, holding)
+    all_sets.unknown_nats = 0.0 if made.point.directed is None else made.point.directed.nats
     length_s = context.track.duration_s
 
     def made_of(one: Component, settings: Iterable[Setting]) -> list[Component]:

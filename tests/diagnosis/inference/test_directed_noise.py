@@ -1,0 +1,108 @@
+"""Noise that is louder along one direction: a source, and no sensor's own noise of a colour."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tracks import experiment, track_of
+
+from ahrsd.diagnosis import priors
+from ahrsd.diagnosis.inference.diagnose import begun, diagnose
+from ahrsd.diagnosis.inference.likelihood.directed_noise import Directed, directed
+from ahrsd.diagnosis.inference.likelihood.linearisation import first_point, linearised
+from ahrsd.diagnosis.track import Spec
+
+AXIS = np.array([0.6, -0.7, 0.39]) / np.linalg.norm([0.6, -0.7, 0.39])
+RATE_HZ = 25.0
+
+
+def _coloured(rng: np.random.Generator, shape: tuple[int, ...], low: float, high: float):
+    """Noise of unit deviation between two frequencies."""
+    spectrum = np.fft.rfft(rng.normal(size=shape), axis=0)
+    hertz = np.fft.rfftfreq(shape[0], 1 / RATE_HZ)
+    spectrum[(hertz < low) | (hertz > high)] = 0.0
+    values = np.fft.irfft(spectrum, shape[0], axis=0)
+    return values / values.std(axis=0)
+
+
+def _field(rows: int) -> np.ndarray:
+    return experiment("wam", seed=15, samples=rows).field_b
+
+
+def test_noise_of_any_colour_that_is_independent_by_axis_has_no_direction():
+    """Red, with axes of different levels: 40 draws, none near to what is asked of an unknown."""
+    rng, most, field_b = np.random.default_rng(3), -np.inf, _field(3000)
+    for _ in range(40):
+        left = rng.normal(size=(3000, 3)) + _coloured(rng, (3000, 3), 0.0, 1.0)
+        left *= np.exp(rng.normal(size=3) * priors.AXES_DIFFER / 2)
+        most = max(most, directed(left, field_b, RATE_HZ, 1.0).nats)
+    assert most < priors.UNKNOWN_ODDS / 2
+
+
+@pytest.mark.parametrize("band_hz", [(0.3, 1.2), (2.0, 6.0)])
+def test_a_source_has_its_direction_its_octaves_and_its_power(band_hz: tuple[float, float]):
+    rng, level = np.random.default_rng(4), np.array([1.2, 1.0, 1 / 1.2])
+    left = rng.normal(size=(6000, 3)) * level
+    left += 0.5 * _coloured(rng, (6000, 1), *band_hz) * AXIS
+    found = directed(left, _field(6000), RATE_HZ, 1.0)
+    assert found.nats > 50.0
+    assert abs(found.direction @ AXIS) > 0.98
+    assert found.level == pytest.approx(level, rel=0.05)
+    middle_hz = (found.edges_hz[1:] + found.edges_hz[:-1]) / 2
+    cosines = np.diff(found.edges_hz) / found.edges_hz[-1]
+    power = found.power(middle_hz, np.ones(len(middle_hz))) * cosines
+    assert power.sum() == pytest.approx(0.25, rel=0.25)
+    inside = (found.edges_hz[1:] > band_hz[0]) & (found.edges_hz[:-1] < band_hz[1])
+    assert power[inside].sum() > 0.9 * power.sum()
+
+
+def test_what_a_loud_gyro_leaves_across_the_field_is_no_source():
+    rng, field_b = np.random.default_rng(5), _field(4000)
+    field_b = np.broadcast_to(field_b[0], field_b.shape)  # a vehicle that does not turn
+    unit = field_b / np.linalg.norm(field_b, axis=1, keepdims=True)
+    gyro = 2.0 * _coloured(rng, (4000, 3), 0.0, 2.0)
+    left = rng.normal(size=(4000, 3)) + gyro - np.sum(gyro * unit, axis=1, keepdims=True) * unit
+    assert directed(left, field_b, RATE_HZ, 1.0).nats < priors.UNKNOWN_ODDS
+
+
+def test_whitened_rows_are_alike_on_all_axes_and_their_density_is_counted():
+    track = track_of(experiment("wam", seed=14, samples=2000, sigma_mag=5e-4))
+    problem, start = begun(track, Spec())
+    point = first_point(problem, start.filtered, ())
+    source = Directed(
+        np.array([1.1, 1.0, 1 / 1.1]), AXIS, np.array([3.0, 0.5]), np.array([0.0, 1.0, 12.5]), 99.0
+    )
+    plain = linearised(point, point.context)
+    made = linearised(replace(point, directed=source), point.context)
+    count = int(made.edges[-1])
+    middle_hz = (made.edges[1:] + made.edges[:-1]) / 2 * problem.rate_hz / (2 * count)
+    share = np.repeat(np.where(middle_hz < 1.0, 3.0, 0.5), np.diff(made.edges))
+    covariance = (
+        np.diag(source.level)
+        @ (np.eye(3) + share[:, None, None] * np.outer(AXIS, AXIS))
+        @ np.diag(source.level)
+    )
+    y, before = made.y.reshape(-1, 3), plain.y.reshape(-1, 3)
+    square = np.einsum("ni,nij,nj->n", before, np.linalg.inv(covariance), before)
+    assert np.sum(y**2, axis=1) == pytest.approx(square, rel=1e-5)
+    denser = -0.5 * np.sum(np.log1p(share)) * np.count_nonzero(point.filtered.used) / count
+    assert made.log_whitening - plain.log_whitening == pytest.approx(denser, rel=1e-6)
+
+
+def test_a_quick_current_that_nobody_logged_is_unknown_along_its_direction():
+    """Noise of a colour swallowed it, and nothing was told."""
+    track = track_of(experiment("wam", seed=14, samples=4000, sigma_mag=5e-4))
+    rng = np.random.default_rng(8)
+    added = 4e-4 * _coloured(rng, (len(track), 1), 0.8, 2.5) * AXIS
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    assert found.findings == ()
+    left = found.unexplained
+    assert left.detected
+    assert left.where.frame == "sensor"
+    assert abs(np.array(left.where.direction) @ AXIS) > 0.95
+    low, high = left.where.band_hz
+    assert low < 0.9
+    assert high > 2.0
+    assert left.size == pytest.approx(np.sqrt(2.0) * 4e-4, rel=0.3)
