@@ -22,6 +22,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Validation,
 )
 from ahrsd.diagnosis.answer.text import (
+    along,
     assumed,
     headline,
     in_one_sentence,
@@ -30,6 +31,7 @@ from ahrsd.diagnosis.answer.text import (
     sensitivity,
     setting_text,
     size_lines,
+    told_size,
     value_text,
     verdict,
 )
@@ -384,8 +386,10 @@ def _unexplained(found: Diagnosis) -> list[tuple[str, str]]:
     if left.where is None or not (left.detected or left.ordinary):
         return []
     rows = [("where", place(left.where))]
+    if left.where.direction is not None:
+        rows.append(("along", along(left.where.direction)))
     if left.size is not None:
-        rows.append(("size", number(left.size, left.unit)))
+        rows.append(("size", told_size(left.size, left.unit)))
     if left.ordinary is not None:
         rows += [("part", text) for text in size_lines(left.ordinary)]
         rows += [("yardstick", left.ordinary.why)] if left.ordinary.why else []

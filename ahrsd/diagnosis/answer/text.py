@@ -167,6 +167,12 @@ def place(where: Where) -> str:
     return "; ".join(part for part in parts if part)
 
 
+def along(direction: tuple[float, float, float]) -> str:
+    """`x -0.44, y +0.65, z +0.62 (a unit vector of that frame)`."""
+    x, y, z = direction
+    return f"x {x:+.2f}, y {y:+.2f}, z {z:+.2f} (a unit vector of that frame)"
+
+
 def value_text(value: Value) -> str:
     """`field_per_ampere_y = 1.30e-03 +- 4e-05 gauss/A`."""
     return f"{value.name} = {value.value:.3g} +- {value.std:.1g} {value.unit}"
@@ -174,8 +180,10 @@ def value_text(value: Value) -> str:
 
 def _unexplained_lines(left: Unexplained) -> list[str]:
     out = [] if left.where is None else [f"   where      {place(left.where)}"]
+    if left.where is not None and left.where.direction is not None:
+        out.append(f"   along      {along(left.where.direction)}")
     if left.size is not None:
-        out.append(f"   size       {left.size:.3g} {left.unit}")
+        out.append(f"   size       {told_size(left.size, left.unit)}")
     if left.ordinary is not None:
         out += [f"   part       {text}" for text in size_lines(left.ordinary)]
         out += [f"   yardstick  {left.ordinary.why}"] if left.ordinary.why else []

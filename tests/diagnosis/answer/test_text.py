@@ -88,6 +88,20 @@ def test_what_is_ordinary_is_no_mismatch_and_is_not_silent():
     assert "not in the library:" not in lines(one)
 
 
+def test_what_is_unknown_is_told_with_direction_frequencies_and_size():
+    where = Where(
+        ((0.0, 110.0),), ("x", "y"), "sensor", band_hz=(0.26, 2.08), direction=(0.6, -0.8, 0.0)
+    )
+    left = Unexplained(True, where, None, 4.19e-4, "gauss", evidence_nats=40.0)
+    said = lines(Diagnosis("walk.csv", None, True, 1e-17, (), left, {}))
+    at = said.index("not in the library:")
+    assert said[at + 1 : at + 4] == [
+        "   where      0.0-110.0 s; axes x y; turns with the vehicle; 0.26-2.08 Hz",
+        "   along      x +0.60, y -0.80, z +0.00 (a unit vector of that frame)",
+        "   size       0.42 mG",
+    ]
+
+
 def test_a_name_beside_what_is_ordinary_is_a_mismatch():
     lag = Finding(
         "mag_time_lag", 0.99, (), Where((), (), "link"), (), None, None, None, words="it is late"
