@@ -26,42 +26,61 @@ ROUNDS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Searched:
-    """An answer, and the sets at the last linearisation that it was chosen of."""
+    """An answer, and the sets at the last linearisation that it was chosen of.
+
+    source: what is louder along one direction than a sensor's noise is, None where nothing is
+    """
 
     answer: decision.Answer
     all_sets: Hypotheses
     space: Space
+    source: Directed | None
 
 
 def answered(found: richest_model.Judged, library: Mapping[str, Effect]) -> Searched:
     """Searched at the richest model, and again at what was found, until that stays."""
     all_sets, space, best = best_at(found, library, (), was_real=True)
     answer = decision.decided(all_sets, space, best, library)
+    source = _source(all_sets, answer.best)
     for _ in range(ROUNDS - 1):
         before = members.names_of(all_sets, answer.best)
         there = [all_sets.component(key) for key in sorted(answer.best.names)]
         named = [one for one in there if one.effect is not None and one.key != LAG]
         real = all_sets.is_real(answer.best.names)
         point = all_sets.made.point
-        source, known = _source(all_sets, answer.best, real=real), point.directed
-        other_noise = (source is None) != (known is None)
+        directed = _whitened(answer, source, point.directed)
+        other_noise = (directed is None) != (point.directed is None)
         if not (named or other_noise):
             break
         spans = moved_in(all_sets, answer.best)
-        point = replace(unread(point, spans) if spans else point, directed=source)
+        point = replace(unread(point, spans) if spans else point, directed=directed)
         del all_sets, space  # what was asked at the point before is as much again
         found = richest_model.settled(point, library, named)
         all_sets, space, best = best_at(found, library, named, real)
         answer = decision.decided(all_sets, space, best, library)
+        source = _source(all_sets, answer.best)
         if members.names_of(all_sets, answer.best) == before and not (spans or other_noise):
             break
-    return _while_moved(Searched(answer, all_sets, space), library)
+    return _while_moved(Searched(answer, all_sets, space, source), library)
 
 
-def _source(all_sets: Hypotheses, best: Hypothesis, *, real: bool) -> Directed | None:
+def _source(all_sets: Hypotheses, best: Hypothesis) -> Directed | None:
     """What is louder along one direction than a sensor's noise is, None where that is not sure."""
     found = along_one_direction(all_sets.made, best.keys, best.at)
-    return found if found.nats > (priors.DIRECTED_REAL if real else priors.UNKNOWN_ODDS) else None
+    asked = priors.DIRECTED_REAL if all_sets.is_real(best.names) else priors.UNKNOWN_ODDS
+    return found if found.nats > asked else None
+
+
+def _whitened(
+    answer: decision.Answer, source: Directed | None, known: Directed | None
+) -> Directed | None:
+    """The source beside whose noise names are judged: one that is surer than each of them.
+
+    A strong name whose log or form is not exact leaves a rest, and is no worse for it; what a
+    source has more of than all names have is not theirs.
+    """
+    surest = max((one.evidence_nats for one in answer.findings), default=0.0)
+    return source if source is not None and (known or source.nats > surest) else None
 
 
 def _while_moved(found: Searched, library: Mapping[str, Effect]) -> Searched:
@@ -81,7 +100,7 @@ def _while_moved(found: Searched, library: Mapping[str, Effect]) -> Searched:
     steps = [one for key in answer.keys if (one := anew.component(key)).jumps]
     begun = [time_s for one in steps for time_s in one.moments_s]
     if any(a - near_s <= time_s <= b + near_s for time_s in begun for a, b in spans):
-        return Searched(answer, anew, space)
+        return Searched(answer, anew, space, _source(anew, answer.best))
     return found
 
 

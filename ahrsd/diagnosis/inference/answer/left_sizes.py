@@ -82,7 +82,8 @@ def told_sizes(
         return left
     if left.detected:
         known = dict.fromkeys(_words(all_sets, best, key) for key in answer.unknown)
-        why = f"beyond what such recordings ordinarily leave: {', '.join(known)}"
+        what = ", ".join(known) or "a source of one direction, quicker than a course in time"
+        why = f"beyond what such recordings ordinarily leave: {what}"
         sizes = left_sizes(all_sets, best, why, answer.unknown)
         return replace(left, ordinary=sizes)
     if simulated and nats > priors.UNKNOWN_ODDS:

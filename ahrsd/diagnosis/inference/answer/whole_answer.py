@@ -14,9 +14,11 @@ import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import (
     Check,
+    Contribution,
     Diagnosis,
     Finding,
     RegimeMap,
+    Unexplained,
 )
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, baseline
 from ahrsd.diagnosis.data_quality.facts import Fact, of_fact, rounding
@@ -28,6 +30,7 @@ from ahrsd.diagnosis.inference.answer.left_sizes import told_sizes, with_channel
 from ahrsd.diagnosis.inference.answer.repaired_noise import loud_facts, repaired_noise
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.decision.members import nats_of_remainder
+from ahrsd.diagnosis.inference.decision.unexplained import along_its_direction
 from ahrsd.diagnosis.inference.likelihood.logged_columns import as_recorded
 from ahrsd.diagnosis.inference.recorded_rate import Quick
 from ahrsd.diagnosis.inference.search_rounds import Searched
@@ -59,10 +62,11 @@ def whole_answer(
     slow = support.supported(answer, held, 0)
     told = (*slow, *support.supported(fast.answer, quickly, len(slow)))
     courses = pictures.courses(all_sets, answer.best)
-    left = support.what_is_left(answer, held)
-    if not left.detected:
-        left = support.what_is_left(fast.answer, quickly)
-    left = with_channels(left, found, courses)
+    contributions = [
+        *pictures.contributions(all_sets, answer),
+        *pictures.contributions(fast.all_sets, fast.answer),
+    ]
+    left = with_channels(_left(found, fast, (held, quickly), contributions), found, courses)
     remainder_nats = nats_of_remainder(all_sets, answer.best)
     left = told_sizes(all_sets, answer, left, remainder_nats, simulated=simulated)
     left = max(left, fast.hum, key=lambda one: (one.detected, one.evidence_nats))
@@ -72,11 +76,7 @@ def whole_answer(
     residuals = residual_checks.residuals_of(held.rows(answer.best.names))
     maps = residual_checks.regime_maps(residuals)
     alone = visibility.seen_alone(all_sets, found.space, held.less(answer.keys))
-    contributions = [
-        *pictures.contributions(all_sets, answer),
-        *pictures.contributions(fast.all_sets, fast.answer),
-    ]
-    odds = answer.log_odds, fast.answer.log_odds, remainder_nats, fast.hum.evidence_nats, 0.0
+    odds = answer.log_odds, fast.answer.log_odds, remainder_nats, left.evidence_nats, 0.0
     counted = len(named) > len(told)
     said = support.doubts(told) if something else support.nearest(answer, all_sets)
     return Diagnosis(
@@ -97,6 +97,17 @@ def whole_answer(
         validation=support.validation((answer, held), (fast.answer, quickly), told, left),
         regime_map=maps,
     )
+
+
+def _left(
+    found: Searched, fast: Quick, held: tuple[HeldOut, HeldOut], named: Sequence[Contribution]
+) -> Unexplained:
+    """What no name explains: in time, along one direction, or at the recorded rate."""
+    left = support.what_is_left(found.answer, held[0])
+    if not left.detected:
+        added = [one.added for one in named if one.unit == "gauss"]
+        left = along_its_direction(found.all_sets, found.answer.best, found.source, added)
+    return left if left.detected else support.what_is_left(fast.answer, held[1])
 
 
 def _as_recorded(told: Sequence[Told], found: Searched) -> tuple[Told, ...]:

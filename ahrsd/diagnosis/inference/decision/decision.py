@@ -19,11 +19,7 @@ from ahrsd.diagnosis.inference.components.ordinary_remainder import GYRO_MATRIX,
 from ahrsd.diagnosis.inference.decision.acceptance import accepted
 from ahrsd.diagnosis.inference.decision.findings import as_finding, drift_finding, turn_finding
 from ahrsd.diagnosis.inference.decision.members import coefficients, is_ordinary
-from ahrsd.diagnosis.inference.decision.unexplained import (
-    along_its_direction,
-    changing_source,
-    left_beyond_ordinary,
-)
+from ahrsd.diagnosis.inference.decision.unexplained import changing_source, left_beyond_ordinary
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.model import Term
 
@@ -81,8 +77,6 @@ def decided(
     )
     if switching and not left.detected:
         unknown, left = changing_source(all_sets, best, switching[0], odds)
-    if not left.detected:
-        left = along_its_direction(all_sets, best)
     surest = max([*odds.values(), left.evidence_nats], default=0.0)
     told = tuple(found), tuple(terms), left, surest
     return Answer(best, tuple(keys), unknown, rivals, *told)

@@ -17,6 +17,7 @@ from ahrsd.diagnosis.inference.decision.members import (
     library_members,
     size_of,
 )
+from ahrsd.diagnosis.inference.likelihood.directed_noise import Directed
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.where_and_when.address import AXES, departures
 from ahrsd.diagnosis.where_and_when.locate import Frame, single_source, unit_columns
@@ -73,11 +74,16 @@ def changing_source(
     return tuple(keys), _described(at, course, frame, nats, ((onsets[0], float(time_s[-1])),))
 
 
-def along_its_direction(all_sets: Hypotheses, best: Hypothesis) -> Unexplained:
-    """A source along whose direction the noise is louder: the octaves that have most of it."""
+def along_its_direction(
+    all_sets: Hypotheses, best: Hypothesis, source: Directed | None, named: Sequence[Array]
+) -> Unexplained:
+    """A source along whose direction the noise is louder: the octaves that have most of it.
+
+    named: (N, 3) gauss that names add, each; what is along the direction of one is its own rest
+    """
     made = all_sets.made
-    source, rate_hz = made.point.directed, made.point.problem.rate_hz
-    if source is None:
+    rate_hz = made.point.problem.rate_hz
+    if source is None or any(_is_along(source.direction, added) for added in named):
         return Unexplained(False)
     count = int(made.edges[-1])
     edges_hz = made.edges * rate_hz / (2.0 * count)
@@ -97,6 +103,12 @@ def along_its_direction(all_sets: Hypotheses, best: Hypothesis) -> Unexplained:
         unit="gauss",
         evidence_nats=source.nats,
     )
+
+
+def _is_along(direction: Array, added: Array) -> bool:
+    """Whether what a name adds has one direction, and nearly this one."""
+    own, share = single_source(added, np.ones(len(added)))
+    return bool(share > priors.ONE_SOURCE and abs(own @ direction) > priors.SAME_DIRECTION)
 
 
 def _course(all_sets: Hypotheses, best: Hypothesis, key: str, odds: float) -> Unexplained:
