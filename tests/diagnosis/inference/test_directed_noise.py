@@ -32,9 +32,9 @@ def _field(rows: int) -> np.ndarray:
 
 
 def test_noise_of_any_colour_that_is_independent_by_axis_has_no_direction():
-    """Red, with axes of different levels: 40 draws, none near to what is asked of an unknown."""
+    """Red, with axes of different levels: 12 draws, none near to what is asked of an unknown."""
     rng, most, field_b = np.random.default_rng(3), -np.inf, _field(3000)
-    for _ in range(40):
+    for _ in range(12):
         left = rng.normal(size=(3000, 3)) + _coloured(rng, (3000, 3), 0.0, 1.0)
         left *= np.exp(rng.normal(size=3) * priors.AXES_DIFFER / 2)
         most = max(most, directed(left, field_b, RATE_HZ, 1.0).nats)
