@@ -151,8 +151,8 @@ DIRECTED_SHARES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 #: nats of such a source beside what real recordings leave, from which it is unknown;  source:
 #: eleven untouched recordings have up to 106
 DIRECTED_REAL = 200.0
-#: share of what a name adds that has one direction, and cosine to that of such a source, from which
-#: the source is the name's own rest: twenty degrees, six of a hundred directions by chance
+#: share of what a name adds that has one direction, and cosine to that of something unknown, from
+#: which the two are one source: twenty degrees, six of a hundred directions by chance
 ONE_SOURCE, SAME_DIRECTION = 0.8, 0.94
 
 #: size of a free course, by frame, that one in ten untouched recordings is beyond beside the

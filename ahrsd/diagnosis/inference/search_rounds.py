@@ -74,12 +74,13 @@ def _source(all_sets: Hypotheses, best: Hypothesis) -> Directed | None:
 def _whitened(
     answer: decision.Answer, source: Directed | None, known: Directed | None
 ) -> Directed | None:
-    """The source beside whose noise names are judged: one that is surer than each of them.
+    """The source beside whose noise names are judged: one that is surer than all that is told.
 
-    A strong name whose log or form is not exact leaves a rest, and is no worse for it; what a
-    source has more of than all names have is not theirs.
+    A strong name whose log or form is not exact leaves a rest, and is no worse for it, and so does
+    a course of what is unknown; what a source has more of than all of these have is not theirs.
     """
-    surest = max((one.evidence_nats for one in answer.findings), default=0.0)
+    told = [one.evidence_nats for one in answer.findings]
+    surest = max([*told, answer.unexplained.evidence_nats])
     return source if source is not None and (known or source.nats > surest) else None
 
 

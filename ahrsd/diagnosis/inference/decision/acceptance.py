@@ -27,6 +27,7 @@ from ahrsd.diagnosis.inference.decision.members import (
     is_ordinary,
     library_members,
 )
+from ahrsd.diagnosis.inference.decision.unexplained import is_along
 from ahrsd.diagnosis.inference.likelihood.candidates import beside
 from ahrsd.diagnosis.inference.search.model_search import (
     Hypotheses,
@@ -34,6 +35,7 @@ from ahrsd.diagnosis.inference.search.model_search import (
     Space,
     come_and_gone,
 )
+from ahrsd.diagnosis.where_and_when.locate import single_source
 
 
 def accepted(
@@ -45,7 +47,8 @@ def accepted(
     best = _come_and_gone(all_sets, space, best)
     best, rivals = _borne_out(all_sets, space, best)
     best, rivals = _beside_others(all_sets, space, best, rivals)
-    return _held_to_form(all_sets, space, best, rivals)
+    best, rivals = _held_to_form(all_sets, space, best, rivals)
+    return _of_one_source(all_sets, space, best, rivals)
 
 
 def _borne_out(
@@ -219,6 +222,32 @@ def _held_to_form(
             return best, rivals
         taken |= found.names - best.names
         best, rivals = _borne_out(all_sets, space, found)
+
+
+def _of_one_source(
+    all_sets: Hypotheses, space: Space, best: Hypothesis, rivals: dict[str, Hypothesis]
+) -> tuple[Hypothesis, dict[str, Hypothesis]]:
+    """The set without names that act along the one direction in which something unknown acts.
+
+    A source that no name has is drawn by logged columns that go with it, each in part: all along
+    its direction, the rest as well.  Several names, or one that is less sure than the rest, are
+    one unknown source; one that is surer leaves a rest.
+    """
+    odds = {key: best.score - rival.score for key, rival in rivals.items()}
+    members = [key for key in odds if key != LAG and all_sets.component(key).columns.on_mag]
+    named = [key for key in members if all_sets.component(key).row is not None]
+    unknown = [key for key in set(members) - set(named) if not is_ordinary(all_sets, best, key)]
+    added = {key: added_by(all_sets, best, key)[0] for key in (*named, *unknown)}
+    for key in sorted(unknown, key=lambda one: -odds[one]):
+        direction, share = single_source(added[key], np.ones(len(added[key])))
+        if share < priors.ONE_SOURCE:
+            continue
+        alike = [one for one in named if is_along(direction, added[one])]
+        parts = alike if len(alike) > 1 else [one for one in alike if odds[one] < odds[key]]
+        if parts:
+            fewer = all_sets.judge(best.names - set(parts), best)
+            return _of_one_source(all_sets, space, *_borne_out(all_sets, space, fewer))
+    return best, rivals
 
 
 def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:

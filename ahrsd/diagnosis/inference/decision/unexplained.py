@@ -83,7 +83,7 @@ def along_its_direction(
     """
     made = all_sets.made
     rate_hz = made.point.problem.rate_hz
-    if source is None or any(_is_along(source.direction, added) for added in named):
+    if source is None or any(is_along(source.direction, added) for added in named):
         return Unexplained(False)
     count = int(made.edges[-1])
     edges_hz = made.edges * rate_hz / (2.0 * count)
@@ -105,7 +105,7 @@ def along_its_direction(
     )
 
 
-def _is_along(direction: Array, added: Array) -> bool:
+def is_along(direction: Array, added: Array) -> bool:
     """Whether what a name adds has one direction, and nearly this one."""
     own, share = single_source(added, np.ones(len(added)))
     return bool(share > priors.ONE_SOURCE and abs(own @ direction) > priors.SAME_DIRECTION)
