@@ -28,6 +28,7 @@ def turned(track: Track, angle_rad: np.ndarray) -> Track:
     return replace(track, mag_b_gauss=Rotation.from_rotvec(angle_rad).apply(track.mag_b_gauss))
 
 
+@pytest.mark.slow
 def test_a_mount_that_stays_crooked_has_a_name() -> None:
     track = driven(3000)
     found = diagnose(turned(track, np.full((len(track), 3), 3e-3)))

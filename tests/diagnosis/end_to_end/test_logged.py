@@ -92,6 +92,7 @@ def test_another_column_is_no_cause_at_any_time(driven, seed: int) -> None:
     assert not any("runs" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_the_rest_of_a_column_with_a_hole_names_its_cause() -> None:
     track, current = beside_a_motor(2000)
     holed = np.where((track.time_s > 60.0) & (track.time_s < 85.0), np.nan, current)

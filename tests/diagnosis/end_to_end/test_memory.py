@@ -45,6 +45,7 @@ def test_a_low_pass_begins_where_it_was_left() -> None:
     np.testing.assert_allclose(slow, expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_iron_that_had_not_settled_is_no_step_and_no_drift() -> None:
     track = made(Trial(6, scenario="wam", samples=2500)).track
     setting = {"time_constant_s": 25.0, "memory": (0.3, -0.25, 0.2)}

@@ -99,6 +99,7 @@ def test_a_field_that_falls_off_by_e_in_metres_of_height_is_one_name() -> None:
     assert abs(answer.findings[0].setting["length_m"] / 3.0 - 1) < 0.2
 
 
+@pytest.mark.slow
 def test_a_start_up_between_the_grids_time_constants() -> None:
     track, readings = _quiet(4)
     effect = EFFECTS["gyro_startup"]

@@ -14,7 +14,8 @@ from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Spec
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
 def test_the_noise_is_found_below_what_differences_say(seed: int) -> None:
     track = shaking(seed)
     assert shaken(track)

@@ -11,6 +11,7 @@ from mismatch_trials import Trial, made
 from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
+@pytest.mark.slow
 def test_a_warm_up_that_nobody_logged_is_one_drift() -> None:
     quiet = replace(made(Trial(seed=8, samples=6000)).track, covariates={})
     passed_s = quiet.time_s - quiet.time_s[0]
