@@ -154,6 +154,8 @@ DIRECTED_REAL = 200.0
 #: share of what a name adds that has one direction, and cosine to that of something unknown, from
 #: which the two are one source: twenty degrees, six of a hundred directions by chance
 ONE_SOURCE, SAME_DIRECTION = 0.8, 0.94
+#: the same share of something unknown: a free course takes noise along the other axes as well
+MAINLY_ONE = 0.5
 
 #: size of a free course, by frame, that one in ten untouched recordings is beyond beside the
 #: remainder, gauss or rad/s: it is a finding only where it is larger;  source: the same command.

@@ -240,7 +240,7 @@ def _of_one_source(
     added = {key: added_by(all_sets, best, key)[0] for key in (*named, *unknown)}
     for key in sorted(unknown, key=lambda one: -odds[one]):
         direction, share = single_source(added[key], np.ones(len(added[key])))
-        if share < priors.ONE_SOURCE:
+        if share < priors.MAINLY_ONE:
             continue
         alike = [one for one in named if is_along(direction, added[one])]
         parts = alike if len(alike) > 1 else [one for one in alike if odds[one] < odds[key]]
