@@ -135,3 +135,13 @@ def _stronger(track: Track) -> Track:
 )
 def test_agreement_stays_agreement(change) -> None:
     _agrees(diagnose(change(_with_reference(_made(PLAIN[0])))))
+
+
+@pytest.mark.parametrize(
+    ("scenario", "seed"),
+    [("wam", 1), *(pytest.param(*one, marks=pytest.mark.slow) for one in (("mam", 1), ("wam", 2)))],
+)
+def test_a_loud_gyro_at_ten_hertz_has_no_delay(scenario: str, seed: int) -> None:
+    """Moved by half a step its noise is averaged: that was a delay, and a crooked gyro besides."""
+    made_one = experiment(scenario, seed=seed, samples=3000, rate_hz=10.0, sigma_gyro=3e-2)
+    _agrees(diagnose(track_of(made_one)))

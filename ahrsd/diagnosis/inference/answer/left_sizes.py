@@ -149,7 +149,8 @@ def left_sizes(
 def _words(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
     """What a part is, in words."""
     one, effect = all_sets.component(key), key.split(maxsplit=1)[0]
-    if not best.names.isdisjoint(form_keys(key)):
+    factors = {factor for name in library_members(all_sets, best) for factor in form_keys(name)}
+    if key in factors or not best.names.isdisjoint(form_keys(key)):
         return f"what {effect} stands in for"
     if one.row is not None:
         return f"one of the steps of a source that changes ({effect})"
