@@ -58,6 +58,18 @@ def test_a_source_has_its_direction_its_octaves_and_its_power(band_hz: tuple[flo
     assert power[inside].sum() > 0.9 * power.sum()
 
 
+def test_the_power_is_the_same_where_the_residual_was_divided_by_all_that_is_in_it():
+    """As a noise of a colour takes the source for its own, where names that are surer stand."""
+    rng, band_hz = np.random.default_rng(7), (2.0, 6.0)
+    left = rng.normal(size=(6000, 3)) + 2.0 * _coloured(rng, (6000, 1), *band_hz) * AXIS
+    whole = float(np.mean(left**2))
+    found = directed(left / np.sqrt(whole), _field(6000), RATE_HZ, 1.0)
+    middle_hz = (found.edges_hz[1:] + found.edges_hz[:-1]) / 2
+    cosines = np.diff(found.edges_hz) / found.edges_hz[-1]
+    power = found.power(middle_hz, np.full(len(middle_hz), whole)) @ cosines
+    assert power == pytest.approx(4.0, rel=0.1)
+
+
 def test_what_a_loud_gyro_leaves_across_the_field_is_no_source():
     rng, field_b = np.random.default_rng(5), _field(4000)
     field_b = np.broadcast_to(field_b[0], field_b.shape)  # a vehicle that does not turn
@@ -72,7 +84,12 @@ def test_whitened_rows_are_alike_on_all_axes_and_their_density_is_counted():
     problem, start = begun(track, Spec())
     point = first_point(problem, start.filtered, ())
     source = Directed(
-        np.array([1.1, 1.0, 1 / 1.1]), AXIS, np.array([3.0, 0.5]), np.array([0.0, 1.0, 12.5]), 99.0
+        np.array([1.1, 1.0, 1 / 1.1]),
+        AXIS,
+        np.array([3.0, 0.5]),
+        np.zeros(2),
+        np.array([0.0, 1.0, 12.5]),
+        99.0,
     )
     plain = linearised(point, point.context)
     made = linearised(replace(point, directed=source), point.context)

@@ -1,8 +1,8 @@
 """Noise along one direction: a source that is quicker than any course, or never comes twice alike.
 
 A sensor's own noise is independent from axis to axis, whatever its colour, and its axes differ by a
-level that is the same in every octave.  A current, iron that moves or a rotor acts along one
-direction of the sensor, in some octaves and not in others:
+level that is the same in every octave.  A current, or iron that moves, acts along one direction of
+the sensor, in some octaves and not in others:
 
     covariance in octave b:  v_b (D + p_b a a^T),   D diagonal, |D| = 1, p_b >= 0
                           =  v_b L (I + q_b w w^T) L,   L = D^(1/2), w a unit vector
@@ -36,12 +36,14 @@ class Directed:
     """What is louder along one direction.
 
     level (3,): of each axis, their product 1;  along (3,): unit vector of the axes in these levels
-    share (B,): q of each octave;  edges_hz (B + 1,): its ends;  nats: by which it is likelier
+    share (B,): q of each octave;  square (B,): mean square of the source in the residual there
+    edges_hz (B + 1,): ends of the octaves;  nats: by which it is likelier
     """
 
     level: Array
     along: Array
     share: Array
+    square: Array
     edges_hz: Array
     nats: float
 
@@ -59,9 +61,12 @@ class Directed:
         return np.asarray(along / self.level)
 
     def power(self, band_hz: Array, variance: Array) -> Array:
-        """(B,) mean square of the source, of bands with these middles and variances."""
-        share = self.share[np.searchsorted(self.edges_hz[1:-1], band_hz)]
-        return np.asarray(float(np.sum((self.level * self.along) ** 2)) * share * variance)
+        """(B,) mean square of the source in bands with these middles.
+
+        variance (B,): by which the residual was divided there
+        """
+        square = self.square[np.searchsorted(self.edges_hz[1:-1], band_hz)]
+        return np.asarray(square * variance)
 
 
 def directed(left: Array, field_b: Array, rate_hz: float, used: float) -> Directed:
@@ -81,10 +86,13 @@ def directed(left: Array, field_b: Array, rate_hz: float, used: float) -> Direct
     square = np.array([whole[a:b].T @ whole[a:b] / max(b - a, 1) for a, b in bands])
     square += 1e-12 * np.eye(3)
     level, w, share, nats = _likeliest(square, rows)
+    even = square / level / level[:, None]
+    noise = (np.trace(even, axis1=1, axis2=2) - np.einsum("i,bij,j->b", w, even, w)) / 2.0
+    source = share * noise * float(np.sum((level * w) ** 2))
     nats -= _across_field(whole, along, bands, rows)
     edges_hz = edges.astype(float) * rate_hz / (2.0 * count)
     nats += float(np.log(priors.COURSE) - np.log(priors.DIRECTIONS))
-    return Directed(level, w, share, edges_hz, nats)
+    return Directed(level, w, share, source, edges_hz, nats)
 
 
 def _likeliest(square: Array, rows: Array) -> tuple[Array, Array, Array, float]:

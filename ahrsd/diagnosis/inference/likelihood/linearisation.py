@@ -144,11 +144,21 @@ class Linearised:
 
     def as_loud(self, rows: Array) -> Array:
         """Rows by frequency (3 M, p) in axes along which the noise is alike."""
+        return rows if self.whitening is None else self._turned(rows, self.whitening)
+
+    def as_read(self, rows: Array) -> Array:
+        """The inverse of that."""
         if self.whitening is None:
             return rows
-        out = rows.reshape(-1, 3, rows.shape[1])
-        for T, a, b in zip(self.whitening, self.edges[:-1], self.edges[1:], strict=True):
-            out[a:b] = np.einsum("ij,njp->nip", T.astype(rows.dtype), out[a:b])
+        return self._turned(rows, np.asarray(np.linalg.inv(self.whitening)))
+
+    def _turned(self, rows: Array, by: Array) -> Array:
+        """Rows by frequency (3 M, p), the three of each multiplied by its band's matrix."""
+        out = rows.reshape(-1, 3, rows.shape[1]).copy()
+        for matrix, (a, b) in zip(
+            by.astype(rows.dtype), itertools.pairwise(self.edges), strict=True
+        ):
+            out[a:b] = np.einsum("ij,njp->nip", matrix, out[a:b])
         return out.reshape(rows.shape)
 
     def _together(self) -> int:
@@ -490,10 +500,9 @@ def along_one_direction(made: Linearised, keys: Sequence[str], at: At) -> Direct
     left = made.left_by(keys, at) / point.loud.amplitude[:, None]
     left = np.where(point.filtered.used[:, None], left, 0.0)
     if made.whitening is not None:
-        rows = dct(left, n=int(made.edges[-1]), axis=0, norm="ortho")
-        for T, a, b in zip(made.whitening, made.edges[:-1], made.edges[1:], strict=True):
-            rows[a:b] = np.linalg.solve(T, rows[a:b].T).T
-        left = np.asarray(idct(rows, axis=0, norm="ortho")[: len(left)])
+        count = int(made.edges[-1])
+        rows = made.as_read(dct(left, n=count, axis=0, norm="ortho").reshape(-1, 1))
+        left = np.asarray(idct(rows.reshape(-1, 3), axis=0, norm="ortho")[: len(left)])
     used = float(np.mean(point.filtered.used))
     return directed(left, made.context.field_b, point.problem.rate_hz, used)
 
