@@ -126,7 +126,8 @@ def test_what_is_told_of_the_current_on_the_outer_compass_is_small() -> None:
 def test_a_magnet_is_put_on_and_taken_off() -> None:
     found = diagnosed("broad/36_disturbed_attached_magnet_5cm.csv.gz")
     (there,) = named(found, "hard_iron_step")
-    assert there.where.intervals_s[0] == pytest.approx((36.8, 98.7), abs=2.0)
+    # the hand takes two seconds, whose readings are left out: when it begins is known to those
+    assert there.where.intervals_s[0] == pytest.approx((36.8, 98.7), abs=2.5)
     assert np.linalg.norm(values(there)) == pytest.approx(MAGNET_GAUSS, rel=0.1)
     assert there.where.frame == "sensor"
     assert there.heldout.nll_gain_per_sample > there.heldout.placebo_gain
