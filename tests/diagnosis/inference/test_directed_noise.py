@@ -123,3 +123,15 @@ def test_a_quick_current_that_nobody_logged_is_unknown_along_its_direction():
     assert low < 0.9
     assert high > 2.0
     assert left.size == pytest.approx(np.sqrt(2.0) * 4e-4, rel=0.3)
+
+
+@pytest.mark.slow
+def test_a_source_that_is_louder_for_a_while_is_no_louder_noise():
+    track = track_of(experiment("wam", seed=14, samples=4000, sigma_mag=5e-4))
+    rng = np.random.default_rng(8)
+    louder = np.where(track.time_s > 90.0, 2.0, 0.8)
+    added = 4e-4 * louder[:, None] * _coloured(rng, (len(track), 1), 0.8, 8.0) * AXIS
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    assert found.findings == ()
+    assert found.unexplained.detected
+    assert abs(np.array(found.unexplained.where.direction) @ AXIS) > 0.95

@@ -62,10 +62,12 @@ def loud_facts(
 ) -> list[Fact]:  # fmt: skip
     """What is to be said of the noise's level.
 
-    Beside a real remainder it comes and goes, coarse numbers scatter by themselves, and where turns
-    were lost or something passed what that leaves is no noise.
+    Beside a real remainder it comes and goes, and so it does with a source of one direction; coarse
+    numbers scatter by themselves, and where turns were lost or something passed what that leaves is
+    no noise.
     """
-    if found.all_sets.is_real(found.answer.best.names) or rounding(facts):
+    real = found.all_sets.is_real(found.answer.best.names)
+    if real or found.source is not None or rounding(facts):
         return []
     short = [
         span for one in told if one.where.frame == "world" for span in one.where.intervals_s
