@@ -349,7 +349,7 @@ def come_and_gone(all_sets: Hypotheses, space: Space, names: Names) -> list[Name
         at_s = (*begins.moments_s, *ends.moments_s)
         near = {key for key in steps if _begins_near(all_sets.component(key), at_s)}
         for gone in dict.fromkeys((frozenset({first, last}), frozenset(near))):
-            out += [names - gone | {_formed(all_sets, space, one.key)} for one in found]
+            out += [names - gone | {formed(all_sets, space, one.key)} for one in found]
     return out
 
 
@@ -472,10 +472,10 @@ def sought(
         first = max(total, key=lambda one: total[one])
         if total[first] > worth:
             key, worth = first, total[first]
-    return _formed(all_sets, space, key)
+    return formed(all_sets, space, key)
 
 
-def _formed(all_sets: Hypotheses, space: Space, key: str) -> str:
+def formed(all_sets: Hypotheses, space: Space, key: str) -> str:
     """A candidate, known to the sets with what it leaves of its form."""
     form = space.form(all_sets.component(key))
     if form is not None and key not in all_sets.forms:
