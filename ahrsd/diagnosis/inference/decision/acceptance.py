@@ -33,6 +33,7 @@ from ahrsd.diagnosis.inference.search.model_search import (
     Hypotheses,
     Hypothesis,
     Space,
+    at_its_moments,
     come_and_gone,
 )
 from ahrsd.diagnosis.where_and_when.locate import single_source
@@ -46,6 +47,9 @@ def accepted(
     best = _with_heading(all_sets, space, best)
     best = _come_and_gone(all_sets, space, best)
     best, rivals = _borne_out(all_sets, space, best)
+    likelier = _of_likeliest_kind(all_sets, space, best)
+    if likelier is not best:
+        best, rivals = _borne_out(all_sets, space, likelier)
     best, rivals = _beside_others(all_sets, space, best, rivals)
     best, rivals = _held_to_form(all_sets, space, best, rivals)
     return _of_one_source(all_sets, space, best, rivals)
@@ -95,6 +99,25 @@ def _come_and_gone(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypo
         if likeliest is best:
             return best
         best = likeliest
+
+
+def _of_likeliest_kind(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+    """The set with each step that has a form of the kind that is likeliest at its moments.
+
+    Beside an ordinary remainder nothing is exchanged: its laws are not exact.
+    """
+    if all_sets.is_real(best.names):
+        return best
+    while True:
+        tried = [
+            all_sets.with_(best.names - {key}, other)
+            for key in library_members(all_sets, best)
+            for other in at_its_moments(all_sets, space, key)
+        ]
+        likelier = all_sets.likeliest(best, tried)
+        if likelier is best:
+            return best
+        best = likelier
 
 
 def _is_form(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:

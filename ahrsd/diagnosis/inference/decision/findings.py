@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +20,12 @@ from ahrsd.diagnosis.inference.components.ordinary_remainder import GYRO_MATRIX,
 from ahrsd.diagnosis.inference.decision.members import added_by, coefficients, cost_if_left_out
 from ahrsd.diagnosis.inference.decision.which_delay import delay_unit, which_delay
 from ahrsd.diagnosis.inference.likelihood.candidates import beside
-from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space, formed
+from ahrsd.diagnosis.inference.search.model_search import (
+    Hypotheses,
+    Hypothesis,
+    Space,
+    at_its_moments,
+)
 from ahrsd.diagnosis.inference.search.near_settings import changed, opened
 from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.where_and_when.address import where_of
@@ -112,7 +117,7 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
     mine = own.effect or key
     by_name[mine] = max(by_name[mine], worth[key] + own.prior)
     rival = max((k for k in worth if k != key), key=lambda k: worth[k], default=key)
-    closer = _with_form(all_sets, space, key, worth)
+    closer = at_its_moments(all_sets, space, key)
     if own.row is None or by_name[all_sets.component(rival).effect or rival] > by_name[mine]:
         closer = [*closer, rival]
     if closer:  # the scan knows sizes, noise and forms but roughly: each as a set of its own
@@ -133,16 +138,6 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
     total = np.logaddexp.reduce(list(by_name.values()))
     shares = {name: float(np.exp(nats - total)) for name, nats in by_name.items()}
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
-
-
-def _with_form(all_sets: Hypotheses, space: Space, key: str, others: Iterable[str]) -> list[str]:
-    """Of what has a form of its own: other names at its very moments, each with its form."""
-    own = all_sets.component(key)
-    if key not in all_sets.forms or not own.moments_s:
-        return []
-    alike = [k for k in others if all_sets.component(k).moments_s == own.moments_s]
-    alike = [k for k in alike if all_sets.component(k).effect != own.effect]
-    return [formed(all_sets, space, k) for k in alike if all_sets.component(k).jumps]
 
 
 def _where(all_sets: Hypotheses, best: Hypothesis, key: str, frame: str) -> Where:

@@ -29,6 +29,8 @@ FINER, SHARPEST = 3, 7
 REMEMBERED = 3
 #: moments at which steps are proposed, and how far apart, of the recording's length
 MOMENTS, APART = 4, 0.02
+#: s by which moments are rounded
+SAME_MOMENT_S = 2e-3
 
 Names = frozenset[str]
 
@@ -285,6 +287,26 @@ def exchanged(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
     return best
 
 
+def at_its_moments(all_sets: Hypotheses, space: Space, key: str) -> list[str]:
+    """Steps of other kinds at the very moments of one that has a form, each with its own.
+
+    A scan asks without forms: by it the two may be hundreds of nats apart that differ by one.
+    """
+    own = all_sets.component(key)
+    if key not in all_sets.forms or not own.jumps or not own.moments_s:
+        return []
+    if len(own.moments_s) == 1:
+        _put_among(all_sets, space, space.steps_at(own.moments_s[0]))
+    listed = [all_sets.component(k) for keys in space.effects.values() for k in keys]
+    others = [one for one in listed if one.jumps and one.effect != own.effect]
+    others = [one for one in others if len(one.moments_s) == len(own.moments_s)]
+    return [
+        formed(all_sets, space, one.key)
+        for one in others
+        if np.allclose(one.moments_s, own.moments_s, rtol=0.0, atol=SAME_MOMENT_S)
+    ]
+
+
 def sharpened(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
     """The set with onsets and scales of its names sought on where each is likelier.
 
@@ -362,10 +384,15 @@ def _propose_steps(all_sets: Hypotheses, space: Space, here: Hypothesis) -> None
     """Put steps at the moments at which a set is most surprised among the candidates."""
     made = all_sets.made
     for time_s in surprises(made.left_by(here.keys, here.at), made.context.track.time_s):
-        new = [one for one in space.steps_at(time_s) if one.key not in made.seen]
-        made.add(new)
-        for one in new:
-            space.effects.setdefault(one.effect or one.key, []).append(one.key)
+        _put_among(all_sets, space, space.steps_at(time_s))
+
+
+def _put_among(all_sets: Hypotheses, space: Space, found: Sequence[Component]) -> None:
+    """Put components among the candidates, but for those that are known."""
+    new = [one for one in found if one.key not in all_sets.made.seen]
+    all_sets.made.add(new)
+    for one in new:
+        space.effects.setdefault(one.effect or one.key, []).append(one.key)
 
 
 def surprises(residual: Array, time_s: Array) -> list[float]:
