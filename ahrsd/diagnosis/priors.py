@@ -143,8 +143,8 @@ FREEDOMS = (3.0, 5.0, 8.0, 15.0)
 LEVEL_S, LEVELS = 4.0, (0.02, 50.0)
 #: octaves of the noise's spectrum, at most
 BANDS = 7
-#: deviation of the log power of a magnetometer's axis from the mean of the three;  source: .1 to .5
-#: on eleven untouched recordings
+#: deviation of the log power of a magnetometer's axis from the mean of the three;  source: up to .5
+#: on nine of eleven untouched recordings, .7 and 1.2 on the others
 AXES_DIFFER = 0.4
 #: power of a source of one direction, relative to the noise's in an octave: where there is one
 DIRECTED_SHARES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
