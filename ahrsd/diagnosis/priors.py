@@ -101,6 +101,8 @@ MOST_ON, MOST_WAVES = 0.3, 100
 #: nats by which a residual is unlike along its three axes: twice that is one in 1e6 by chance, of
 #: five degrees of freedom;  and directions that a source of one may have
 UNALIKE, DIRECTIONS = 18.0, 100.0
+#: s by which two moments may differ that are one, rounded
+SAME_MOMENT_S = 2e-3
 #: how often what switches is outside of the vehicle;  three nats
 SWITCHES_OUTSIDE = 0.05
 #: square of a jump of the mean, in its deviations, of three axes: one in 1e6 by chance
@@ -144,8 +146,10 @@ LEVEL_S, LEVELS = 4.0, (0.02, 50.0)
 #: octaves of the noise's spectrum, at most
 BANDS = 7
 #: deviation of the log power of a magnetometer's axis from the mean of the three;  source: up to .5
-#: on nine of eleven untouched recordings, .7 and 1.2 on the others
+#: on eight of eleven untouched recordings, .6, .7 and 1.2 on the others
 AXES_DIFFER = 0.4
+#: cosines that an octave has at least for its covariance to be asked
+DIRECTED_COSINES = 12
 #: power of a source of one direction, relative to the noise's in an octave: where there is one
 DIRECTED_SHARES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 #: nats of such a source beside what real recordings leave, from which it is unknown;  source:

@@ -11,6 +11,7 @@ import pytest
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Track
 from ahrsd.recording.table import read_table
+from ahrsd.samples import Array
 from ahrsd.simulation import Experiment, ScenarioSettings, simulate
 
 RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "recordings"
@@ -77,3 +78,18 @@ def recorded(name: str) -> Track:
     return Track(
         rows.time_s, dt_s, rows.raw_b_gauss, rows.gyro_b_rad_s, accel, dict(rows.covariates), runs
     )
+
+
+def coloured(
+    rng: np.random.Generator,
+    shape: tuple[int, ...],
+    band_hz: tuple[float, float],
+    rate_hz: float = 25.0,
+) -> Array:
+    """Noise along the first axis between two frequencies, of unit deviation and no mean."""
+    spectrum = np.fft.rfft(rng.normal(size=shape), axis=0)
+    hertz = np.fft.rfftfreq(shape[0], 1 / rate_hz)
+    spectrum[(hertz < band_hz[0]) | (hertz > band_hz[1])] = 0.0
+    spectrum[0] = 0.0
+    values = np.fft.irfft(spectrum, shape[0], axis=0)
+    return np.asarray(values / values.std(axis=0))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tracks import experiment, track_of
+from tracks import coloured, experiment, track_of
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
 from ahrsd.diagnosis.inference.diagnose import diagnose
@@ -18,12 +18,7 @@ ROWS = 3500
 
 
 def _slow(rng: np.random.Generator, highest_hz: float) -> Array:
-    """(ROWS,) of unit deviation at 25 Hz."""
-    spectrum = np.fft.rfft(rng.normal(size=ROWS))
-    spectrum[np.fft.rfftfreq(ROWS, 1 / 25.0) > highest_hz] = 0.0
-    spectrum[0] = 0.0
-    values = np.fft.irfft(spectrum, ROWS)
-    return np.asarray(values / values.std())
+    return coloured(rng, (ROWS,), (0.0, highest_hz))
 
 
 def _found(added: Array, current: Array, speed: Array) -> Diagnosis:

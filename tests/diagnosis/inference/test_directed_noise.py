@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tracks import experiment, track_of
+from tracks import coloured, experiment, track_of
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.inference.diagnose import begun, diagnose
@@ -18,15 +18,6 @@ AXIS = np.array([0.6, -0.7, 0.39]) / np.linalg.norm([0.6, -0.7, 0.39])
 RATE_HZ = 25.0
 
 
-def _coloured(rng: np.random.Generator, shape: tuple[int, ...], low: float, high: float):
-    """Noise of unit deviation between two frequencies."""
-    spectrum = np.fft.rfft(rng.normal(size=shape), axis=0)
-    hertz = np.fft.rfftfreq(shape[0], 1 / RATE_HZ)
-    spectrum[(hertz < low) | (hertz > high)] = 0.0
-    values = np.fft.irfft(spectrum, shape[0], axis=0)
-    return values / values.std(axis=0)
-
-
 def _field(rows: int) -> np.ndarray:
     return experiment("wam", seed=15, samples=rows).field_b
 
@@ -35,7 +26,7 @@ def test_noise_of_any_colour_that_is_independent_by_axis_has_no_direction():
     """Red, with axes of different levels: 12 draws, none near to what is asked of an unknown."""
     rng, most, field_b = np.random.default_rng(3), -np.inf, _field(3000)
     for _ in range(12):
-        left = rng.normal(size=(3000, 3)) + _coloured(rng, (3000, 3), 0.0, 1.0)
+        left = rng.normal(size=(3000, 3)) + coloured(rng, (3000, 3), (0.0, 1.0))
         left *= np.exp(rng.normal(size=3) * priors.AXES_DIFFER / 2)
         most = max(most, directed(left, field_b, RATE_HZ, 1.0).nats)
     assert most < priors.UNKNOWN_ODDS / 2
@@ -45,7 +36,7 @@ def test_noise_of_any_colour_that_is_independent_by_axis_has_no_direction():
 def test_a_source_has_its_direction_its_octaves_and_its_power(band_hz: tuple[float, float]):
     rng, level = np.random.default_rng(4), np.array([1.2, 1.0, 1 / 1.2])
     left = rng.normal(size=(6000, 3)) * level
-    left += 0.5 * _coloured(rng, (6000, 1), *band_hz) * AXIS
+    left += 0.5 * coloured(rng, (6000, 1), band_hz) * AXIS
     found = directed(left, _field(6000), RATE_HZ, 1.0)
     assert found.nats > 50.0
     assert abs(found.direction @ AXIS) > 0.98
@@ -61,7 +52,7 @@ def test_a_source_has_its_direction_its_octaves_and_its_power(band_hz: tuple[flo
 def test_the_power_is_the_same_where_the_residual_was_divided_by_all_that_is_in_it():
     """As a noise of a colour takes the source for its own, where names that are surer stand."""
     rng, band_hz = np.random.default_rng(7), (2.0, 6.0)
-    left = rng.normal(size=(6000, 3)) + 2.0 * _coloured(rng, (6000, 1), *band_hz) * AXIS
+    left = rng.normal(size=(6000, 3)) + 2.0 * coloured(rng, (6000, 1), band_hz) * AXIS
     whole = float(np.mean(left**2))
     found = directed(left / np.sqrt(whole), _field(6000), RATE_HZ, 1.0)
     middle_hz = (found.edges_hz[1:] + found.edges_hz[:-1]) / 2
@@ -74,7 +65,7 @@ def test_what_a_loud_gyro_leaves_across_the_field_is_no_source():
     rng, field_b = np.random.default_rng(5), _field(4000)
     field_b = np.broadcast_to(field_b[0], field_b.shape)  # a vehicle that does not turn
     unit = field_b / np.linalg.norm(field_b, axis=1, keepdims=True)
-    gyro = 2.0 * _coloured(rng, (4000, 3), 0.0, 2.0)
+    gyro = 2.0 * coloured(rng, (4000, 3), (0.0, 2.0))
     left = rng.normal(size=(4000, 3)) + gyro - np.sum(gyro * unit, axis=1, keepdims=True) * unit
     assert directed(left, field_b, RATE_HZ, 1.0).nats < priors.UNKNOWN_ODDS
 
@@ -112,7 +103,7 @@ def test_a_quick_current_that_nobody_logged_is_unknown_along_its_direction():
     """Noise of a colour swallowed it, and nothing was told."""
     track = track_of(experiment("wam", seed=14, samples=4000, sigma_mag=5e-4))
     rng = np.random.default_rng(8)
-    added = 4e-4 * _coloured(rng, (len(track), 1), 0.8, 2.5) * AXIS
+    added = 4e-4 * coloured(rng, (len(track), 1), (0.8, 2.5)) * AXIS
     found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
     assert found.findings == ()
     left = found.unexplained
@@ -130,7 +121,7 @@ def test_a_source_that_is_louder_for_a_while_is_no_louder_noise():
     track = track_of(experiment("wam", seed=14, samples=4000, sigma_mag=5e-4))
     rng = np.random.default_rng(8)
     louder = np.where(track.time_s > 90.0, 2.0, 0.8)
-    added = 4e-4 * louder[:, None] * _coloured(rng, (len(track), 1), 0.8, 8.0) * AXIS
+    added = 4e-4 * louder[:, None] * coloured(rng, (len(track), 1), (0.8, 8.0)) * AXIS
     found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
     assert found.findings == ()
     assert found.unexplained.detected

@@ -10,6 +10,7 @@ import numpy as np
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import (
     Assumed,
+    Contribution,
     Finding,
     OnPriors,
     Unexplained,
@@ -24,6 +25,7 @@ from ahrsd.diagnosis.inference.components.effect_components import LAG, LAG_FORM
 from ahrsd.diagnosis.inference.components.gaussian_process import CourseLaw
 from ahrsd.diagnosis.inference.decision.acceptance import asked_odds
 from ahrsd.diagnosis.inference.decision.decision import Answer
+from ahrsd.diagnosis.inference.decision.unexplained import along_its_direction
 from ahrsd.diagnosis.inference.likelihood import noise_model
 from ahrsd.diagnosis.inference.likelihood.evidence import evaluated
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
@@ -66,6 +68,17 @@ def what_is_left(answer: Answer, held: HeldOut) -> Unexplained:
     all_sets, best = held.all_sets, answer.best
     asked = asked_odds(all_sets, best, keys[0])
     return replace(left, priors=on_priors(all_sets, best, answer.rivals[keys[0]], asked))
+
+
+def left_at_both_rates(
+    found: Searched, quick: Answer, held: tuple[HeldOut, HeldOut], named: Sequence[Contribution]
+) -> Unexplained:
+    """What no name explains: in time, along one direction, or at the recorded rate."""
+    left = what_is_left(found.answer, held[0])
+    if not left.detected:
+        added = [one.added for one in named if one.unit == "gauss"]
+        left = along_its_direction(found.all_sets, found.answer.best, found.source, added)
+    return left if left.detected else what_is_left(quick, held[1])
 
 
 def validation(

@@ -14,11 +14,9 @@ import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import (
     Check,
-    Contribution,
     Diagnosis,
     Finding,
     RegimeMap,
-    Unexplained,
 )
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, baseline
 from ahrsd.diagnosis.data_quality.facts import Fact, of_fact, rounding
@@ -30,7 +28,6 @@ from ahrsd.diagnosis.inference.answer.left_sizes import told_sizes, with_channel
 from ahrsd.diagnosis.inference.answer.repaired_noise import loud_facts, repaired_noise
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.decision.members import nats_of_remainder
-from ahrsd.diagnosis.inference.decision.unexplained import along_its_direction
 from ahrsd.diagnosis.inference.likelihood.logged_columns import as_recorded
 from ahrsd.diagnosis.inference.recorded_rate import Quick
 from ahrsd.diagnosis.inference.search_rounds import Searched
@@ -66,7 +63,8 @@ def whole_answer(
         *pictures.contributions(all_sets, answer),
         *pictures.contributions(fast.all_sets, fast.answer),
     ]
-    left = with_channels(_left(found, fast, (held, quickly), contributions), found, courses)
+    left = support.left_at_both_rates(found, fast.answer, (held, quickly), contributions)
+    left = with_channels(left, found, courses)
     remainder_nats = nats_of_remainder(all_sets, answer.best)
     left = told_sizes(all_sets, answer, left, remainder_nats, simulated=simulated)
     left = max(left, fast.hum, key=lambda one: (one.detected, one.evidence_nats))
@@ -97,17 +95,6 @@ def whole_answer(
         validation=support.validation((answer, held), (fast.answer, quickly), told, left),
         regime_map=maps,
     )
-
-
-def _left(
-    found: Searched, fast: Quick, held: tuple[HeldOut, HeldOut], named: Sequence[Contribution]
-) -> Unexplained:
-    """What no name explains: in time, along one direction, or at the recorded rate."""
-    left = support.what_is_left(found.answer, held[0])
-    if not left.detected:
-        added = [one.added for one in named if one.unit == "gauss"]
-        left = along_its_direction(found.all_sets, found.answer.best, found.source, added)
-    return left if left.detected else support.what_is_left(fast.answer, held[1])
 
 
 def _as_recorded(told: Sequence[Told], found: Searched) -> tuple[Told, ...]:

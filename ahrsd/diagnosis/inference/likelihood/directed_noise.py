@@ -27,9 +27,6 @@ from ahrsd.diagnosis.inference.likelihood.noise_model import octaves
 from ahrsd.diagnosis.model import directions
 from ahrsd.samples import Array
 
-#: cosines that an octave has at least for its covariance to be asked
-_FEWEST = 12
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Directed:
@@ -82,7 +79,7 @@ def directed(left: Array, field_b: Array, rate_hz: float, used: float) -> Direct
     with_field = np.sum(left * unit, axis=1, keepdims=True) * unit
     whole, along = (np.asarray(dct(one, axis=0, norm="ortho")) for one in (left, with_field))
     rows = np.array([max(b - a, 1) * used for a, b in bands])
-    rows[rows < _FEWEST] = 0.0
+    rows[rows < priors.DIRECTED_COSINES] = 0.0
     square = np.array([whole[a:b].T @ whole[a:b] / max(b - a, 1) for a, b in bands])
     square += 1e-12 * np.eye(3)
     level, w, share, nats = _likeliest(square, rows)

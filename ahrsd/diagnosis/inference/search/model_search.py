@@ -29,8 +29,6 @@ FINER, SHARPEST = 3, 7
 REMEMBERED = 3
 #: moments at which steps are proposed, and how far apart, of the recording's length
 MOMENTS, APART = 4, 0.02
-#: s by which moments are rounded
-SAME_MOMENT_S = 2e-3
 
 Names = frozenset[str]
 
@@ -303,7 +301,7 @@ def at_its_moments(all_sets: Hypotheses, space: Space, key: str) -> list[str]:
     return [
         formed(all_sets, space, one.key)
         for one in others
-        if np.allclose(one.moments_s, own.moments_s, rtol=0.0, atol=SAME_MOMENT_S)
+        if np.allclose(one.moments_s, own.moments_s, rtol=0.0, atol=priors.SAME_MOMENT_S)
     ]
 
 
