@@ -27,6 +27,9 @@ from ahrsd.diagnosis.inference.likelihood.noise_model import octaves
 from ahrsd.diagnosis.model import directions
 from ahrsd.samples import Array
 
+#: directions to begin with, of each axis and of each octave's loudest, the likeliest of them
+_CLIMBS = 4
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Directed:
@@ -95,11 +98,13 @@ def directed(left: Array, field_b: Array, rate_hz: float, used: float) -> Direct
 def _likeliest(square: Array, rows: Array) -> tuple[Array, Array, Array, float]:
     """Levels, direction, shares and nats, of covariances (B, 3, 3) of so many rows (B,)."""
     level, none = _climbed(lambda x: _nats(square, rows, x, None)[0], np.zeros(2))
+
+    def worth(x: Array) -> float:
+        return _nats(square, rows, x[:2], x[2:])[0]
+
     loudest = [np.linalg.eigh(one)[1][:, -1] for one, n in zip(square, rows, strict=True) if n]
-    found = [
-        _climbed(lambda x: _nats(square, rows, x[:2], x[2:])[0], np.concatenate([level, start]))
-        for start in np.unique(np.round([*np.eye(3), *loudest], 3), axis=0)
-    ]
+    starts = [np.concatenate([level, one]) for one in (*np.eye(3), *loudest)]
+    found = [_climbed(worth, one) for one in sorted(starts, key=worth)[-_CLIMBS:]]
     best, nats = max(found, key=lambda one: one[1])
     _, share = _nats(square, rows, best[:2], best[2:])
     return _level(best[:2]), best[2:] / np.linalg.norm(best[2:]), share, nats - none
@@ -111,7 +116,7 @@ def _climbed(worth: Callable[[Array], float], start: Array) -> tuple[Array, floa
     def cost(x: Array) -> float:
         return -worth(x)
 
-    found = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-2})
+    found = minimize(cost, start, method="L-BFGS-B")
     return np.asarray(found.x), -float(found.fun)
 
 
