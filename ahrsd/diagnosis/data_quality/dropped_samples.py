@@ -68,28 +68,36 @@ def missing_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
     """Where the filter jumps by whole steps.  rate_b_rad_s (N, 3) without bias.
 
     Over few samples first, which tells the quick turns, then over more, which tells slower ones;
-    and where too few stand out alone, all together.
+    and where all jumps together say that less than half of them stand out alone, all together.
     """
-    track = done.track
-    for samples, least in priors.LOST_TURN_AVERAGED:
-        if len(track) < 10 * samples:
-            break
-        found = _jumps(done, rate_b_rad_s, samples, least)
-        enough = (
-            len(found.forward) >= priors.LOST_TURNS_FEWEST + 3 * len(found.backward) + found.others
-        )
-        jumps = found.forward
-        sure = max(priors.LOST_TURNS_NATS, priors.LOST_TURN_EACH_NATS * len(jumps))
-        if enough and whole_nats(found.steps[jumps], found.scatter[jumps]) > sure:
-            lost = np.zeros(len(track), dtype=np.int64)
-            lost[jumps] = np.round(found.steps[jumps])
-            setting = {LONG: found.long} if found.long else {}
-            return [_fact(track, recovered(done, rate_b_rad_s, lost), setting)]
-    if expected := some_lost(done, rate_b_rad_s):
-        turns = recovered(done, rate_b_rad_s, np.zeros(len(track), dtype=np.int64), expected)
+    track, none = done.track, np.zeros(len(done.track), dtype=np.int64)
+    found = _standing_out(done, rate_b_rad_s)
+    expected = some_lost(done, rate_b_rad_s)
+    if found is not None and 2 * len(found.forward) >= expected:
+        lost = none.copy()
+        lost[found.forward] = np.round(found.steps[found.forward])
+        setting = {LONG: found.long} if found.long else {}
+        return [_fact(track, recovered(done, rate_b_rad_s, lost), setting)]
+    if expected:
+        turns = recovered(done, rate_b_rad_s, none, expected)
         if np.count_nonzero(turns.lost) >= priors.LOST_TURNS_FEWEST:
             return [_fact(track, turns, {UNSEEN: expected})]
     return []
+
+
+def _standing_out(done: Filtered, rate_b_rad_s: Array) -> _Jumps | None:
+    """Jumps by whole steps that are no noise, over few samples or more; None where none are."""
+    for samples, least in priors.LOST_TURN_AVERAGED:
+        if len(done.track) < 10 * samples:
+            break
+        found = _jumps(done, rate_b_rad_s, samples, least)
+        jumps = found.forward
+        fewest = priors.LOST_TURNS_FEWEST + 3 * len(found.backward) + found.others
+        sure = max(priors.LOST_TURNS_NATS, priors.LOST_TURN_EACH_NATS * len(jumps))
+        nats = whole_nats(found.steps[jumps], found.scatter[jumps])
+        if len(jumps) >= fewest and nats > sure:
+            return found
+    return None
 
 
 def differ(lost: Sequence[Fact], beside: Sequence[Fact]) -> bool:

@@ -217,3 +217,22 @@ def test_missing_samples_are_seen_where_whole_seconds_are_missing_too() -> None:
     fact = only(tuple(facts))
     assert fact.effect == "dropped_samples"
     assert 4 <= fact.setting["long"] <= 10
+
+
+@pytest.mark.parametrize("motion", ["mam", "wam"])
+def test_three_lost_samples_are_told_where_they_are(motion: str) -> None:
+    """What is not told of them is a step of the field: a turn that is not in the log."""
+    made = experiment(motion, samples=9000, seed=3, sigma_mag=3e-4)
+    track, model = track_of(made), replace(true_model(made), sigma_mag_gauss=3e-4)
+    quick = np.argsort(-np.linalg.norm(track.gyro_b_rad_s, axis=1))
+    rows: list[int] = []
+    for row in quick.tolist():
+        if 100 < row < 8900 and all(abs(row - other) > 500 for other in rows) and len(rows) < 3:
+            rows.append(row)
+    cut = without_rows(track, np.delete(np.arange(len(track)), rows), restamp=True)
+    slow = replace(model, sigma_gyro_rad_s=GYRO_RAD_S)
+    facts = missing_turns(run_filter(cut, slow), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
+    fact = only(tuple(facts))
+    told_s = [end for _, end in fact.where.intervals_s]
+    at_s = [cut.time_s[row - k] for k, row in enumerate(sorted(rows))]
+    assert told_s == pytest.approx(at_s, abs=3 * float(np.nanmedian(cut.dt_s)))

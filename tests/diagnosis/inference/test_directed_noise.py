@@ -126,3 +126,16 @@ def test_a_source_that_is_louder_for_a_while_is_no_louder_noise():
     assert found.findings == ()
     assert found.unexplained.detected
     assert abs(np.array(found.unexplained.where.direction) @ AXIS) > 0.95
+
+
+def test_iron_on_a_joint_that_nobody_logged_is_unknown_on_the_sensor():
+    track = track_of(experiment("wam", seed=14, samples=3500, sigma_mag=5e-4))
+    angle = coloured(np.random.default_rng(5), (len(track), 1), (0.1, 0.4))  # to and fro in seconds
+    added = 7e-4 * angle * AXIS
+    found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
+    assert found.findings == ()
+    left = found.unexplained
+    assert left.detected
+    assert left.where.frame == "sensor"
+    assert abs(np.array(left.where.direction) @ AXIS) > 0.95
+    assert left.evidence_nats > 30.0

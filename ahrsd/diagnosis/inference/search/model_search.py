@@ -220,8 +220,8 @@ class Space:
     finer: neighbours of a setting;  remembered: those in what is from before the recording
     form: what a component leaves of its form;  steps_at: of a time
     while_there: what comes with one step and goes with another
-    sources: that switch or have one direction, of which one at most is added, and none beside a
-             remainder: how large they are in rooms is not measured
+    sources: that switch, of which one at most is added, and none beside a remainder: how large
+             they are in rooms is not measured
     """
 
     effects: dict[str, list[str]]

@@ -29,7 +29,6 @@ from ahrsd.diagnosis.inference.search.model_search import (
     Space,
     searched,
 )
-from ahrsd.diagnosis.inference.search.one_direction import one_direction
 from ahrsd.diagnosis.inference.search.remembered import remembered
 from ahrsd.diagnosis.inference.search.switching_sources import switching
 
@@ -53,21 +52,18 @@ def best_at(
         here = known | real if was_real else known
         starts = [here, known, here | {COURSES[0]}, here | set(COURSES[:2]) - real]
     if not (known and was_real):
-        bare = all_sets.judge(())
-        clean = bare.score > all_sets.judge(real, bare).score
-        _offered(all_sets, space, bare, clean=clean)
+        _offered(all_sets, space, all_sets.judge(()))
     found = searched(all_sets, space, starts)
     if not all_sets.is_real(found[0].names):
-        new = [found[0].names | {key} for key in _offered(all_sets, space, found[0], clean=True)]
+        new = [found[0].names | {key} for key in _offered(all_sets, space, found[0])]
         if new:
             found = searched(all_sets, space, [found[0].names, *new])
     return all_sets, space, found[0]
 
 
-def _offered(all_sets: Hypotheses, space: Space, here: Hypothesis, *, clean: bool) -> list[str]:
-    """Keys of sources as a set leaves them, put among what may be in one: that switch, and, where a
-    recording is clean and leaves nothing ordinary, that have one direction."""
-    new = switching(all_sets, here) + (one_direction(all_sets, here) if clean else [])
+def _offered(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[str]:
+    """Keys of sources that switch, as a set leaves them, put among what may be in one."""
+    new = switching(all_sets, here)
     all_sets.made.add(new)
     space.sources.extend(one.key for one in new if one.key not in space.sources)
     return [one.key for one in new]
