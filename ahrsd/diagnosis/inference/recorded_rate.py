@@ -18,7 +18,7 @@ from ahrsd.diagnosis.calibration_fit.delay import without_lag
 from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.components.component import Component
-from ahrsd.diagnosis.inference.components.effect_components import component, form_of
+from ahrsd.diagnosis.inference.components.effect_components import effect_component, form_component
 from ahrsd.diagnosis.inference.decision import decision
 from ahrsd.diagnosis.inference.likelihood import noise_model, richest_model
 from ahrsd.diagnosis.inference.likelihood.linearisation import (
@@ -124,9 +124,9 @@ def _searched_in(
     for name, effect in library.items():
         settings = effect.settings(fast.context) if effect.quick else ()
         settings = tuple(one for one in settings if "covariate" in one or not real)
-        parts = [component(fast.context, effect, one, len(settings)) for one in settings]
+        parts = [effect_component(fast.context, effect, one, len(settings)) for one in settings]
         unlogged = [one for one in parts if "covariate" not in one.setting]
-        left = [(one.key, form_of(one, fast.context, library)) for one in unlogged]
+        left = [(one.key, form_component(one, fast.context, library)) for one in unlogged]
         forms |= {key: form for key, form in left if form is not None}
         fast.add(parts)
         fast.keep_lightly(parts)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.components.component import Component
-from ahrsd.diagnosis.inference.components.effect_components import LAG, PIECES
+from ahrsd.diagnosis.inference.components.effect_components import LAG, STEP_PIECES
 from ahrsd.diagnosis.inference.decision import decision, members
 from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.inference.likelihood.directed_noise import Directed
@@ -112,7 +112,7 @@ def moved_in(all_sets: Hypotheses, best: Hypothesis) -> list[tuple[float, float]
     what it leaves is louder than all else, and other names are told for it.  Of names that begin
     within a hand's time of each other, and end so or stay, all but the levels is the way.
     """
-    point, half_s = all_sets.made.point, priors.APPROACH_S / 2 / PIECES
+    point, half_s = all_sets.made.point, priors.APPROACH_S / 2 / STEP_PIECES
     track, sigma = point.filtered.track, point.filtered.model.sigma_mag_gauss
     read = np.isfinite(track.mag_b_gauss).all(axis=1)
     starting = [

@@ -11,15 +11,15 @@ from scipy.stats import multivariate_t
 
 from ahrsd.diagnosis import inference, priors
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.inference.components.component import Sized
-from ahrsd.diagnosis.inference.components.gaussian_process import CourseLaw
+from ahrsd.diagnosis.inference.components.component import ScaledLaw
+from ahrsd.diagnosis.inference.components.gaussian_process import GaussianProcessLaw
 from ahrsd.diagnosis.inference.likelihood import noise_model
 from ahrsd.estimator.locked import harmonics, squares
 
 
 @pytest.mark.parametrize("psi", [np.array([0.3, 0.5]), np.array([-1.0, 3.0])])
 def test_a_course_has_the_size_that_its_law_says(psi):
-    law = CourseLaw(np.repeat(np.arange(1.0, 41.0), 3), 1e-3)
+    law = GaussianProcessLaw(np.repeat(np.arange(1.0, 41.0), 3), 1e-3)
     variance = np.exp(law.log_variance(psi))
     t = np.linspace(0.0, 1.0, 4001)
     modes = np.cos(np.pi * t[:, None] * np.arange(1, 41))
@@ -28,7 +28,7 @@ def test_a_course_has_the_size_that_its_law_says(psi):
 
 
 def test_slopes_are_those_of_differences():
-    law = CourseLaw(np.repeat(np.arange(1.0, 21.0), 3), 1e-3, mean=0.5, spread=1.2)
+    law = GaussianProcessLaw(np.repeat(np.arange(1.0, 21.0), 3), 1e-3, mean=0.5, spread=1.2)
     psi = np.array([0.2, 1.1])
     for k in range(2):
         step = 1e-6 * np.eye(2)[k]
@@ -39,7 +39,7 @@ def test_slopes_are_those_of_differences():
 
 
 def test_an_ordinary_size_is_a_lognormal_density():
-    law = Sized(np.ones(2), np.array([-20.0]), np.array([20.0]), mean=-1.0, spread=0.7)
+    law = ScaledLaw(np.ones(2), np.array([-20.0]), np.array([20.0]), mean=-1.0, spread=0.7)
     grid = np.linspace(-10.0, 10.0, 4001)
     density = np.exp([law.log_prior(np.array([x]))[0] for x in grid])
     assert np.sum(density) * (grid[1] - grid[0]) == pytest.approx(1.0, abs=1e-6)

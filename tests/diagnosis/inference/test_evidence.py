@@ -10,8 +10,8 @@ from scipy.linalg import block_diag
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from ahrsd.diagnosis.inference.components.component import Fixed, Sized
-from ahrsd.diagnosis.inference.components.gaussian_process import CourseLaw
+from ahrsd.diagnosis.inference.components.component import FixedLaw, ScaledLaw
+from ahrsd.diagnosis.inference.components.gaussian_process import GaussianProcessLaw
 from ahrsd.diagnosis.inference.likelihood import noise_model
 from ahrsd.diagnosis.inference.likelihood.evidence import Products, evaluated, maximised, reached
 
@@ -43,10 +43,10 @@ def products(B: np.ndarray, y: np.ndarray) -> Products:
 def laws() -> list:
     even = (np.array([np.log(0.01)]), np.array([np.log(10.0)]))
     return [
-        Fixed(np.full(3, 4.0)),
-        Sized(np.array([0.5, 1.0, 2.0]), *even),
-        Sized(np.ones(4), *even, mean=np.log(0.3), spread=0.8),
-        CourseLaw(np.repeat(np.arange(1, 6), 2).astype(float), 1.0),
+        FixedLaw(np.full(3, 4.0)),
+        ScaledLaw(np.array([0.5, 1.0, 2.0]), *even),
+        ScaledLaw(np.ones(4), *even, mean=np.log(0.3), spread=0.8),
+        GaussianProcessLaw(np.repeat(np.arange(1, 6), 2).astype(float), 1.0),
     ]
 
 
@@ -113,7 +113,7 @@ def test_adding_and_dropping_agree_on_200_hypotheses():
         def of(chosen, start=None, B=B, y=y):
             columns = np.concatenate([np.arange(width) + width * k for k in chosen])
             even = (np.array([np.log(0.01)]), np.array([np.log(10.0)]))
-            own = [Sized(np.ones(width), *even) for _ in chosen]
+            own = [ScaledLaw(np.ones(width), *even) for _ in chosen]
             begin = start or (np.full(4, 1.0), np.zeros(len(chosen)))
             return maximised(products(B[:, columns], y), own, begin)
 
@@ -133,7 +133,7 @@ def test_what_is_not_there_is_small_and_what_is_there_is_found():
     even = (np.array([np.log(0.01)]), np.array([np.log(10.0)]))
     found = maximised(
         products(B, y),
-        [Sized(np.ones(8), *even), Sized(np.ones(8), *even)],
+        [ScaledLaw(np.ones(8), *even), ScaledLaw(np.ones(8), *even)],
         (np.zeros(4), np.zeros(2)),
     )
     assert np.exp(found.psi[0]) == pytest.approx(2.0, rel=0.5)
@@ -233,7 +233,7 @@ def test_a_climb_goes_on_where_size_and_corner_are_nearly_one(size: float) -> No
         np.array([rows]),
         STEP,
     )
-    law = CourseLaw(np.arange(1, count + 1).astype(float), 1.0)
+    law = GaussianProcessLaw(np.arange(1, count + 1).astype(float), 1.0)
     starts = [np.array([0.0, np.log(corner)]) for corner in (4.0, 36.0)]
     low, high = (maximised(said, [law], (np.zeros(1), start)) for start in starts)
     assert low.nats == pytest.approx(high.nats, abs=0.05)

@@ -13,15 +13,18 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.inference.components.component import Component, Fixed
+from ahrsd.diagnosis.inference.components.component import Component, FixedLaw
 from ahrsd.diagnosis.inference.components.effect_components import (
     LAG,
     LAG_FORM,
-    beyond,
-    holds,
+    contains_component,
     library_components,
+    project_out,
 )
-from ahrsd.diagnosis.inference.components.ordinary_remainder import ordinary_remainder, still_spells
+from ahrsd.diagnosis.inference.components.ordinary_remainder import (
+    ordinary_remainder,
+    still_intervals,
+)
 from ahrsd.diagnosis.inference.diagnose import broken_where_unsampled
 from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.inference.likelihood.candidates import beside
@@ -87,11 +90,13 @@ def test_a_delay_that_is_long_is_found_from_none():
 def test_eddy_currents_hold_a_delay_and_no_other_effect_does(bare):
     delay = bare.base.made.seen[LAG].component
     parts = dict(library_components(bare.base.made.context, EFFECTS))
-    assert [name for name, some in parts.items() if holds(some[0], delay)] == ["eddy_current"]
-    eddy = beyond(parts["eddy_current"][0], delay)
+    assert [name for name, some in parts.items() if contains_component(some[0], delay)] == [
+        "eddy_current"
+    ]
+    eddy = project_out(parts["eddy_current"][0], delay)
     assert eddy.beside == LAG
     assert eddy.key != parts["eddy_current"][0].key
-    assert not holds(eddy, delay)
+    assert not contains_component(eddy, delay)
     shared = np.einsum("nia,ni->a", eddy.columns.mag, delay.columns.mag[:, :, 0])
     np.testing.assert_allclose(shared, 0.0, atol=1e-9)
 
@@ -99,13 +104,13 @@ def test_eddy_currents_hold_a_delay_and_no_other_effect_does(bare):
 def test_columns_hold_others_that_are_a_sum_of_them():
     rng = np.random.default_rng(1)
     X = rng.normal(size=(50, 3, 4))
-    law = Fixed(np.ones(4))
+    law = FixedLaw(np.ones(4))
     whole = Component("whole", "sensor", Columns(mag=X), law)
     part = Component("part", "sensor", Columns(mag=X @ np.array([[1.0], [2], [0], [-1]])), law)
     other = Component("other", "sensor", Columns(mag=rng.normal(size=(50, 3, 1))), law)
-    assert holds(whole, part)
-    assert not holds(whole, other)
-    assert not holds(part, whole)
+    assert contains_component(whole, part)
+    assert not contains_component(whole, other)
+    assert not contains_component(part, whole)
 
 
 def test_spells_at_rest_are_those_in_which_a_sensor_hardly_turns():
@@ -114,7 +119,7 @@ def test_spells_at_rest_are_those_in_which_a_sensor_hardly_turns():
     moving = (t >= 20.0) & (t < 60.0)
     gyro[moving, 2] = 1.0
     gyro[(t >= 80.0) & (t < 81.0), 0] = 1.0
-    found = still_spells(t, gyro)
+    found = still_intervals(t, gyro)
     expected = [(0.0, 19.7), (60.2, 79.7), (81.2, 99.9)]
     np.testing.assert_allclose(found, expected, atol=0.31)
 
@@ -123,7 +128,7 @@ def test_what_hardly_turns_in_most_of_its_time_is_never_at_rest():
     t = np.arange(0.0, 100.0, 0.1)
     gyro = np.zeros((len(t), 3))
     gyro[:100, 2] = 1.0
-    assert still_spells(t, gyro) == []
+    assert still_intervals(t, gyro) == []
 
 
 def test_a_logged_cause_is_the_same_component_at_every_point():

@@ -133,7 +133,7 @@ class HeldOut:
     def _moved(self, key: str, without: Names) -> float:
         """Nats of the best of a member's copies at other times, beside the set without it."""
         rows, one = self.rows(without), self.all_sets.component(key)
-        moved = [one.moved_columns(share) for share in priors.SHIFTS]
+        moved = [one.shifted_columns(share) for share in priors.SHIFTS]
         copies = rows.passed(moved)
         parts = _beside(self.parts(without), rows, copies)
         known = rows.X.shape[2]

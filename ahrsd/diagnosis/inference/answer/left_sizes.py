@@ -32,9 +32,9 @@ from ahrsd.diagnosis.inference.components.alternatives import (
     BY_RATE,
     BY_TILT,
     QUICK,
-    form_keys,
+    factor_keys,
 )
-from ahrsd.diagnosis.inference.components.component import Fixed, Sized
+from ahrsd.diagnosis.inference.components.component import FixedLaw, ScaledLaw
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.decision.members import (
     added_by,
@@ -149,8 +149,8 @@ def left_sizes(
 def _words(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
     """What a part is, in words."""
     one, effect = all_sets.component(key), key.split(maxsplit=1)[0]
-    factors = {factor for name in library_members(all_sets, best) for factor in form_keys(name)}
-    if key in factors or not best.names.isdisjoint(form_keys(key)):
+    factors = {factor for name in library_members(all_sets, best) for factor in factor_keys(name)}
+    if key in factors or not best.names.isdisjoint(factor_keys(key)):
         return f"what {effect} stands in for"
     if one.row is not None:
         return f"one of the steps of a source that changes ({effect})"
@@ -174,11 +174,11 @@ def _together(limits: Sequence[float]) -> float:
 def _to_limit(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     """How many times as large a part is ordinarily at most; 0 of what is not ordinary."""
     law, row = all_sets.component(key).law, all_sets.component(key).row
-    if row is not None and isinstance(law, Sized):
+    if row is not None and isinstance(law, ScaledLaw):
         value, deviation = coefficients(all_sets, best, key)
         limit = row.ordinary * law.scale + 2.0 * deviation  # beyond, it is told (`size_of`)
         return 1.0 / max(float(np.max(np.abs(value) / limit)), 1e-12)
-    if isinstance(law, Fixed):
+    if isinstance(law, FixedLaw):
         value, _ = coefficients(all_sets, best, key)
         return _WITHIN / max(float(np.sqrt(np.mean(value**2 / law.variance))), 1e-12)
     if key not in priors.ORDINARY:

@@ -20,9 +20,9 @@ from ahrsd.diagnosis.calibration_fit.gyro_at_rest import HARDLY_TURNED, at_rest
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.data_quality.preparation import Prepared, would_have_shown
 from ahrsd.diagnosis.inference.answer.held_out import HeldOut
-from ahrsd.diagnosis.inference.components.component import Fixed, Law, Sized
+from ahrsd.diagnosis.inference.components.component import FixedLaw, Law, ScaledLaw
 from ahrsd.diagnosis.inference.components.effect_components import LAG, LAG_FORM
-from ahrsd.diagnosis.inference.components.gaussian_process import CourseLaw
+from ahrsd.diagnosis.inference.components.gaussian_process import GaussianProcessLaw
 from ahrsd.diagnosis.inference.decision.acceptance import asked_odds
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.decision.unexplained import along_its_direction
@@ -200,9 +200,9 @@ def _resized(all_sets: Hypotheses, known: Hypothesis, factor: float, step: float
 
 def _larger(law: Law, factor: float) -> Law:
     """A law whose sizes are so many times as large."""
-    if isinstance(law, Fixed):
-        return Fixed(law.variance * factor**2)
-    if isinstance(law, Sized | CourseLaw) and law.spread > 0.0:
+    if isinstance(law, FixedLaw):
+        return FixedLaw(law.variance * factor**2)
+    if isinstance(law, ScaledLaw | GaussianProcessLaw) and law.spread > 0.0:
         return replace(law, mean=law.mean + float(np.log(factor)))
     return law
 

@@ -58,7 +58,7 @@ MOMENTS = ("onset_s", "end_s")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MadeAnew:
+class LazyColumns:
     """Columns that are made whenever they are asked for.
 
     Those of a thousand candidates would be as much as their rows, and few of them are asked for.
@@ -80,15 +80,17 @@ class MadeAnew:
         return self.make().gyro if self.on_gyro else None
 
 
-def in_frame(context: Context, frame: Frame, courses: Callable[[], Array], count: int) -> MadeAnew:
+def columns_in_frame(
+    context: Context, frame: Frame, time_functions: Callable[[], Array], count: int
+) -> LazyColumns:
     """Courses in time, (N, count), each along each axis of a frame: three columns a course."""
 
     def make() -> Columns:
         axes = unit_columns(context, frame)
-        flat = (courses()[:, None, :, None] * axes[:, :, None, :]).reshape(len(axes), 3, -1)
+        flat = (time_functions()[:, None, :, None] * axes[:, :, None, :]).reshape(len(axes), 3, -1)
         return Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
 
-    return MadeAnew(make, 3 * count, on_mag=frame != "gyro", on_gyro=frame == "gyro")
+    return LazyColumns(make, 3 * count, on_mag=frame != "gyro", on_gyro=frame == "gyro")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +109,7 @@ class Component:
 
     key: str
     frame: str
-    columns: Columns | MadeAnew
+    columns: Columns | LazyColumns
     law: Law
     prior: float = 0.0
     row: Effect | None = None
@@ -135,7 +137,7 @@ class Component:
         """Number of coefficients."""
         return self.columns.width
 
-    def moved_columns(self, share: float) -> Columns:
+    def shifted_columns(self, share: float) -> Columns:
         """Its columns by a share of the recording later, their end at the beginning."""
         mag, gyro = (
             None if part is None else np.roll(part, round(share * len(part)), axis=0)
@@ -146,20 +148,20 @@ class Component:
     def moved(self, share: float) -> Component:
         """A copy at another time: of the same law, with nothing to do with the readings."""
         key = f"{self.key}, moved by {share}"
-        return replace(self, key=key, columns=self.moved_columns(share))
+        return replace(self, key=key, columns=self.shifted_columns(share))
 
-    def lightly(self, context: Context) -> Component:
+    def with_lazy_columns(self, context: Context) -> Component:
         """The same, which makes its columns of the context whenever they are asked for."""
         if self.row is None or self.beside:
             raise ValueError(f"{self.key} is no effect of the library in a setting")
         columns = self.columns
         make = partial(self.row.columns, context, self.setting)
-        light = MadeAnew(make, columns.width, columns.on_mag, columns.on_gyro)
-        return replace(self, columns=light)
+        lazy = LazyColumns(make, columns.width, columns.on_mag, columns.on_gyro)
+        return replace(self, columns=lazy)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fixed:
+class FixedLaw:
     """Variances that are known.  variance (q,)."""
 
     variance: Array
@@ -182,7 +184,7 @@ class Fixed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sized:
+class ScaledLaw:
     """One size for all: variance = scale^2 e^(2 psi).
 
     scale (q,);  low, high: of psi;  mean, spread: of its normal law; spread 0: even between them
@@ -202,7 +204,7 @@ class Sized:
     @property
     def stiffness(self) -> Array:
         """(k,) curvature of minus the log density of psi."""
-        return np.array([stiff(self.spread)])
+        return np.array([normal_curvature(self.spread)])
 
     def log_variance(self, psi: Array) -> Array:
         """(q,) logarithms."""
@@ -217,7 +219,7 @@ class Sized:
         return log_density(psi[0], self.mean, self.spread, self.low[0], self.high[0])
 
 
-def stiff(spread: float) -> float:
+def normal_curvature(spread: float) -> float:
     """Curvature of minus the log density of one logarithm; spread 0: even."""
     return spread**-2 if spread > 0.0 else 0.0
 
@@ -227,6 +229,8 @@ def log_density(
 ) -> tuple[float, Array]:
     """Of one logarithm: normal, or even between its ends (spread 0); and its slope (1,)."""
     if spread > 0.0:
-        off = (value - mean) / spread
-        return -0.5 * off**2 - float(np.log(spread * np.sqrt(2 * np.pi))), np.array([-off / spread])
+        scaled = (value - mean) / spread
+        return -0.5 * scaled**2 - float(np.log(spread * np.sqrt(2 * np.pi))), np.array(
+            [-scaled / spread]
+        )
     return -float(np.log(high - low)), np.zeros(1)

@@ -16,19 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.inference.components.component import Component, in_frame, log_density, stiff
+from ahrsd.diagnosis.inference.components.component import (
+    Component,
+    columns_in_frame,
+    log_density,
+    normal_curvature,
+)
 from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.where_and_when.locate import Frame
 from ahrsd.samples import Array
 
 #: half waves of a course: one in so many seconds, and from few to many
-MODE_S, FEWEST, MOST = 5.0, 16, 28
+_MODE_S, _FEWEST_MODES, _MOST_MODES = 5.0, 16, 28
 #: the same of a quick one
-QUICK_S, MOST_QUICK = 1.5, 80
+_QUICK_MODE_S, _MOST_QUICK_MODES = 1.5, 80
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CourseLaw:
+class GaussianProcessLaw:
     """psi: logarithms of the size, in units of `unit`, and of the corner, in half waves.
 
     order (q,): of each coefficient;  mean, spread: of the log size; spread 0: even;  most: units
@@ -60,25 +65,25 @@ class CourseLaw:
     @property
     def stiffness(self) -> Array:
         """(k,) curvature of minus the log density of psi."""
-        return np.array([stiff(self.spread), 0.0])
+        return np.array([normal_curvature(self.spread), 0.0])
 
     def _shape(self, psi: Array) -> tuple[Array, Array]:
         """Log shape (q,) before it is scaled, and its slope in the log corner (q,)."""
-        ratio = (self.order * np.exp(-psi[1])) ** 2
-        return -np.log1p(ratio), 2.0 * ratio / (1.0 + ratio)
+        squared_ratio = (self.order * np.exp(-psi[1])) ** 2
+        return -np.log1p(squared_ratio), 2.0 * squared_ratio / (1.0 + squared_ratio)
 
     def log_variance(self, psi: Array) -> Array:
         """(q,) logarithms."""
         shape, _ = self._shape(psi)
         axes = len(shape) / len(np.unique(self.order))
-        whole = np.log(np.sum(np.exp(shape)) / axes / 2.0)  # a cosine has half of its square
-        return np.asarray(2 * np.log(self.unit) + 2 * psi[0] + shape - whole)
+        log_power = np.log(np.sum(np.exp(shape)) / axes / 2.0)  # a cosine has half of its square
+        return np.asarray(2 * np.log(self.unit) + 2 * psi[0] + shape - log_power)
 
     def slope(self, psi: Array) -> Array:
         """(q, k) of the log variances."""
-        shape, by_corner = self._shape(psi)
-        share = np.exp(shape) / np.sum(np.exp(shape))
-        return np.column_stack([np.full(len(shape), 2.0), by_corner - share @ by_corner])
+        shape, shape_slope = self._shape(psi)
+        power_share = np.exp(shape) / np.sum(np.exp(shape))
+        return np.column_stack([np.full(len(shape), 2.0), shape_slope - power_share @ shape_slope])
 
     def log_prior(self, psi: Array) -> tuple[float, Array]:
         """Log density and gradient (k,)."""
@@ -88,7 +93,7 @@ class CourseLaw:
         return size + corner, np.concatenate([slope, flat])
 
 
-def course(
+def gaussian_process(
     context: Context,
     frame: Frame,
     ordinary: priors.Size | None = None,
@@ -99,24 +104,28 @@ def course(
 
     like: one of the same frame, whose columns it takes;  quick: key of one with short waves too
     """
-    waves = np.clip(context.track.duration_s / MODE_S, FEWEST, MOST)
+    mode_count = np.clip(context.track.duration_s / _MODE_S, _FEWEST_MODES, _MOST_MODES)
     if quick is not None:
-        waves = np.clip(context.track.duration_s / QUICK_S, FEWEST, MOST_QUICK)
-    order = np.arange(1, int(waves) + 1)
-    waves_of = partial(_cosines, context.track.time_s, order)
-    columns = in_frame(context, frame, waves_of, len(order)) if like is None else like.columns
+        mode_count = np.clip(
+            context.track.duration_s / _QUICK_MODE_S, _FEWEST_MODES, _MOST_QUICK_MODES
+        )
+    order = np.arange(1, int(mode_count) + 1)
+    cosines = partial(_cosine_modes, context.track.time_s, order)
+    columns = (
+        columns_in_frame(context, frame, cosines, len(order)) if like is None else like.columns
+    )
     unit = priors.COURSE_UNIT[frame]
-    law = CourseLaw(np.repeat(order, 3).astype(float), unit)
+    law = GaussianProcessLaw(np.repeat(order, 3).astype(float), unit)
     key = quick or f"free {frame}"
     if ordinary is not None:
-        middle = float(np.log(ordinary.median / unit))
-        law = CourseLaw(law.order, unit, middle, ordinary.spread, ordinary.most / unit)
+        log_median = float(np.log(ordinary.median / unit))
+        law = GaussianProcessLaw(law.order, unit, log_median, ordinary.spread, ordinary.most / unit)
         key = f"{frame}_course"
-    odds = 0.0 if ordinary is not None else float(np.log(priors.COURSE))
-    return Component(key, frame, columns, law, odds)
+    log_odds = 0.0 if ordinary is not None else float(np.log(priors.COURSE))
+    return Component(key, frame, columns, law, log_odds)
 
 
-def _cosines(time_s: Array, order: NDArray[np.int_]) -> Array:
+def _cosine_modes(time_s: Array, order: NDArray[np.int_]) -> Array:
     """(N, k) half waves."""
     phase = np.pi * (time_s - time_s[0]) / (time_s[-1] - time_s[0])
     return np.asarray(np.cos(phase[:, None] * order))

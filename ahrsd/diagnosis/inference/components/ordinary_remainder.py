@@ -12,8 +12,8 @@ from scipy.ndimage import uniform_filter1d
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.inference.components.component import Component, Fixed, Sized
-from ahrsd.diagnosis.inference.components.gaussian_process import course
+from ahrsd.diagnosis.inference.components.component import Component, FixedLaw, ScaledLaw
+from ahrsd.diagnosis.inference.components.gaussian_process import gaussian_process
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.estimator.locked import harmonics, of_change, on_each_axis, squares
 from ahrsd.samples import Array
@@ -26,36 +26,40 @@ _GRAVITY = 9.81
 def ordinary_remainder(context: Context) -> list[Component]:
     """Its components along a recording."""
     found = [
-        course(context, "world", priors.ORDINARY["world_course"]),
-        course(context, "gyro", priors.ORDINARY["gyro_course"]),
-        _sized(context, "by_direction", "sensor", harmonics(context.field_b)),
-        by_change(context),
-        _sized(context, "field_by_rate", "sensor", context.rowwise_rate_b_rad_s),
-        _sized(context, "by_rate_squared", "gyro", squares(context.rowwise_rate_b_rad_s)),
+        gaussian_process(context, "world", priors.ORDINARY["world_course"]),
+        gaussian_process(context, "gyro", priors.ORDINARY["gyro_course"]),
+        _remainder_component(context, "by_direction", "sensor", harmonics(context.field_b)),
+        field_by_change(context),
+        _remainder_component(context, "field_by_rate", "sensor", context.rowwise_rate_b_rad_s),
+        _remainder_component(
+            context, "by_rate_squared", "gyro", squares(context.rowwise_rate_b_rad_s)
+        ),
         gyro_matrix(context),
     ]
     if context.force_b_m_s2 is not None and np.isfinite(context.force_b_m_s2).all():
-        found.append(_sized(context, "by_force", "gyro", context.force_b_m_s2 / _GRAVITY))
-        found.append(bending(context))
+        found.append(
+            _remainder_component(context, "by_force", "gyro", context.force_b_m_s2 / _GRAVITY)
+        )
+        found.append(mount_bending(context))
     return found
 
 
-def _sized(context: Context, key: str, frame: str, functions: Array) -> Component:
+def _remainder_component(context: Context, key: str, frame: str, functions: Array) -> Component:
     """Each function (N, k) along each axis of the sensor, all coefficients of one size."""
-    law = ordinary(priors.ORDINARY[key], np.ones(3 * functions.shape[1]))
+    law = ordinary_size_law(priors.ORDINARY[key], np.ones(3 * functions.shape[1]))
     flat = on_each_axis(functions)
     columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
     return Component(key, frame, columns, law)
 
 
-def ordinary(size: priors.Size, scale: Array) -> Sized:
+def ordinary_size_law(size: priors.Size, scale: Array) -> ScaledLaw:
     """The law of an ordinary size, of coefficients in units of `scale` (q,)."""
     mean = float(np.log(size.median))
     low, high = mean - 4.0 * size.spread, float(np.log(size.most))
-    return Sized(scale, np.array([low]), np.array([high]), mean, size.spread)
+    return ScaledLaw(scale, np.array([low]), np.array([high]), mean, size.spread)
 
 
-def still_spells(time_s: Array, gyro_rad_s: Array) -> list[tuple[float, float]]:
+def still_intervals(time_s: Array, gyro_rad_s: Array) -> list[tuple[float, float]]:
     """The longest spells in which a sensor hardly turns, from and to, s, in their order.
 
     None where it hardly turns in most of its time: then that is its motion.
@@ -66,23 +70,25 @@ def still_spells(time_s: Array, gyro_rad_s: Array) -> list[tuple[float, float]]:
     if np.mean(still) > priors.MOSTLY:
         return []
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
-    spells = [(float(time_s[a]), float(time_s[b - 1])) for a, b in edges.reshape(-1, 2)]
-    long = [one for one in spells if one[1] - one[0] >= priors.STILL_S]
-    return sorted(sorted(long, key=lambda one: one[0] - one[1])[: priors.MOST_SPELLS])
+    intervals = [(float(time_s[a]), float(time_s[b - 1])) for a, b in edges.reshape(-1, 2)]
+    long_enough = [one for one in intervals if one[1] - one[0] >= priors.STILL_S]
+    return sorted(sorted(long_enough, key=lambda one: one[0] - one[1])[: priors.MOST_SPELLS])
 
 
-def by_change(context: Context) -> Component:
+def field_by_change(context: Context) -> Component:
     """A matrix on the field's change, without what is alike on all axes: that is the delay."""
     columns = of_change(context.field_dot_b)
-    law = ordinary(priors.ORDINARY["by_change"], np.ones(columns.shape[2]))
+    law = ordinary_size_law(priors.ORDINARY["by_change"], np.ones(columns.shape[2]))
     return Component("by_change", "sensor", Columns(mag=columns), law)
 
 
-def bending(context: Context) -> Component:
+def mount_bending(context: Context) -> Component:
     """A mount that gives: turned by what force and angular acceleration do to it."""
-    found = next(one for one in EFFECTS.values() if one.ordinary_part == "bending")
-    law = ordinary(priors.ORDINARY["bending"], np.array([one.scale for one in found.parameters]))
-    return Component("bending", "sensor", found.columns(context, {}), law)
+    effect = next(one for one in EFFECTS.values() if one.ordinary_part == "bending")
+    law = ordinary_size_law(
+        priors.ORDINARY["bending"], np.array([one.scale for one in effect.parameters])
+    )
+    return Component("bending", "sensor", effect.columns(context, {}), law)
 
 
 def gyro_matrix(context: Context) -> Component:
@@ -95,4 +101,4 @@ def gyro_matrix(context: Context) -> Component:
         columns[:, axis, 3 + axis] = w[:, axis]
         columns[:, i, 6 + axis], columns[:, j, 6 + axis] = w[:, j], w[:, i]
     deviation = np.repeat([priors.ORDINARY_MISALIGNMENT_RAD, priors.ORDINARY_SCALE], [3, 6])
-    return Component(GYRO_MATRIX, "gyro", Columns(gyro=columns), Fixed(deviation**2))
+    return Component(GYRO_MATRIX, "gyro", Columns(gyro=columns), FixedLaw(deviation**2))

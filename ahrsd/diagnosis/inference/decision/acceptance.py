@@ -14,11 +14,11 @@ import numpy as np
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.inference.components.alternatives import (
-    by_heading,
-    form_keys,
-    lone_parts,
-    other_courses,
-    varying,
+    alternative_sources,
+    coefficient_factors,
+    factor_keys,
+    field_by_heading,
+    single_remainder_parts,
 )
 from ahrsd.diagnosis.inference.components.effect_components import LAG
 from ahrsd.diagnosis.inference.decision.members import (
@@ -64,7 +64,7 @@ def _borne_out(
     """
     while True:
         own = [key for key in sorted(best.names) if key not in all_sets.remainder]
-        own = [key for key in own if best.names.isdisjoint(form_keys(key))]
+        own = [key for key in own if best.names.isdisjoint(factor_keys(key))]
         asked = {key: asked_odds(all_sets, best, key) for key in own}
         without = {key: all_sets.without(best.names, key) for key in own}
         near = {key: all_sets.compared(without[key], best, best.score - asked[key]) for key in own}
@@ -172,7 +172,7 @@ def _with_one_part(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypo
     rest = frozenset(all_sets.remainder)
     if all_sets.real or not rest & best.names or not space.courses:
         return best
-    found = lone_parts(all_sets.component(key) for key in all_sets.remainder)
+    found = single_remainder_parts(all_sets.component(key) for key in all_sets.remainder)
     all_sets.made.add(found)
     bare = best.names - rest
     return all_sets.likeliest(best, [bare | {one.key} for one in found])
@@ -186,7 +186,7 @@ def _with_heading(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypot
     unknown = any(all_sets.component(key).row is None for key in best.names)
     if unknown or all_sets.real or not space.courses:
         return best
-    heading = by_heading(all_sets.made.context)
+    heading = field_by_heading(all_sets.made.context)
     all_sets.made.add([heading])
     return all_sets.likeliest(best, [best.names | {heading.key}])
 
@@ -200,8 +200,8 @@ def _beside_others(
     """
     if not library_members(all_sets, best) or not space.courses:
         return best, rivals
-    parts = lone_parts(all_sets.component(key) for key in all_sets.remainder)
-    others = other_courses(all_sets.made.context)
+    parts = single_remainder_parts(all_sets.component(key) for key in all_sets.remainder)
+    others = alternative_sources(all_sets.made.context)
     all_sets.made.add([*parts, *others])
     wide, rest = best, frozenset(all_sets.remainder)
     for one in (*others, *parts):
@@ -230,9 +230,9 @@ def _held_to_form(
             one = all_sets.component(key)
             # a quick cause's phase is summed from its column, and wanders as that errs
             wanders = one.row is not None and one.row.quick and "covariate" in one.setting
-            if wanders or not taken.isdisjoint(form_keys(key)):
+            if wanders or not taken.isdisjoint(factor_keys(key)):
                 continue
-            forms = varying(one, added_by(all_sets, best, key)[0], made.context)
+            forms = coefficient_factors(one, added_by(all_sets, best, key)[0], made.context)
             made.add(forms)
             for form in forms:
                 least = max(best.score + asked, found.score)

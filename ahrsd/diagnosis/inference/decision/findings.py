@@ -13,8 +13,8 @@ from ahrsd.diagnosis.answer.text import separating_manoeuvre
 from ahrsd.diagnosis.effects.effect import Effect, Setting
 from ahrsd.diagnosis.inference.components.effect_components import (
     LAG,
-    TO_THE_DIGIT,
-    holds,
+    ROUNDING_SHARE,
+    contains_component,
 )
 from ahrsd.diagnosis.inference.components.ordinary_remainder import GYRO_MATRIX, TURNS
 from ahrsd.diagnosis.inference.decision.members import added_by, coefficients, cost_if_left_out
@@ -133,7 +133,7 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
         by_name = {name: min(nats, by_name[mine]) for name, nats in by_name.items()}
     for name, keys in space.effects.items():
         wider = all_sets.component(keys[0])
-        if name in by_name and name != mine and holds(wider, own, TO_THE_DIGIT):
+        if name in by_name and name != mine and contains_component(wider, own, ROUNDING_SHARE):
             by_name[name] = by_name[mine] + float(np.log(priors.SAME_FORM))
     total = np.logaddexp.reduce(list(by_name.values()))
     shares = {name: float(np.exp(nats - total)) for name, nats in by_name.items()}

@@ -10,9 +10,9 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.added_field import heading_error_deg
 from ahrsd.diagnosis.answer.diagnosis import Cost
 from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
-from ahrsd.diagnosis.inference.components.component import Sized
+from ahrsd.diagnosis.inference.components.component import ScaledLaw
 from ahrsd.diagnosis.inference.components.effect_components import LAG
-from ahrsd.diagnosis.inference.components.ordinary_remainder import still_spells
+from ahrsd.diagnosis.inference.components.ordinary_remainder import still_intervals
 from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, model_of
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.samples import Array
@@ -46,7 +46,7 @@ def size_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     one says nothing.
     """
     one = all_sets.component(key)
-    if one.effect is not None and isinstance(one.law, Sized):
+    if one.effect is not None and isinstance(one.law, ScaledLaw):
         value, deviation = coefficients(all_sets, best, key)
         return float(np.max(np.maximum(np.abs(value) - 2.0 * deviation, 0.0) / one.law.scale))
     psi = all_sets.psi_of(best)[key]
@@ -78,7 +78,7 @@ def is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
 def _is_place(all_sets: Hypotheses, key: str) -> bool:
     """Whether a step of the field is where the sensor is lifted off a place or put down on it."""
     one, recorded = all_sets.component(key), all_sets.made.point.problem.recorded
-    spells = still_spells(recorded.time_s, recorded.gyro_b_rad_s)
+    spells = still_intervals(recorded.time_s, recorded.gyro_b_rad_s)
     if not spells or one.frame != "world":
         return False
     off = np.abs(np.ravel(spells)[:, None] - one.moments_s)

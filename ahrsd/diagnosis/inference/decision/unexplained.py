@@ -9,7 +9,7 @@ import numpy as np
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Unexplained, Where
-from ahrsd.diagnosis.inference.components.alternatives import form_keys
+from ahrsd.diagnosis.inference.components.alternatives import factor_keys
 from ahrsd.diagnosis.inference.decision.members import (
     added_by,
     coefficients,
@@ -39,7 +39,7 @@ def left_beyond_ordinary(
         key = max(courses, key=lambda one: odds[one])
         if key in space.courses:
             return (key,), _course(all_sets, best, key, odds[key])
-        stands_in = [name for name in library_members(all_sets, best) if key in form_keys(name)]
+        stands_in = [name for name in library_members(all_sets, best) if key in factor_keys(name)]
         return (key, *stands_in), _other(all_sets, best, (key, *stands_in), odds[key])
     for key, size in priors.ORDINARY.items():
         if key not in best.names or size_of(all_sets, best, key) < size.up_to():

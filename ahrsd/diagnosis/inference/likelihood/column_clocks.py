@@ -15,7 +15,7 @@ import numpy as np
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.columns.clocks import Late, at_clock, likeliest_clock, suspects
 from ahrsd.diagnosis.effects.design_matrix import on_axes
-from ahrsd.diagnosis.inference.components.component import Component, Sized
+from ahrsd.diagnosis.inference.components.component import Component, ScaledLaw
 from ahrsd.diagnosis.inference.likelihood.candidates import beside
 from ahrsd.diagnosis.inference.likelihood.evidence import At
 from ahrsd.diagnosis.inference.likelihood.linearisation import by_key, linearised
@@ -85,6 +85,6 @@ class _EvidenceBesideModel:
         course = at_clock(self._made.context.track, self.column, clock, self.middle_s)
         scaled = course / max(float(np.std(course)), 1e-300)
         low, high = np.log(priors.EFFECT_SIZES)
-        law = Sized(np.full(3, priors.COURSE_UNIT["sensor"]), np.array([low]), np.array([high]))
+        law = ScaledLaw(np.full(3, priors.COURSE_UNIT["sensor"]), np.array([low]), np.array([high]))
         columns = Columns(mag=on_axes(scaled[:, None]))
         return Component(f"{self.column} at {clock}", "sensor", columns, law)

@@ -18,7 +18,7 @@ from scipy.fft import dct, idct, next_fast_len
 from ahrsd.diagnosis.calibration_fit import noise_fit
 from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
 from ahrsd.diagnosis.calibration_fit.problem import Problem
-from ahrsd.diagnosis.inference.components.component import Component, Fixed
+from ahrsd.diagnosis.inference.components.component import Component, FixedLaw
 from ahrsd.diagnosis.inference.likelihood import noise_model
 from ahrsd.diagnosis.inference.likelihood.directed_noise import Directed, directed
 from ahrsd.diagnosis.inference.likelihood.evidence import At, Products
@@ -180,7 +180,7 @@ class Linearised:
         for one in components:
             known = self.seen[one.key]
             if known.component is one:
-                self.seen[one.key] = replace(known, component=one.lightly(self.context))
+                self.seen[one.key] = replace(known, component=one.with_lazy_columns(self.context))
 
     def _apart(self, keys: Sequence[str]) -> None:
         """Give each a batch of its own: it meets all others, and its neighbours need not."""
@@ -416,7 +416,7 @@ def linearised(
     made = Linearised(point, context, smooth, edges, white, alone=alone, whitening=whitening)
     made.y = made.as_loud(white[:, None])[:, 0]
     prior = prior_of(point.problem.track)
-    law = Fixed(prior.deviation**2)
+    law = FixedLaw(prior.deviation**2)
     made.add([Component(CALIBRATION, "sensor", nuisance_columns(smooth), law)])
     made.put_back({CALIBRATION: coefficients(point.filtered.model) - prior.mean})
     return made

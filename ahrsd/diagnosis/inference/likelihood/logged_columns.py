@@ -146,7 +146,7 @@ def _effects_by(context: Context, library: Library, name: str) -> list[tuple[Eff
         if effect.delay or effect.quick or not effect.needs:
             continue
         by_it = [one for one in effect.settings(context) if one.get("covariate") == name]
-        if by_it and len(effect_components.in_time(context, effect, by_it[0])) > 1:
+        if by_it and len(effect_components.logged_time_settings(context, effect, by_it[0])) > 1:
             found.append((effect, by_it[0]))
     return found
 
@@ -172,7 +172,7 @@ def _worth(
     for one in readings:
         context = replace(made.context, track=one.of(made.context.track))
         for effect, setting in asked:
-            new = effect_components.component(context, effect, setting, 1)
+            new = effect_components.effect_component(context, effect, setting, 1)
             new = replace(new, key=f"{new.key} {one}")
             made.add([new])
             of[new.key] = one

@@ -21,13 +21,13 @@ from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.components.component import Component
 from ahrsd.diagnosis.inference.components.effect_components import (
     LAG,
-    anew,
-    causes,
-    delay,
+    delay_component,
     delay_form,
+    logged_cause_components,
     plain_delay,
+    rebuild_component,
 )
-from ahrsd.diagnosis.inference.components.gaussian_process import course
+from ahrsd.diagnosis.inference.components.gaussian_process import gaussian_process
 from ahrsd.diagnosis.inference.components.ordinary_remainder import ordinary_remainder
 from ahrsd.diagnosis.inference.likelihood.evidence import At, maximised
 from ahrsd.diagnosis.inference.likelihood.linearisation import (
@@ -80,15 +80,19 @@ def base_of(
     """
     context = point.context
     rest = ordinary_remainder(context) if whole else []
-    lag = delay(context, library)
+    lag = delay_component(context, library)
     lags = [] if lag is None else [lag]
     if point.problem.lag_s != 0.0:
         lags.append(delay_form(context, point.problem.lag_s))
-    known = [anew(one, context, library) for one in named]
+    known = [rebuild_component(one, context, library) for one in named]
     had = {one.effect for one in known}
-    driven = [one for one in causes(context, library) if one.effect not in had]
+    driven = [one for one in logged_cause_components(context, library) if one.effect not in had]
     bound = {one.key: one for one in rest if one.key in COURSES.values()}
-    free = [course(context, frame, like=bound.get(COURSES[frame])) for frame in FRAMES if whole]
+    free = [
+        gaussian_process(context, frame, like=bound.get(COURSES[frame]))
+        for frame in FRAMES
+        if whole
+    ]
     parts = [*rest, *lags, *known, *driven, *free]
     made = linearised(as_columns_say(point, parts), context)
     made.add(parts)

@@ -16,7 +16,7 @@ import numpy as np
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.effects.effect import ANGLES, SCALES, Setting
-from ahrsd.diagnosis.inference.components.component import MOMENTS, Component, Fixed
+from ahrsd.diagnosis.inference.components.component import MOMENTS, Component, FixedLaw
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
@@ -61,7 +61,7 @@ def opened(
     mag = _with_slopes(one.columns.mag, here.mag, [each.mag for each in found], value)
     gyro = _with_slopes(one.columns.gyro, here.gyro, [each.gyro for each in found], value)
     largest = one.law.log_variance(one.law.high)
-    law = Fixed(np.concatenate([np.exp(largest), np.full(len(nearby), priors.SETTING_OFF**2)]))
+    law = FixedLaw(np.concatenate([np.exp(largest), np.full(len(nearby), priors.SETTING_OFF**2)]))
     key = f"{one.key}, open in {', '.join(nearby)} at {np.array2string(value, precision=6)}"
     return replace(one, key=key, columns=Columns(mag, gyro), law=law)
 

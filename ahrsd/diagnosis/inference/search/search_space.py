@@ -10,14 +10,14 @@ from ahrsd.diagnosis.inference.components.component import Component
 from ahrsd.diagnosis.inference.components.effect_components import (
     LAG,
     LAG_FORM,
-    beside_key,
-    beyond,
-    component,
-    form_of,
-    holds,
+    contains_component,
+    effect_component,
+    form_component,
+    interval_components,
     library_components,
-    neighbours,
-    while_there,
+    neighbouring_settings,
+    project_out,
+    projected_key,
 )
 from ahrsd.diagnosis.inference.likelihood.candidates import Beside
 from ahrsd.diagnosis.inference.likelihood.linearisation import Linearised
@@ -93,8 +93,8 @@ def _passed(
     for some in _by_hundreds(library_components(made.context, library)):
         passed = []
         for name, parts in some:
-            held = [] if delay is None or not holds(parts[0], delay) else parts
-            beside = [] if delay is None else [beyond(one, delay) for one in held]
+            held = [] if delay is None or not contains_component(parts[0], delay) else parts
+            beside = [] if delay is None else [project_out(one, delay) for one in held]
             effects[name] = [one.key for one in (*parts, *beside)]
             passed += [*parts, *beside]
             whole += held
@@ -117,14 +117,14 @@ def space_at(
         listed = effects.setdefault(one.effect or one.key, [])
         if one.key not in listed:
             listed.append(one.key)
-        form = form_of(one, context, library)
+        form = form_component(one, context, library)
         if form is not None:
             made.add([form])
             forms[one.key] = form.key
     if LAG_FORM in made.seen:
         forms[LAG] = LAG_FORM
     psi = psi_by_key(made, base.whole, rich.at)
-    holding = {one.key: beside_key(one.key) for one in whole}
+    holding = {one.key: projected_key(one.key) for one in whole}
     all_sets = Hypotheses(made, base.remainder, rich.at.log_noise, psi, forms, holding)
     all_sets.unknown_nats = 0.0 if made.point.directed is None else made.point.directed.nats
     length_s = context.track.duration_s
@@ -133,27 +133,32 @@ def space_at(
         if one.row is None or one.key == LAG:
             return []
         row, tried = one.row, max(priors.SOUGHT_SETTINGS, len(effects[one.row.identifier]))
-        return [component(context, row, one, tried).lightly(context) for one in settings]
+        return [
+            effect_component(context, row, one, tried).with_lazy_columns(context)
+            for one in settings
+        ]
 
     def finer(one: Component, round_: int) -> list[Component]:
-        return made_of(one, neighbours(one.setting, length_s, round_))
+        return made_of(one, neighbouring_settings(one.setting, length_s, round_))
 
     def closer(scan: Beside, one: Component, round_: int) -> list[Component]:
         return made_of(one, remembered(scan, one, round_))
 
     def left_of(one: Component) -> Component | None:
-        return form_of(one, context, library)
+        return form_component(one, context, library)
 
     def steps_at(time_s: float) -> list[Component]:
         setting = {"onset_s": round(time_s, 3)}
         jumping = [row for row in library.values() if row.jumps]
         return [
-            component(context, row, setting, priors.PROPOSED_ONSETS).lightly(context)
+            effect_component(context, row, setting, priors.PROPOSED_ONSETS).with_lazy_columns(
+                context
+            )
             for row in jumping
         ]
 
     def come_and_gone(begins: Component, ends: Component) -> list[Component]:
-        return while_there(begins, ends, context, library, priors.SOUGHT_SETTINGS**2)
+        return interval_components(begins, ends, context, library, priors.SOUGHT_SETTINGS**2)
 
     space = Space(effects, COURSES, finer, closer, left_of, steps_at, come_and_gone)
     return all_sets, space

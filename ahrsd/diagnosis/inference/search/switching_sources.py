@@ -25,7 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.inference.components.component import Component, Sized, in_frame, log_density
+from ahrsd.diagnosis.inference.components.component import (
+    Component,
+    ScaledLaw,
+    columns_in_frame,
+    log_density,
+)
 from ahrsd.diagnosis.inference.likelihood.candidates import beside
 from ahrsd.diagnosis.inference.likelihood.evidence import At
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
@@ -200,7 +205,7 @@ def _levels(context: Context, frame: Frame, moments: Sequence[int]) -> Component
     columns = frame_columns(context, frame, segments_between(time_s, edges))
     low, high = (np.array([np.log(one)]) for one in priors.COURSE_SIZES)
     unit = priors.COURSE_UNIT[frame]
-    law = Sized(np.full(columns.width, unit), low, high)
+    law = ScaledLaw(np.full(columns.width, unit), low, high)
     lasting = float(time_s[-1] - time_s[0])
     odds = float(np.log(priors.COURSE * _share(frame))) - lasting / priors.BETWEEN_S
     odds += len(moments) * float(np.log(lasting / len(time_s) / priors.BETWEEN_S))
@@ -265,7 +270,7 @@ def _coming(
         np.arange(count) / (step_s * (b - a)) for (a, b), count in zip(spells, counts, strict=True)
     ]
     waves = partial(_waves, len(time_s), tuple(spells), counts)
-    columns = in_frame(context, frame, waves, sum(counts))
+    columns = columns_in_frame(context, frame, waves, sum(counts))
     law = SpellLaw(np.repeat(np.concatenate(order), 3), priors.COURSE_UNIT[frame])
     spans = tuple((float(time_s[a]), float(time_s[b - 1])) for a, b in spells)
     key = f"{frame} that is there from and to {spans} s"
