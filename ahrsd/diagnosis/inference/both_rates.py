@@ -15,7 +15,10 @@ from ahrsd.diagnosis.inference.search_rounds import Searched, answered
 
 
 def found_at_both_rates(
-    problem: Problem, richest: richest_model.Judged, start: NullFit, library: Mapping[str, Effect]
+    problem: Problem,
+    richest: richest_model.FittedPoint,
+    start: NullFit,
+    library: Mapping[str, Effect],
 ) -> tuple[Searched, Quick]:
     """The search, and what only the recorded rate shows; with that taken out the search anew.
 
@@ -45,7 +48,7 @@ def _without_quick(
     if fast.slower is None:
         raise ValueError("nothing was found at the recorded rate")
     again = fit_null(fast.slower.track, problem.spec, start.model, walk=False)
-    found = answered(richest_model.richest(fast.slower, again.filtered, library), library)
+    found = answered(richest_model.fit_richest_model(fast.slower, again.filtered, library), library)
     real = found.all_sets.is_real(found.answer.best.names)
     return found, replace(fast, left=_quick(found, library, real=real).left)
 

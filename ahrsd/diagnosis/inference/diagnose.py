@@ -24,7 +24,7 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.answer.whole_answer import whole_answer
 from ahrsd.diagnosis.inference.both_rates import found_at_both_rates
 from ahrsd.diagnosis.inference.likelihood import richest_model
-from ahrsd.diagnosis.inference.likelihood.column_clocks import wrong_clock
+from ahrsd.diagnosis.inference.likelihood.column_clocks import find_wrong_clock
 from ahrsd.diagnosis.inference.lost_turns import broken_where_unsampled, lost_beside, nats
 from ahrsd.diagnosis.track import Spec, Track
 
@@ -76,8 +76,8 @@ def _answered(
     if lost := lost_turns(came, problem.cold):
         asked = counted.with_facts(lost)
         problem, start = begun(asked.put_right(), spec)
-    richest = richest_model.richest(problem, start.filtered, library)
-    if clocks and (clock := wrong_clock(richest)) is not None:
+    richest = richest_model.fit_richest_model(problem, start.filtered, library)
+    if clocks and (clock := find_wrong_clock(richest)) is not None:
         at_its_time = _answered(
             clock.moved(asked.track), spec, library, simulated=simulated, clocks=False
         )
@@ -92,7 +92,7 @@ def _answered(
     if differ(lost, beside):
         other = counted.with_facts(beside)
         otherwise, begin = begun(other.put_right(), spec)
-        richest = richest_model.richest(otherwise, begin.filtered, library)
+        richest = richest_model.fit_richest_model(otherwise, begin.filtered, library)
         again, quickly = found_at_both_rates(otherwise, richest, begin, searched)
         if nats(again, beside) > nats(found, lost):
             asked, problem, start, found, fast = other, otherwise, begin, again, quickly

@@ -16,7 +16,7 @@ import numpy as np
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.data_quality.dropped_samples import missing_turns, price
 from ahrsd.diagnosis.data_quality.facts import Fact
-from ahrsd.diagnosis.inference.likelihood.linearisation import Point, moved
+from ahrsd.diagnosis.inference.likelihood.linearisation import Point, step_to_maximum
 from ahrsd.diagnosis.inference.recorded_rate import Quick, at_recorded_rate
 from ahrsd.diagnosis.inference.search_rounds import Searched
 from ahrsd.diagnosis.track import Track
@@ -37,7 +37,7 @@ def lost_beside(came: Track, found: Searched, fast: Quick, lost: Sequence[Fact])
         and any(abs(one.moments_s[0] - at) < priors.TRANSITION_S for at in begin_s)
     }  # fmt: skip
     rest = all_sets.judge(best.names - answers, best)
-    point = moved(all_sets.made, rest.keys, rest.at)
+    point = step_to_maximum(all_sets.made, rest.keys, rest.at)
     return _turns(at_recorded_rate(replace(point, problem=replace(point.problem, recorded=came))))
 
 

@@ -25,11 +25,11 @@ from ahrsd.diagnosis.inference.likelihood.linearisation import (
     CALIBRATION,
     Linearised,
     Point,
-    added,
-    by_key,
-    linearised,
-    moved,
-    relevelled,
+    coefficients_by_key,
+    linearise,
+    refit_noise_level,
+    step_to_maximum,
+    total_contribution,
 )
 from ahrsd.diagnosis.inference.search.model_search import (
     Hypotheses,
@@ -77,10 +77,10 @@ def quick(
           alternating fields of its own
     source_nats: evidence of a source in that set that switches
     """
-    point = at_recorded_rate(moved(made, best.keys, best.at))
+    point = at_recorded_rate(step_to_maximum(made, best.keys, best.at))
     fast, all_sets, space, found = _searched(point, library, real=real)
     for _ in range(LEVELLED if found.names else 0):  # rows far off for what is found are not now
-        point = relevelled(fast, found.keys, found.at)
+        point = refit_noise_level(fast, found.keys, found.at)
         del fast, all_sets, space  # what was asked at the point before is as much again
         fast, all_sets, space, found = _searched(point, library, real=real)
     all_sets.unknown_nats = source_nats
@@ -99,19 +99,19 @@ def _searched(
     Where a band stands out it may be noise as well: what was found without that has to be likelier
     than a band of any power.
     """
-    plain = linearised(point, point.context)
+    plain = linearise(point, point.context)
     first = _searched_in(plain, library, (), real=real)
     if real:
         return first
     known = first[1].judge(frozenset())
     rate_hz = point.problem.rate_hz
     highest_hz = 0.5 * rate_hz * float(np.mean(point.filtered.used))  # readings that repeat
-    band = loudest_band(plain.left_by(known.keys, known.at), rate_hz, highest_hz)
+    band = loudest_band(plain.residual(known.keys, known.at), rate_hz, highest_hz)
     if band is None:
         return first
     names = first[3].names
     del plain, first, known  # at a recording's own rate each is a hundred megabytes
-    beside = linearised(point, point.context, band[:2])
+    beside = linearise(point, point.context, band[:2])
     return _searched_in(beside, library, [names], real=real)
 
 
@@ -129,11 +129,11 @@ def _searched_in(
         left = [(one.key, form_component(one, fast.context, library)) for one in unlogged]
         forms |= {key: form for key, form in left if form is not None}
         fast.add(parts)
-        fast.keep_lightly(parts)
+        fast.make_columns_lazy(parts)
         if parts:
             candidates[name] = [one.key for one in parts]
     step = priors.NOISE_STEP_REAL if real else priors.NOISE_STEP_CLEAN
-    noise = richest_model.fitted(fast, (CALIBRATION,), step).log_noise
+    noise = richest_model.fit_hyperparameters(fast, (CALIBRATION,), step).log_noise
     fast.add(list(forms.values()))
     known = {key: form.key for key, form in forms.items()}
     all_sets = Hypotheses(fast, (), noise, {}, known, real=real)
@@ -159,7 +159,7 @@ def _hum(fast: Linearised, best: Hypothesis) -> Unexplained:
     low, high = float(fast.edges[alone.start]), float(fast.edges[alone.stop])
     rate_hz, count = fast.point.problem.rate_hz, int(fast.edges[-1])
     level = replace(best.at, log_noise=np.full(len(log_noise), beside))
-    left = fast.left_by(best.keys, level)
+    left = fast.residual(best.keys, level)
     band_hz = (rate_hz * low / (2 * count), rate_hz * high / (2 * count))
     return of_band(fast.context, left, rate_hz, band_hz, nats)
 
@@ -178,14 +178,18 @@ def at_recorded_rate(slow: Point) -> Point:
     mag, gyro = drawn(slow.terms_mag), drawn(slow.terms_gyro)
     filtered = run_filter(track, model_at_rate(slow.filtered.model, problem), mag, gyro)
     fast = replace(problem, track=track, thin=1, averaged=1.0)
-    loud = noise_model.loudness(filtered.whitened, filtered.used, fast.rate_hz)
+    loud = noise_model.fit_noise_levels(filtered.whitened, filtered.used, fast.rate_hz)
     return Point(fast, filtered, {}, mag, gyro, loud)
 
 
 def _without(fast: Problem, slow: Problem, made: Linearised, best: Hypothesis) -> Problem:
     """The problem of the working rate, without what was found at the recorded one."""
-    values = {key: v for key, v in by_key(made, best.keys, best.at).items() if key in best.names}
+    values = {
+        key: v
+        for key, v in coefficients_by_key(made, best.keys, best.at).items()
+        if key in best.names
+    }
     known = {key: made.seen[key].component for key in values}
-    mag, _ = added(len(fast.track), known, values)
+    mag, _ = total_contribution(len(fast.track), known, values)
     recorded = replace(slow.recorded, mag_b_gauss=slow.recorded.mag_b_gauss - mag)
     return replace(slow, recorded=recorded, instants=False).lagging(0.0)

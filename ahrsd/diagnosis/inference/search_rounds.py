@@ -14,8 +14,11 @@ from ahrsd.diagnosis.inference.components.component import Component
 from ahrsd.diagnosis.inference.components.effect_components import LAG, STEP_PIECES
 from ahrsd.diagnosis.inference.decision import decision, members
 from ahrsd.diagnosis.inference.likelihood import richest_model
-from ahrsd.diagnosis.inference.likelihood.directed_noise import Directed
-from ahrsd.diagnosis.inference.likelihood.linearisation import along_one_direction, unread
+from ahrsd.diagnosis.inference.likelihood.directed_noise import DirectedNoise
+from ahrsd.diagnosis.inference.likelihood.linearisation import (
+    directed_noise_of_residual,
+    omit_readings,
+)
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.inference.search.search_space import best_at
 from ahrsd.samples import Array
@@ -34,10 +37,10 @@ class Searched:
     answer: decision.Answer
     all_sets: Hypotheses
     space: Space
-    source: Directed | None
+    source: DirectedNoise | None
 
 
-def answered(found: richest_model.Judged, library: Mapping[str, Effect]) -> Searched:
+def answered(found: richest_model.FittedPoint, library: Mapping[str, Effect]) -> Searched:
     """Searched at the richest model, and again at what was found, until that stays."""
     all_sets, space, best = best_at(found, library, (), was_real=True)
     answer = decision.decided(all_sets, space, best, library)
@@ -53,9 +56,9 @@ def answered(found: richest_model.Judged, library: Mapping[str, Effect]) -> Sear
         if not (named or other_noise):
             break
         spans = moved_in(all_sets, answer.best)
-        point = replace(unread(point, spans) if spans else point, directed=directed)
+        point = replace(omit_readings(point, spans) if spans else point, directed=directed)
         del all_sets, space  # what was asked at the point before is as much again
-        found = richest_model.settled(point, library, named)
+        found = richest_model.converge(point, library, named)
         all_sets, space, best = best_at(found, library, named, real)
         answer = decision.decided(all_sets, space, best, library)
         source = _source(all_sets, answer.best)
@@ -64,16 +67,16 @@ def answered(found: richest_model.Judged, library: Mapping[str, Effect]) -> Sear
     return _while_moved(Searched(answer, all_sets, space, source), library)
 
 
-def _source(all_sets: Hypotheses, best: Hypothesis) -> Directed | None:
+def _source(all_sets: Hypotheses, best: Hypothesis) -> DirectedNoise | None:
     """What is louder along one direction than a sensor's noise is, None where that is not sure."""
-    found = along_one_direction(all_sets.made, best.keys, best.at)
+    found = directed_noise_of_residual(all_sets.made, best.keys, best.at)
     asked = priors.DIRECTED_REAL if all_sets.is_real(best.names) else priors.UNKNOWN_ODDS
     return found if found.nats > asked else None
 
 
 def _whitened(
-    answer: decision.Answer, source: Directed | None, known: Directed | None
-) -> Directed | None:
+    answer: decision.Answer, source: DirectedNoise | None, known: DirectedNoise | None
+) -> DirectedNoise | None:
     """The source beside whose noise names are judged: one that is surer than all that is told.
 
     A strong name whose log or form is not exact leaves a rest, and is no worse for it, and so does
@@ -95,7 +98,7 @@ def _while_moved(found: Searched, library: Mapping[str, Effect]) -> Searched:
     spans = [(a - near_s, b + near_s) for one in spells for a, b in one]
     if not 0 < len(spans) < priors.CHANGES or max(np.ptp(spans, axis=1)) > 2 * priors.APPROACH_S:
         return found
-    rich = richest_model.settled(unread(all_sets.made.point, spans), library, ())
+    rich = richest_model.converge(omit_readings(all_sets.made.point, spans), library, ())
     anew, space, best = best_at(rich, library, (), was_real=True)
     answer = decision.decided(anew, space, best, library)
     steps = [one for key in answer.keys if (one := anew.component(key)).jumps]

@@ -46,8 +46,10 @@ KINDS = {
 }
 #: functions that are timed, in the order in which they run, and the modules that call them
 PHASES = {
-    **dict.fromkeys(("prepared", "problem_of", "fit_null", "lost_turns", "wrong_clock"), engine),
-    "richest": richest_model,
+    **dict.fromkeys(
+        ("prepared", "problem_of", "fit_null", "lost_turns", "find_wrong_clock"), engine
+    ),
+    "fit_richest_model": richest_model,
     **dict.fromkeys(("answered", "quick"), both_rates),
     **dict.fromkeys(("lost_beside", "whole_answer", "beyond_chance"), engine),
 }

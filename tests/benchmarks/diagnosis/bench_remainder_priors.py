@@ -34,8 +34,8 @@ from ahrsd.diagnosis.inference.components.effect_components import LAG
 from ahrsd.diagnosis.inference.decision.members import size_of
 from ahrsd.diagnosis.inference.diagnose import begun, diagnose
 from ahrsd.diagnosis.inference.likelihood import richest_model
-from ahrsd.diagnosis.inference.likelihood.candidates import beside
-from ahrsd.diagnosis.inference.likelihood.evidence import evaluated
+from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
+from ahrsd.diagnosis.inference.likelihood.evidence import evaluate
 from ahrsd.diagnosis.inference.search.search_space import space_at
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import RecordingError
@@ -66,11 +66,11 @@ def measured(path: Path) -> dict[str, Any]:
     """What a recording leaves: `profiles` of the remainder, `effects` that nobody put there."""
     track = prepared(load_track(path)[0]).put_right()
     problem, fit = begun(track, Spec())
-    found = richest_model.richest(problem, fit.filtered, EFFECTS)
+    found = richest_model.fit_richest_model(problem, fit.filtered, EFFECTS)
     return {"profiles": profiles(found), "effects": sizes(found)}
 
 
-def profiles(found: richest_model.Judged) -> dict[str, list[list[float]]]:
+def profiles(found: richest_model.FittedPoint) -> dict[str, list[list[float]]]:
     """Of each component: log sizes, log likelihood at each without the size's own prior."""
     made, remainder, keys, at = found.base.made, found.base.remainder, found.base.whole, found.at
     products = made.products(keys, priors.NOISE_STEP_REAL)
@@ -84,23 +84,23 @@ def profiles(found: richest_model.Judged) -> dict[str, list[list[float]]]:
                 psi = at.psi.copy()
                 psi[begin] = middle + step
                 own, _ = law.log_prior(psi[begin : begin + len(law.start)])
-                nats.append(evaluated(products, laws, at.log_noise, psi).nats - own)
+                nats.append(evaluate(products, laws, at.log_noise, psi).nats - own)
             unit = getattr(law, "unit", 1.0)
             out[key] = [(middle + GRID + np.log(unit)).tolist(), nats]
         begin += len(law.start)
     return out
 
 
-def sizes(found: richest_model.Judged) -> dict[str, list[float]]:
+def sizes(found: richest_model.FittedPoint) -> dict[str, list[float]]:
     """Of each effect in its likeliest setting, and each course: size and nats that it gains."""
     all_sets, space = space_at(found, EFFECTS, ())
     base = all_sets.judge({*found.base.remainder, LAG})
-    scan = beside(all_sets.made, base.keys, base.at)
+    scan = candidate_scan(all_sets.made, base.keys, base.at)
     out = {}
     for name, keys in {**space.effects, **{key: [key] for key in space.courses}}.items():
         if keys == [LAG]:
             continue
-        worth = scan.worth(keys)
+        worth = scan.log_bayes_factors(keys)
         key = max(worth, key=lambda one: worth[one])
         with_it = all_sets.judge(base.names | {key}, base)
         out[name] = [size_of(all_sets, with_it, key), with_it.score - base.score]

@@ -25,7 +25,9 @@ def held(values, rows):
 def notes_at_the_richest_model(track):
     """What is said of the columns before anything is searched."""
     problem, fit = begun(track, Spec())
-    return richest_model.richest(problem, fit.filtered, EFFECTS).base.made.point.problem.notes
+    return richest_model.fit_richest_model(
+        problem, fit.filtered, EFFECTS
+    ).base.made.point.problem.notes
 
 
 @pytest.fixture(scope="module")

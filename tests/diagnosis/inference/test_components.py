@@ -60,7 +60,7 @@ def test_squares_of_the_rates():
 
 
 def test_octaves_cover_all_cosines():
-    edges = noise_model.octaves(6000)
+    edges = noise_model.octave_edges(6000)
     assert edges[0] == 0
     assert edges[-1] == 6000
     assert len(edges) == priors.BANDS + 1
@@ -82,10 +82,10 @@ def test_a_wild_reading_counts_less_and_rows_that_are_normal_count_alike():
     rng = np.random.default_rng(2)
     residual = rng.normal(size=(2000, 3))
     used = np.ones(2000, dtype=bool)
-    calm = noise_model.loudness(residual, used, 10.0)
+    calm = noise_model.fit_noise_levels(residual, used, 10.0)
     assert np.ptp(np.log(calm.amplitude)) < 0.9  # the level alone, a median of forty
     residual[500:2000:50] = 30.0
-    weight = noise_model.loudness(residual, used, 10.0).amplitude
+    weight = noise_model.fit_noise_levels(residual, used, 10.0).amplitude
     assert np.all(weight[500:2000:50] > 5.0)
     assert np.median(weight) == pytest.approx(1.0, abs=0.15)
 
@@ -95,7 +95,7 @@ def test_rows_of_students_law_are_as_likely_as_that_law_says():
     rng = np.random.default_rng(5)
     scale = np.sqrt(rng.chisquare(3.0, size=4000) / 3.0)
     residual = rng.normal(size=(4000, 3)) / scale[:, None]
-    loud = noise_model.loudness(residual, np.ones(4000, dtype=bool), 20.0)
+    loud = noise_model.fit_noise_levels(residual, np.ones(4000, dtype=bool), 20.0)
     rows = residual / loud.amplitude[:, None]
     nats = loud.tails - 0.5 * np.sum(rows**2) - 3.0 * np.sum(np.log(loud.amplitude))
     nats -= 1.5 * len(rows) * np.log(2 * np.pi)
@@ -108,7 +108,7 @@ def test_the_level_follows_noise_that_is_louder_for_long():
     rng = np.random.default_rng(3)
     residual = rng.normal(size=(4000, 3))
     residual[2500:] *= 4.0
-    weight = noise_model.loudness(residual, np.ones(4000, dtype=bool), 10.0).amplitude
+    weight = noise_model.fit_noise_levels(residual, np.ones(4000, dtype=bool), 10.0).amplitude
     assert np.median(weight[3000:]) / np.median(weight[:2000]) == pytest.approx(4.0, rel=0.15)
 
 

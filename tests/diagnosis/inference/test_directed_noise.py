@@ -10,8 +10,8 @@ from tracks import coloured, experiment, track_of
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.inference.diagnose import begun, diagnose
-from ahrsd.diagnosis.inference.likelihood.directed_noise import Directed, directed
-from ahrsd.diagnosis.inference.likelihood.linearisation import first_point, linearised
+from ahrsd.diagnosis.inference.likelihood.directed_noise import DirectedNoise, fit_directed_noise
+from ahrsd.diagnosis.inference.likelihood.linearisation import initial_point, linearise
 from ahrsd.diagnosis.track import Spec
 
 AXIS = np.array([0.6, -0.7, 0.39]) / np.linalg.norm([0.6, -0.7, 0.39])
@@ -28,7 +28,7 @@ def test_noise_of_any_colour_that_is_independent_by_axis_has_no_direction():
     for _ in range(12):
         left = rng.normal(size=(3000, 3)) + coloured(rng, (3000, 3), (0.0, 1.0))
         left *= np.exp(rng.normal(size=3) * priors.AXES_DIFFER / 2)
-        most = max(most, directed(left, field_b, RATE_HZ, 1.0).nats)
+        most = max(most, fit_directed_noise(left, field_b, RATE_HZ, 1.0).nats)
     assert most < priors.UNKNOWN_ODDS / 2
 
 
@@ -37,7 +37,7 @@ def test_a_source_has_its_direction_its_octaves_and_its_power(band_hz: tuple[flo
     rng, level = np.random.default_rng(4), np.array([1.2, 1.0, 1 / 1.2])
     left = rng.normal(size=(6000, 3)) * level
     left += 0.5 * coloured(rng, (6000, 1), band_hz) * AXIS
-    found = directed(left, _field(6000), RATE_HZ, 1.0)
+    found = fit_directed_noise(left, _field(6000), RATE_HZ, 1.0)
     assert found.nats > 50.0
     assert abs(found.direction @ AXIS) > 0.98
     assert found.level == pytest.approx(level, rel=0.05)
@@ -54,7 +54,7 @@ def test_the_power_is_the_same_where_the_residual_was_divided_by_all_that_is_in_
     rng, band_hz = np.random.default_rng(7), (2.0, 6.0)
     left = rng.normal(size=(6000, 3)) + 2.0 * coloured(rng, (6000, 1), band_hz) * AXIS
     whole = float(np.mean(left**2))
-    found = directed(left / np.sqrt(whole), _field(6000), RATE_HZ, 1.0)
+    found = fit_directed_noise(left / np.sqrt(whole), _field(6000), RATE_HZ, 1.0)
     middle_hz = (found.edges_hz[1:] + found.edges_hz[:-1]) / 2
     cosines = np.diff(found.edges_hz) / found.edges_hz[-1]
     power = found.power(middle_hz, np.full(len(middle_hz), whole)) @ cosines
@@ -67,14 +67,14 @@ def test_what_a_loud_gyro_leaves_across_the_field_is_no_source():
     unit = field_b / np.linalg.norm(field_b, axis=1, keepdims=True)
     gyro = 2.0 * coloured(rng, (4000, 3), (0.0, 2.0))
     left = rng.normal(size=(4000, 3)) + gyro - np.sum(gyro * unit, axis=1, keepdims=True) * unit
-    assert directed(left, field_b, RATE_HZ, 1.0).nats < priors.UNKNOWN_ODDS
+    assert fit_directed_noise(left, field_b, RATE_HZ, 1.0).nats < priors.UNKNOWN_ODDS
 
 
 def test_whitened_rows_are_alike_on_all_axes_and_their_density_is_counted():
     track = track_of(experiment("wam", seed=14, samples=2000, sigma_mag=5e-4))
     problem, start = begun(track, Spec())
-    point = first_point(problem, start.filtered, ())
-    source = Directed(
+    point = initial_point(problem, start.filtered, ())
+    source = DirectedNoise(
         np.array([1.1, 1.0, 1 / 1.1]),
         AXIS,
         np.array([3.0, 0.5]),
@@ -82,8 +82,8 @@ def test_whitened_rows_are_alike_on_all_axes_and_their_density_is_counted():
         np.array([0.0, 1.0, 12.5]),
         99.0,
     )
-    plain = linearised(point, point.context)
-    made = linearised(replace(point, directed=source), point.context)
+    plain = linearise(point, point.context)
+    made = linearise(replace(point, directed=source), point.context)
     count = int(made.edges[-1])
     middle_hz = (made.edges[1:] + made.edges[:-1]) / 2 * problem.rate_hz / (2 * count)
     share = np.repeat(np.where(middle_hz < 1.0, 3.0, 0.5), np.diff(made.edges))

@@ -13,7 +13,12 @@ from scipy.stats import multivariate_normal
 from ahrsd.diagnosis.inference.components.component import FixedLaw, ScaledLaw
 from ahrsd.diagnosis.inference.components.gaussian_process import GaussianProcessLaw
 from ahrsd.diagnosis.inference.likelihood import noise_model
-from ahrsd.diagnosis.inference.likelihood.evidence import Products, evaluated, maximised, reached
+from ahrsd.diagnosis.inference.likelihood.evidence import (
+    Products,
+    evaluate,
+    maximise,
+    maximise_above,
+)
 
 ROWS, STEP = (20, 20, 40, 80), 0.7
 
@@ -71,13 +76,13 @@ LOG_NOISE, PSI = np.array([0.4, 0.1, -0.2, 0.3]), np.array([-0.4, -0.9, 0.2, 0.8
 
 def test_the_evidence_is_that_of_the_dense_gaussian():
     B, y = design(1, WIDTHS)
-    at = evaluated(products(B, y), laws(), LOG_NOISE, PSI)
+    at = evaluate(products(B, y), laws(), LOG_NOISE, PSI)
     assert at.nats == pytest.approx(dense(B, y, LOG_NOISE, PSI), abs=1e-6)
 
 
 def test_the_gradient_is_that_of_differences():
     B, y = design(2, WIDTHS)
-    at = evaluated(products(B, y), laws(), LOG_NOISE, PSI)
+    at = evaluate(products(B, y), laws(), LOG_NOISE, PSI)
     x = np.concatenate([LOG_NOISE, PSI])
     for k in range(len(x)):
         step = 1e-5 * np.eye(len(x))[k]
@@ -87,7 +92,7 @@ def test_the_gradient_is_that_of_differences():
 
 def test_the_mean_and_covariance_are_those_of_bayes():
     B, y = design(3, WIDTHS)
-    at = evaluated(products(B, y), laws(), LOG_NOISE, PSI)
+    at = evaluate(products(B, y), laws(), LOG_NOISE, PSI)
     weight = np.repeat(np.exp(-LOG_NOISE), ROWS)
     k, variance = 0, []
     for law in laws():
@@ -115,7 +120,7 @@ def test_adding_and_dropping_agree_on_200_hypotheses():
             even = (np.array([np.log(0.01)]), np.array([np.log(10.0)]))
             own = [ScaledLaw(np.ones(width), *even) for _ in chosen]
             begin = start or (np.full(4, 1.0), np.zeros(len(chosen)))
-            return maximised(products(B[:, columns], y), own, begin)
+            return maximise(products(B[:, columns], y), own, begin)
 
         rich = of(whole)
         dropped = of(few, (rich.log_noise, rich.psi[few]))
@@ -131,7 +136,7 @@ def test_what_is_not_there_is_small_and_what_is_there_is_found():
     B = rng.normal(size=(sum(ROWS), 16))
     y = B[:, :8] @ rng.normal(scale=2.0, size=8) + rng.normal(size=len(B))
     even = (np.array([np.log(0.01)]), np.array([np.log(10.0)]))
-    found = maximised(
+    found = maximise(
         products(B, y),
         [ScaledLaw(np.ones(8), *even), ScaledLaw(np.ones(8), *even)],
         (np.zeros(4), np.zeros(2)),
@@ -145,16 +150,16 @@ def test_a_climb_is_given_up_only_where_it_would_not_reach_what_is_asked():
     for seed in range(30):
         B, y = design(60 + seed, WIDTHS)
         start = (np.full(4, 1.5), np.full(len(PSI), -0.5))
-        top = maximised(products(B, y), laws(), start)
-        found = reached(products(B, y), laws(), start, top.nats - 0.1)
+        top = maximise(products(B, y), laws(), start)
+        found = maximise_above(products(B, y), laws(), start, top.nats - 0.1)
         assert found is not None
         assert found.nats == top.nats
-        assert reached(products(B, y), laws(), start, top.nats + 1e3) is None
+        assert maximise_above(products(B, y), laws(), start, top.nats + 1e3) is None
 
 
 def test_the_curvature_is_the_average_information_and_no_less_than_the_expected():
     B, y = design(6, WIDTHS)
-    at = evaluated(products(B, y), laws(), LOG_NOISE, PSI)
+    at = evaluate(products(B, y), laws(), LOG_NOISE, PSI)
     begin, variance, slopes, stiff = 0, [], [], []
     for law in laws():
         mine = PSI[begin : begin + len(law.start)]
@@ -172,7 +177,7 @@ def test_the_curvature_is_the_average_information_and_no_less_than_the_expected(
     average = 0.5 * Z.T @ P @ Z
     k = len(ROWS)
     found = at.curvature.copy()
-    found[:k, :k] -= noise_model.stiffness(k, STEP)
+    found[:k, :k] -= noise_model.prior_curvature(k, STEP)
     found[k:, k:] -= np.diag(np.concatenate(stiff))
     off = ~np.eye(len(found), dtype=bool)
     np.testing.assert_allclose(found[off], average[off], rtol=1e-6, atol=1e-9)
@@ -185,12 +190,12 @@ def test_the_maximum_is_that_of_another_climb():
     """Newton's steps against a quasi-Newton search of the same function, from far away."""
     for seed in range(10):
         B, y = design(20 + seed, WIDTHS)
-        found = maximised(products(B, y), laws(), (np.full(4, 1.5), np.zeros(4)))
+        found = maximise(products(B, y), laws(), (np.full(4, 1.5), np.zeros(4)))
 
         of_all = products(B, y)
 
         def cost(x, known=of_all):
-            at = evaluated(known, laws(), x[:4], x[4:])
+            at = evaluate(known, laws(), x[:4], x[4:])
             return -at.nats, -at.gradient
 
         low, high = noise_model.bounds(4)
@@ -202,7 +207,7 @@ def test_the_maximum_is_that_of_another_climb():
 
 
 def test_bands_that_stand_alone_may_have_any_power() -> None:
-    edges, alone = noise_model.with_band(noise_model.octaves(4000), 700, 900, 50)
+    edges, alone = noise_model.insert_narrow_bands(noise_model.octave_edges(4000), 700, 900, 50)
     assert edges.tolist() == [0, 62, 125, 250, 500, 700, 750, 800, 850, 900, 2000, 4000]
     assert edges[alone].tolist() == [700, 750, 800, 850]
     quiet = np.zeros(len(edges) - 1)
@@ -215,7 +220,7 @@ def test_bands_that_stand_alone_may_have_any_power() -> None:
     for k, one in enumerate(np.eye(len(loud))):
         up, down = (noise_model.log_prior(loud + d * one, STEP, alone)[0] for d in (1e-4, -1e-4))
         assert slope[k] == pytest.approx((up - down) / 2e-4, abs=1e-6)
-    expected = -noise_model.stiffness(len(loud), STEP, alone) @ loud
+    expected = -noise_model.prior_curvature(len(loud), STEP, alone) @ loud
     np.testing.assert_allclose(slope, expected, atol=1e-9)
 
 
@@ -235,6 +240,6 @@ def test_a_climb_goes_on_where_size_and_corner_are_nearly_one(size: float) -> No
     )
     law = GaussianProcessLaw(np.arange(1, count + 1).astype(float), 1.0)
     starts = [np.array([0.0, np.log(corner)]) for corner in (4.0, 36.0)]
-    low, high = (maximised(said, [law], (np.zeros(1), start)) for start in starts)
+    low, high = (maximise(said, [law], (np.zeros(1), start)) for start in starts)
     assert low.nats == pytest.approx(high.nats, abs=0.05)
     assert np.exp(low.psi[1]) == pytest.approx(40.0, rel=0.01)

@@ -27,26 +27,26 @@ from ahrsd.diagnosis.inference.components.ordinary_remainder import (
 )
 from ahrsd.diagnosis.inference.diagnose import broken_where_unsampled
 from ahrsd.diagnosis.inference.likelihood import richest_model
-from ahrsd.diagnosis.inference.likelihood.candidates import beside
-from ahrsd.diagnosis.inference.likelihood.evidence import evaluated
+from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
+from ahrsd.diagnosis.inference.likelihood.evidence import evaluate
 from ahrsd.diagnosis.inference.likelihood.linearisation import (
     CALIBRATION,
-    by_key,
-    first_point,
-    moved,
-    unread,
+    coefficients_by_key,
+    initial_point,
+    omit_readings,
+    step_to_maximum,
 )
-from ahrsd.diagnosis.inference.likelihood.linearisation import added as added_by
+from ahrsd.diagnosis.inference.likelihood.linearisation import total_contribution as added_by
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 from ahrsd.diagnosis.model import Columns
 from ahrsd.diagnosis.track import Spec, Track
 
 
-def richest(track: Track) -> richest_model.Judged:
+def richest(track: Track) -> richest_model.FittedPoint:
     problem, cold = problem_of(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
-    return richest_model.richest(problem, fit.filtered, EFFECTS)
+    return richest_model.fit_richest_model(problem, fit.filtered, EFFECTS)
 
 
 def delayed(track: Track, lag_s: float) -> Track:
@@ -57,7 +57,7 @@ def delayed(track: Track, lag_s: float) -> Track:
 
 
 @pytest.fixture(scope="module")
-def bare() -> richest_model.Judged:
+def bare() -> richest_model.FittedPoint:
     """A simulated recording without an accelerometer."""
     return richest(replace(track_of(experiment("wam", seed=8, samples=3000)), accel_b_m_s2=None))
 
@@ -73,17 +73,17 @@ def test_a_candidate_beside_a_model_is_worth_what_it_adds_to_the_evidence(bare):
     laws = [made.seen[key].component.law for key in keys]
     noise = np.linspace(-0.3, 0.4, len(made.edges) - 1)
     step = priors.NOISE_STEP_REAL
-    without = evaluated(made.products(keys, step), laws, noise, np.zeros(0))
+    without = evaluate(made.products(keys, step), laws, noise, np.zeros(0))
     both = (*keys, LAG)
     laws.append(made.seen[LAG].component.law)
-    with_it = evaluated(made.products(both, step), laws, noise, np.zeros(0))
-    worth = beside(made, keys, without).worth([LAG])
+    with_it = evaluate(made.products(both, step), laws, noise, np.zeros(0))
+    worth = candidate_scan(made, keys, without).log_bayes_factors([LAG])
     assert worth[LAG] == pytest.approx(with_it.nats - without.nats, abs=1e-5)
 
 
 def test_a_delay_that_is_long_is_found_from_none():
     found = richest(delayed(track_of(experiment("wam", seed=9, samples=4000)), 0.11))
-    value = by_key(found.base.made, found.base.whole, found.at)[LAG]
+    value = coefficients_by_key(found.base.made, found.base.whole, found.at)[LAG]
     assert value[0] == pytest.approx(0.11, abs=0.006)
 
 
@@ -140,8 +140,8 @@ def test_a_logged_cause_is_the_same_component_at_every_point():
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
     keys = []
     for one in (problem, problem.lagging(0.03)):
-        start = first_point(one, run_filter(one.track, fit.filtered.model), (LAG,))
-        keys.append(richest_model.base_of(start, EFFECTS, (), whole=False).whole)
+        start = initial_point(one, run_filter(one.track, fit.filtered.model), (LAG,))
+        keys.append(richest_model.build_base(start, EFFECTS, (), whole=False).whole)
     assert "gyro_bias_temperature as logged" in keys[0]
     assert set(keys[1]) - set(keys[0]) == {LAG_FORM}
 
@@ -154,9 +154,9 @@ def test_what_a_point_takes_out_of_the_readings_is_what_it_puts_back():
     track = replace(track, mag_b_gauss=track.mag_b_gauss + added)
     problem, cold = problem_of(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
-    here = richest_model.judged(first_point(problem, fit.filtered, (LAG,)), EFFECTS, ())
-    there = richest_model.judged(
-        moved(here.base.made, here.base.whole, here.at, delayed=False), EFFECTS, ()
+    here = richest_model.fit_at_point(initial_point(problem, fit.filtered, (LAG,)), EFFECTS, ())
+    there = richest_model.fit_at_point(
+        step_to_maximum(here.base.made, here.base.whole, here.at, delayed=False), EFFECTS, ()
     )
     made, values = there.base.made, there.base.made.point.values
     known = {key: made.seen[key].component for key in values if key != LAG}
@@ -179,9 +179,9 @@ def test_a_run_ends_where_a_step_turns_too_far_to_be_told():
 def test_a_span_in_which_something_was_moved_is_unread_and_the_gyro_carries_the_field_across():
     track = track_of(experiment("wam", seed=8, samples=3000))
     problem, cold = problem_of(track, Spec())
-    point = first_point(problem, fit_null(problem.track, problem.spec, cold).filtered, (LAG,))
+    point = initial_point(problem, fit_null(problem.track, problem.spec, cold).filtered, (LAG,))
     middle_s = float(np.median(track.time_s))
-    silent = unread(point, [(middle_s, middle_s + 6.0)])
+    silent = omit_readings(point, [(middle_s, middle_s + 6.0)])
     at_s = silent.filtered.track.time_s
     inside = (at_s > middle_s + 1.0) & (at_s < middle_s + 5.0)
     assert not silent.filtered.used[inside].any()

@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.inference.diagnose import diagnose
-from ahrsd.diagnosis.inference.likelihood.logged_columns import before_the_mean
+from ahrsd.diagnosis.inference.likelihood.logged_columns import deconvolve_mean
 
 PER_AMPERE = np.array([1.2e-3, -0.7e-3, 0.5e-3])
 
@@ -63,7 +63,7 @@ def test_ups_and_downs_are_as_they_were_before_the_mean(waves: float, rel: float
     time_s = np.arange(4000) * 0.04 + 0.002 * np.sin(np.arange(4000))
     turn = 2 * np.pi * waves / 0.8
     averaged = np.cos(turn * time_s + 0.3) * np.sinc(waves)
-    found = before_the_mean(time_s, averaged, 0.8)
+    found = deconvolve_mean(time_s, averaged, 0.8)
     inside = (time_s > 8.0) & (time_s < 150.0)
     wave = np.exp(-1j * turn * time_s[inside])
     before = np.abs(np.mean(wave * found[inside])) / np.abs(np.mean(wave * averaged[inside]))
@@ -73,5 +73,5 @@ def test_ups_and_downs_are_as_they_were_before_the_mean(waves: float, rel: float
 def test_what_a_mean_leaves_nothing_of_is_not_blown_up():
     rng = np.random.default_rng(1)
     noise = rng.normal(size=4000)
-    found = before_the_mean(np.arange(4000) * 0.04, noise, 0.8)
+    found = deconvolve_mean(np.arange(4000) * 0.04, noise, 0.8)
     assert np.std(found) < 4.0 * np.std(noise)

@@ -53,7 +53,7 @@ def with_current(track: Track, *, field: bool) -> Track:
 def sets_of(track: Track) -> tuple[Hypotheses, Space]:
     problem, cold = problem_of(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
-    return space_at(richest_model.richest(problem, fit.filtered, EFFECTS), EFFECTS, ())
+    return space_at(richest_model.fit_richest_model(problem, fit.filtered, EFFECTS), EFFECTS, ())
 
 
 @pytest.fixture(scope="module")
@@ -246,7 +246,9 @@ def test_a_source_that_is_in_no_set_fails_by_time_and_by_whiteness(track):
     pulse = ((t > 50.0) & (t < 75.0))[:, None] * np.array([4e-3, -3e-3, 2e-3])
     problem, cold = problem_of(replace(track, mag_b_gauss=track.mag_b_gauss + pulse), Spec())
     start = fit_null(problem.track, problem.spec, cold, walk=False)
-    all_sets, _ = space_at(richest_model.richest(problem, start.filtered, EFFECTS), EFFECTS, ())
+    all_sets, _ = space_at(
+        richest_model.fit_richest_model(problem, start.filtered, EFFECTS), EFFECTS, ()
+    )
     quiet = all_sets.judge({"free sensor"})
     bare = replace(all_sets.judge(NOTHING), at=replace(
         all_sets.judge(NOTHING).at, log_noise=quiet.at.log_noise))  # fmt: skip

@@ -88,7 +88,9 @@ def test_spells_are_found_to_a_second_and_what_was_tried_is_not_kept():
     track = replace(track, mag_b_gauss=track.mag_b_gauss + lamp)
     problem, cold = problem_of(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
-    all_sets, _ = space_at(richest_model.richest(problem, fit.filtered, EFFECTS), EFFECTS, ())
+    all_sets, _ = space_at(
+        richest_model.fit_richest_model(problem, fit.filtered, EFFECTS), EFFECTS, ()
+    )
     nothing = all_sets.judge(())
     known = set(all_sets.made.seen)
     comes = [one for one in switching(all_sets, nothing) if "spans_s" in one.setting]

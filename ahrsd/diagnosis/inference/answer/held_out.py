@@ -24,7 +24,7 @@ from scipy import linalg
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Heldout
 from ahrsd.diagnosis.inference.answer.residual_checks import WhiteRows, root_of, white_rows
-from ahrsd.diagnosis.inference.likelihood.candidates import averaged
+from ahrsd.diagnosis.inference.likelihood.candidates import averaged_log_bayes_factor
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Names
 from ahrsd.samples import Array
 
@@ -149,7 +149,9 @@ class HeldOut:
                 for right in (G[:known, known:], s[:known, None])
             )
             own, left = G[known:, known:] - W.T @ W, s[known:] - W.T @ seen[:, 0]
-            return np.array([averaged(own[cut, cut], left[cut], one) for cut in cuts])
+            return np.array(
+                [averaged_log_bayes_factor(own[cut, cut], left[cut], one) for cut in cuts]
+            )
 
         folds = len(parts.rows)
         without_one = sum((worth(number) for number in range(folds)), np.zeros(len(moved)))

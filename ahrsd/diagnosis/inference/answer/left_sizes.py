@@ -43,7 +43,7 @@ from ahrsd.diagnosis.inference.decision.members import (
     library_members,
     size_of,
 )
-from ahrsd.diagnosis.inference.likelihood.candidates import beside
+from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.diagnosis.inference.search_rounds import Searched
 from ahrsd.diagnosis.where_and_when import locate
@@ -191,7 +191,7 @@ def _nats(all_sets: Hypotheses, best: Hypothesis) -> dict[str, float]:
 
     Of a Gaussian: the prior's density where the coefficients are nothing, to the posterior's.
     """
-    scan = beside(all_sets.made, best.keys, best.at)
+    scan = candidate_scan(all_sets.made, best.keys, best.at)
     inverse = np.linalg.inv(scan.root)
     covariance = inverse.T @ inverse
     psi, out, begin = all_sets.psi_of(best), {}, 0

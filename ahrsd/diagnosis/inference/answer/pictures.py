@@ -11,7 +11,7 @@ from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.inference.answer.visibility import Seen
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.decision.members import added_by, coefficients
-from ahrsd.diagnosis.inference.likelihood.linearisation import moved
+from ahrsd.diagnosis.inference.likelihood.linearisation import step_to_maximum
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.diagnosis.inference.search_rounds import Searched
 from ahrsd.diagnosis.where_and_when.locate import FRAMES, Frame, Located, coarse_cut, single_source
@@ -32,7 +32,7 @@ def drawn(
     residual: (N, 3) what that leaves, white where the model is right
     """
     best = found.answer.best
-    after = moved(found.all_sets.made, best.keys, best.at).filtered
+    after = step_to_maximum(found.all_sets.made, best.keys, best.at).filtered
     return Drawn(
         after.track.time_s,
         start.filtered.whitened,

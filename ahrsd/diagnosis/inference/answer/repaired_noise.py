@@ -20,7 +20,12 @@ from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.data_quality.facts import Fact, around, lost_at, rounding
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.components.effect_components import LAG
-from ahrsd.diagnosis.inference.likelihood.linearisation import Point, added, by_key, moved
+from ahrsd.diagnosis.inference.likelihood.linearisation import (
+    Point,
+    coefficients_by_key,
+    step_to_maximum,
+    total_contribution,
+)
 from ahrsd.diagnosis.inference.recorded_rate import Quick, at_recorded_rate
 from ahrsd.diagnosis.inference.search_rounds import Searched
 from ahrsd.diagnosis.innovation_filter.noise import level_facts
@@ -48,11 +53,11 @@ def repaired_noise(
 def _with_names_alone(found: Searched) -> Point:
     """The point of an answer with nothing but its names taken out of the readings."""
     all_sets, best = found.all_sets, found.answer.best
-    values = by_key(all_sets.made, best.keys, best.at)
+    values = coefficients_by_key(all_sets.made, best.keys, best.at)
     names = {key: all_sets.component(key) for key in found.answer.keys if key != LAG}
     count = len(all_sets.made.context.track)
-    mag, gyro = added(count, names, {key: values[key] for key in names})
-    point = moved(all_sets.made, best.keys, best.at)
+    mag, gyro = total_contribution(count, names, {key: values[key] for key in names})
+    point = step_to_maximum(all_sets.made, best.keys, best.at)
     return replace(point, terms_mag=mag, terms_gyro=gyro)
 
 

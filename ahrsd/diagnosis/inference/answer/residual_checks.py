@@ -25,7 +25,7 @@ from ahrsd.diagnosis.answer.diagnosis import Check, RegimeMap, Whiteness
 from ahrsd.diagnosis.answer.omnibus import omnibus
 from ahrsd.diagnosis.answer.predictive_checks import COPIES, bands, scene_of, statistics
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
-from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, Linearised, by_frequency
+from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, Linearised, cosine_rows
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.diagnosis.innovation_filter.innovation import batches, joined, sensitivities
 from ahrsd.diagnosis.innovation_filter.noise import freedom_of
@@ -198,7 +198,7 @@ class WhiteRows:
         made, found = self.made, []
         for batch in batches(columns, _BATCH):
             cube = sensitivities(made.regressing, joined([columns[k] for k in batch]))
-            cube = made.as_loud(by_frequency(cube / made.point.loud.amplitude[:, None, None]))
+            cube = made.whiten_axes(cosine_rows(cube / made.point.loud.amplitude[:, None, None]))
             found.append((batch, self.like(cube)))
         cut = {
             number: part

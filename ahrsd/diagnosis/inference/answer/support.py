@@ -27,7 +27,7 @@ from ahrsd.diagnosis.inference.decision.acceptance import asked_odds
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.decision.unexplained import along_its_direction
 from ahrsd.diagnosis.inference.likelihood import noise_model
-from ahrsd.diagnosis.inference.likelihood.evidence import evaluated
+from ahrsd.diagnosis.inference.likelihood.evidence import evaluate
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.diagnosis.inference.search_rounds import Searched
 
@@ -193,7 +193,7 @@ def _resized(all_sets: Hypotheses, known: Hypothesis, factor: float, step: float
         for key, law in zip(known.keys, laws, strict=True)
     ]
     before, after = (
-        evaluated(products, each, known.at.log_noise, known.at.psi).nats for each in (laws, other)
+        evaluate(products, each, known.at.log_noise, known.at.psi).nats for each in (laws, other)
     )
     return after - before
 

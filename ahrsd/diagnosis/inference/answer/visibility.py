@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Limit
 from ahrsd.diagnosis.effects.effect import Effect
-from ahrsd.diagnosis.inference.likelihood.candidates import beside
+from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Names, Space
 from ahrsd.samples import Array
 
@@ -32,16 +32,16 @@ class Seen:
 def seen_alone(all_sets: Hypotheses, space: Space, names: Names) -> list[Seen]:
     """Every effect that could be asked, each in its likeliest setting, beside a set."""
     base = all_sets.judge(names)
-    scan = beside(all_sets.made, base.keys, base.at)
+    scan = candidate_scan(all_sets.made, base.keys, base.at)
     asked = {
         name: [key for key in keys if key not in base.names] for name, keys in space.effects.items()
     }
     if not any(asked.values()):
         return []
-    worth = scan.worth([key for keys in asked.values() for key in keys])
+    worth = scan.log_bayes_factors([key for keys in asked.values() for key in keys])
     best = [max(keys, key=lambda key: worth[key]) for keys in asked.values() if keys]
-    C, own, _ = all_sets.made.candidates(base.keys, best, scan.inverse)
-    W = scan.projected(C)
+    C, own, _ = all_sets.made.candidate_products(base.keys, best, scan.inverse)
+    W = scan.project(C)
     out, begin = [], 0
     for key, square in zip(best, own, strict=True):
         mine = slice(begin, begin + len(square))

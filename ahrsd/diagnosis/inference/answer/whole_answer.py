@@ -28,7 +28,7 @@ from ahrsd.diagnosis.inference.answer.left_sizes import told_sizes, with_channel
 from ahrsd.diagnosis.inference.answer.repaired_noise import loud_facts, repaired_noise
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.decision.members import nats_of_remainder
-from ahrsd.diagnosis.inference.likelihood.logged_columns import as_recorded
+from ahrsd.diagnosis.inference.likelihood.logged_columns import recorded_setting
 from ahrsd.diagnosis.inference.recorded_rate import Quick
 from ahrsd.diagnosis.inference.search_rounds import Searched
 from ahrsd.diagnosis.model import Term
@@ -100,7 +100,7 @@ def whole_answer(
 def _as_recorded(told: Sequence[Told], found: Searched) -> tuple[Told, ...]:
     """What was told by columns as they are read, with settings by the columns as they came."""
     problem = found.all_sets.made.point.problem
-    return tuple(replace(one, setting=as_recorded(one.setting, problem)) for one in told)
+    return tuple(replace(one, setting=recorded_setting(one.setting, problem)) for one in told)
 
 
 def _checked(

@@ -28,7 +28,7 @@ from ahrsd.diagnosis.inference.decision.members import (
     library_members,
 )
 from ahrsd.diagnosis.inference.decision.unexplained import is_along
-from ahrsd.diagnosis.inference.likelihood.candidates import beside
+from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.search.model_search import (
     Hypotheses,
     Hypothesis,
@@ -308,8 +308,8 @@ def _at_other_times(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     """
     copies = [all_sets.component(key).moved(share) for share in priors.SHIFTS]
     all_sets.made.add(copies)
-    scan = beside(all_sets.made, best.keys, best.at)
-    return max(0.0, *scan.worth([copy.key for copy in copies]).values())
+    scan = candidate_scan(all_sets.made, best.keys, best.at)
+    return max(0.0, *scan.log_bayes_factors([copy.key for copy in copies]).values())
 
 
 def _without(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> Hypothesis:

@@ -19,7 +19,7 @@ from ahrsd.diagnosis.inference.components.effect_components import (
 from ahrsd.diagnosis.inference.components.ordinary_remainder import GYRO_MATRIX, TURNS
 from ahrsd.diagnosis.inference.decision.members import added_by, coefficients, cost_if_left_out
 from ahrsd.diagnosis.inference.decision.which_delay import delay_unit, which_delay
-from ahrsd.diagnosis.inference.likelihood.candidates import beside
+from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.search.model_search import (
     Hypotheses,
     Hypothesis,
@@ -69,7 +69,7 @@ def _left_open(all_sets: Hypotheses, best: Hypothesis, key: str, value: Array) -
         return np.zeros(len(value))
     fewer = all_sets.judge(best.names - {key}, best)
     at = replace(fewer.at, log_noise=best.at.log_noise)
-    return beside(made, fewer.keys, at).likeliest(whole)[1][: len(value)]
+    return candidate_scan(made, fewer.keys, at).estimate(whole)[1][: len(value)]
 
 
 def _found(
@@ -107,8 +107,8 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
     named = {all_sets.component(k).effect for k in fewer.names}
     asked = [k for name, keys in space.effects.items() if name not in named for k in keys]
     asked = [k for k in asked if all_sets.is_asked(fewer.names, k)]
-    scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
-    worth = scan.worth([*dict.fromkeys([*asked, key])])
+    scan = candidate_scan(all_sets.made, fewer.keys, best.at_of(fewer))
+    worth = scan.log_bayes_factors([*dict.fromkeys([*asked, key])])
     by_name: dict[str, float] = {}
     for k, nats in worth.items():
         one = all_sets.component(k)

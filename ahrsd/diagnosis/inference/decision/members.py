@@ -13,7 +13,7 @@ from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
 from ahrsd.diagnosis.inference.components.component import ScaledLaw
 from ahrsd.diagnosis.inference.components.effect_components import LAG
 from ahrsd.diagnosis.inference.components.ordinary_remainder import still_intervals
-from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, model_of
+from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, model_from_coefficients
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.samples import Array
 
@@ -97,7 +97,7 @@ def cost_if_left_out(all_sets: Hypotheses, best: Hypothesis, key: str) -> Cost:
     middle, here = prior_of(made.point.problem.track).mean, made.point.filtered.model
     fewer = all_sets.judge(all_sets.without(best.names, key), best)
     left_out, known = (
-        model_of(coefficients(all_sets, one, CALIBRATION)[0] + middle, here)
+        model_from_coefficients(coefficients(all_sets, one, CALIBRATION)[0] + middle, here)
         for one in (fewer, best)
     )
     shift = np.linalg.norm(left_out.hard_iron_gauss - known.hard_iron_gauss)

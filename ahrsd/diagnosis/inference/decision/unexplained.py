@@ -17,7 +17,7 @@ from ahrsd.diagnosis.inference.decision.members import (
     library_members,
     size_of,
 )
-from ahrsd.diagnosis.inference.likelihood.directed_noise import Directed
+from ahrsd.diagnosis.inference.likelihood.directed_noise import DirectedNoise
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.where_and_when.address import AXES, departures
 from ahrsd.diagnosis.where_and_when.locate import Frame, single_source, unit_columns
@@ -75,7 +75,7 @@ def changing_source(
 
 
 def along_its_direction(
-    all_sets: Hypotheses, best: Hypothesis, source: Directed | None, named: Sequence[Array]
+    all_sets: Hypotheses, best: Hypothesis, source: DirectedNoise | None, named: Sequence[Array]
 ) -> Unexplained:
     """A source along whose direction the noise is louder: the octaves that have most of it.
 

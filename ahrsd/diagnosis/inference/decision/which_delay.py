@@ -17,7 +17,7 @@ from ahrsd.diagnosis.inference.components.effect_components import (
     plain_delay,
 )
 from ahrsd.diagnosis.inference.decision.members import coefficients
-from ahrsd.diagnosis.inference.likelihood.candidates import beside
+from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.samples import Array
 
@@ -59,8 +59,8 @@ def _nats_of_filter(all_sets: Hypotheses, best: Hypothesis, tau: float) -> float
         value, deviation = (float(one[0]) for one in coefficients(all_sets, best, LAG_FORM))
     else:
         form = delay_form(all_sets.made.context, tau)
-        scan = beside(all_sets.made, best.keys, best.at)
-        value, deviation = (float(one[0]) for one in scan.likeliest(form))
+        scan = candidate_scan(all_sets.made, best.keys, best.at)
+        value, deviation = (float(one[0]) for one in scan.estimate(form))
     shown = max(deviation**-2 - priors.LAG_IS_FILTER**-2, 1e-9)  # without what was believed before
     part = value / (deviation**2 * shown)
     nats = shown * (part - 0.5)

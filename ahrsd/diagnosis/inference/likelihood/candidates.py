@@ -10,13 +10,13 @@ from scipy.linalg import cholesky, solve_triangular
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.inference.components.component import Component
-from ahrsd.diagnosis.inference.likelihood.evidence import At
+from ahrsd.diagnosis.inference.likelihood.evidence import ModelFit
 from ahrsd.diagnosis.inference.likelihood.linearisation import Linearised
 from ahrsd.samples import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Beside:
+class CandidateScan:
     """A model in its noise, beside which candidates are asked.
 
     at: its coefficients and noise
@@ -25,45 +25,51 @@ class Beside:
 
     made: Linearised
     keys: Sequence[str]
-    at: At
+    at: ModelFit
     inverse: Array
     root: Array
     seen: Array
 
-    def projected(self, products: Array) -> Array:
+    def project(self, products: Array) -> Array:
         """(q, p) root^-1 times products of the model with candidates."""
         return np.asarray(solve_triangular(self.root, products, lower=True, check_finite=False))
 
-    def in_quiet(self) -> Beside:
+    def at_sensor_noise(self) -> CandidateScan:
         """The same in the sensor's own noise: what a candidate explains is noise still."""
         noise = np.minimum(self.at.log_noise, self.at.log_noise[-1])
-        return beside(self.made, self.keys, replace(self.at, log_noise=noise))
+        return candidate_scan(self.made, self.keys, replace(self.at, log_noise=noise))
 
-    def likeliest(self, one: Component) -> tuple[Array, Array]:
+    def estimate(self, candidate: Component) -> tuple[Array, Array]:
         """(q,) coefficients of a candidate of the largest size, and their deviations."""
-        self.made.add([one])
-        C, own, s = self.made.candidates(self.keys, [one.key], self.inverse)
-        W = self.projected(C)
-        G = own[0] - W.T @ W
-        G[np.diag_indices_from(G)] += np.exp(-one.law.log_variance(one.law.high))
+        self.made.add([candidate])
+        cross_products, own_products, s = self.made.candidate_products(
+            self.keys, [candidate.key], self.inverse
+        )
+        W = self.project(cross_products)
+        G = own_products[0] - W.T @ W
+        G[np.diag_indices_from(G)] += np.exp(-candidate.law.log_variance(candidate.law.high))
         covariance = np.linalg.inv(G)
         return covariance @ (s - self.seen @ W), np.sqrt(np.diagonal(covariance))
 
-    def worth(self, candidates: Sequence[str]) -> dict[str, float]:
+    def log_bayes_factors(self, candidates: Sequence[str]) -> dict[str, float]:
         """Log Bayes factor of each candidate, sizes averaged."""
-        C, own, s = self.made.candidates(self.keys, candidates, self.inverse)
-        W = self.projected(C)
-        left = s - self.seen @ W
+        cross_products, own_products, s = self.made.candidate_products(
+            self.keys, candidates, self.inverse
+        )
+        W = self.project(cross_products)
+        residual_score = s - self.seen @ W
         out, begin = {}, 0
-        for key, square in zip(candidates, own, strict=True):
-            part = slice(begin, begin + len(square))
-            begin += len(square)
-            G = square - W[:, part].T @ W[:, part]
-            out[key] = averaged(G, left[part], self.made.seen[key].component)
+        for key, own_information in zip(candidates, own_products, strict=True):
+            part = slice(begin, begin + len(own_information))
+            begin += len(own_information)
+            G = own_information - W[:, part].T @ W[:, part]
+            out[key] = averaged_log_bayes_factor(
+                G, residual_score[part], self.made.seen[key].component
+            )
         return out
 
 
-def beside(made: Linearised, keys: Sequence[str], at: At) -> Beside:
+def candidate_scan(made: Linearised, keys: Sequence[str], at: ModelFit) -> CandidateScan:
     """A model beside which candidates are asked."""
     products = made.products(keys, priors.NOISE_STEP_REAL)
     inverse = np.exp(-at.log_noise)
@@ -76,10 +82,10 @@ def beside(made: Linearised, keys: Sequence[str], at: At) -> Beside:
     A[np.diag_indices_from(A)] += np.exp(-np.concatenate(phi))
     root = cholesky(A, lower=True, check_finite=False)
     seen = solve_triangular(root, inverse @ products.s, lower=True, check_finite=False)
-    return Beside(made, tuple(keys), at, inverse, root, seen)
+    return CandidateScan(made, tuple(keys), at, inverse, root, seen)
 
 
-def averaged(G: Array, s: Array, component: Component) -> float:
+def averaged_log_bayes_factor(G: Array, s: Array, component: Component) -> float:
     """Log Bayes factor of a component with information G (p, p) and score s (p,)."""
     variance = component.law.log_variance(np.zeros(len(component.law.start)))
     deviation = np.exp(0.5 * variance)

@@ -16,74 +16,82 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.columns.clocks import Late, at_clock, likeliest_clock, suspects
 from ahrsd.diagnosis.effects.design_matrix import on_axes
 from ahrsd.diagnosis.inference.components.component import Component, ScaledLaw
-from ahrsd.diagnosis.inference.likelihood.candidates import beside
-from ahrsd.diagnosis.inference.likelihood.evidence import At
-from ahrsd.diagnosis.inference.likelihood.linearisation import by_key, linearised
-from ahrsd.diagnosis.inference.likelihood.richest_model import RICH_COURSES, Judged, psi_by_key
+from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
+from ahrsd.diagnosis.inference.likelihood.evidence import ModelFit
+from ahrsd.diagnosis.inference.likelihood.linearisation import coefficients_by_key, linearise
+from ahrsd.diagnosis.inference.likelihood.richest_model import RICH_COURSES, FittedPoint, psi_by_key
 from ahrsd.diagnosis.model import Columns
 from ahrsd.diagnosis.where_and_when.locate import Located, segments
 
-_COURSE = RICH_COURSES[0]
+_FREE_FIELD = RICH_COURSES[0]
 
 
-def wrong_clock(found: Judged) -> Late | None:
+def find_wrong_clock(fitted: FittedPoint) -> Late | None:
     """The clock of the column that explains most of the richest model's free course, if wrong."""
-    track = found.base.made.context.track
+    track = fitted.base.made.context.track
     if not track.covariates:
         return None
-    asked = suspects(_course(found), track)
-    asked = [one for one in asked if abs(one[0]) > priors.ON_TIME_S]
-    return likeliest_clock(_EvidenceBesideModel(found, asked[0][1]), asked[0][0]) if asked else None
+    suspected = suspects(_free_field(fitted), track)
+    suspected = [one for one in suspected if abs(one[0]) > priors.ON_TIME_S]
+    return (
+        likeliest_clock(_ClockEvidence(fitted, suspected[0][1]), suspected[0][0])
+        if suspected
+        else None
+    )
 
 
-def _course(found: Judged) -> Located:
+def _free_field(fitted: FittedPoint) -> Located:
     """The free course on the sensor, stretch by stretch."""
-    base, track = found.base, found.base.made.context.track
+    base, track = fitted.base, fitted.base.made.context.track
     cut = segments(track.time_s, max(2, int(track.duration_s / priors.ON_TIME_S)))
-    value, unsure = (
-        by_key(base.made, base.whole, at)[_COURSE].reshape(-1, 3)
-        for at in (found.at, replace(found.at, mean=found.at.deviation))
+    value, coefficient_deviation = (
+        coefficients_by_key(base.made, base.whole, at)[_FREE_FIELD].reshape(-1, 3)
+        for at in (fitted.at, replace(fitted.at, mean=fitted.at.deviation))
     )
     phase = np.pi * (cut.middle_s - track.time_s[0]) / track.duration_s
     waves = np.cos(phase[:, None] * np.arange(1, len(value) + 1))
-    deviation = np.sqrt(np.mean(waves**2 @ unsure**2, axis=1))
+    deviation = np.sqrt(np.mean(waves**2 @ coefficient_deviation**2, axis=1))
     flat = np.array([1.0, 0.0, 0.0])
     return Located("sensor", 0.0, cut, waves @ value, deviation, flat)
 
 
-class _EvidenceBesideModel:
+class _ClockEvidence:
     """A field by one column at other times, against the readings beside a model."""
 
-    def __init__(self, found: Judged, column: str) -> None:
-        base, track = found.base, found.base.made.context.track
+    def __init__(self, fitted: FittedPoint, column: str) -> None:
+        base, track = fitted.base, fitted.base.made.context.track
         self.column, self.duration_s = column, track.duration_s
         self.middle_s = float(track.time_s[0] + track.time_s[-1]) / 2
-        made = linearised(base.made.point, base.made.context)
+        made = linearise(base.made.point, base.made.context)
         parts = [base.made.seen[key].component for key in base.whole]
-        self._parts = [one for one in parts if one.key != _COURSE and not self._follows(one)]
+        self._parts = [
+            one for one in parts if one.key != _FREE_FIELD and not self._depends_on_column(one)
+        ]
         made.add(self._parts)
-        made.put_back({
+        made.add_back({
             key: value for key, value in made.point.values.items() if key in made.seen
         })  # fmt: skip
         self._keys = tuple(one.key for one in self._parts)
-        psi = psi_by_key(base.made, base.whole, found.at)
+        psi = psi_by_key(base.made, base.whole, fitted.at)
         at = np.concatenate([*(psi[key] for key in self._keys), np.zeros(0)])
-        self._made, self._at = made, replace(found.at, psi=at)
+        self._made, self._at = made, replace(fitted.at, psi=at)
 
-    def _follows(self, one: Component) -> bool:
+    def _depends_on_column(self, one: Component) -> bool:
         return one.setting.get("covariate") == self.column
 
     def nats(self, clocks: Sequence[tuple[float, float]]) -> list[float]:
         """Log Bayes factors."""
-        new = [self._component(clock) for clock in clocks]
-        self._made.add(new)
-        at: At = self._at
-        worth = beside(self._made, self._keys, at).worth([one.key for one in new])
-        return [worth[one.key] for one in new]
+        candidates = [self._component(clock) for clock in clocks]
+        self._made.add(candidates)
+        at: ModelFit = self._at
+        worth = candidate_scan(self._made, self._keys, at).log_bayes_factors(
+            [one.key for one in candidates]
+        )
+        return [worth[one.key] for one in candidates]
 
     def _component(self, clock: tuple[float, float]) -> Component:
-        course = at_clock(self._made.context.track, self.column, clock, self.middle_s)
-        scaled = course / max(float(np.std(course)), 1e-300)
+        values = at_clock(self._made.context.track, self.column, clock, self.middle_s)
+        scaled = values / max(float(np.std(values)), 1e-300)
         low, high = np.log(priors.EFFECT_SIZES)
         law = ScaledLaw(np.full(3, priors.COURSE_UNIT["sensor"]), np.array([low]), np.array([high]))
         columns = Columns(mag=on_axes(scaled[:, None]))

@@ -40,16 +40,16 @@ from ahrsd.diagnosis.inference.likelihood import noise_model
 from ahrsd.samples import Array
 
 #: relative: columns that are alike but for rounding would else leave no root
-_ROUNDED = 1e-10
+_JITTER = 1e-10
 #: a maximum is reached where a step would gain less, nats; steps; and the longest, of a logarithm
-_FLAT, _STEPS, _LONGEST = 0.02, 40, 2.0
+_CONVERGED_NATS, _MOST_STEPS, _LONGEST_STEP = 0.02, 40, 2.0
 #: how many times what a step foretells the rest of a climb may gain
-_HOPED = 5.0
+_HOPED_FACTOR = 5.0
 #: parts of a step that are tried
-_PARTS = (1.0, 0.3, 0.1, 0.02)
+_STEP_SHARES = (1.0, 0.3, 0.1, 0.02)
 #: curvature of a logarithm that nothing tells of;  parts of the curvature's diagonal that are added
 #: to it until a step leads up
-_LOOSE, _DAMPED = 0.02, (0.0, 0.1, 1.0, 10.0)
+_LEAST_CURVATURE, _DAMPING = 0.02, (0.0, 0.1, 1.0, 10.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +69,7 @@ class Products:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class At:
+class ModelFit:
     """The model at one point of its hyperparameters.
 
     nats: log likelihood and log priors; -inf where rounding is more than what is left
@@ -87,7 +87,7 @@ class At:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Prior:
+class _JointPrior:
     """The laws at one psi: log variances (q,), slopes (q, k), log density with slope, stiffness."""
 
     phi: Array
@@ -98,7 +98,7 @@ class _Prior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Noise:
+class _BandResiduals:
     """Of each band: expected square (B,), square of the likeliest residual (B,), B^T r (B, q)."""
 
     expected: Array
@@ -106,119 +106,132 @@ class _Noise:
     turned: Array
 
 
-def evaluated(products: Products, laws: Sequence[Law], log_noise: Array, psi: Array) -> At:
+def evaluate(products: Products, laws: Sequence[Law], log_noise: Array, psi: Array) -> ModelFit:
     """The log marginal likelihood with its priors, at these hyperparameters."""
-    prior, inverse = _laws(laws, psi), np.exp(-log_noise)
+    prior, inverse = _joint_prior(laws, psi), np.exp(-log_noise)
     deviation = np.exp(0.5 * prior.phi)
     scaled = deviation * (inverse @ products.s)
-    found, log_det = _inverse(products, inverse, deviation)
-    m = found @ scaled
-    sure = 1.0 - np.diag(found)
-    by_phi = 0.5 * (m**2 - sure)
-    noise = _noise(products, found, m * deviation, deviation)
-    by_noise = 0.5 * (noise.expected * inverse - products.rows)
-    of_noise, slope_of_noise = noise_model.log_prior(log_noise, products.step, products.alone)
-    left = float(products.square @ inverse) - float(m @ scaled)
-    likelihood = -0.5 * float(products.rows @ (log_noise + np.log(2 * np.pi)) + log_det + left)
-    return At(
-        likelihood + prior.nats + of_noise if left > 0.0 else -np.inf,
-        np.concatenate([by_noise + slope_of_noise, prior.slopes.T @ by_phi + prior.gradient]),
-        _curvature(products, prior, noise, found, m, inverse),
+    A_inverse, log_det = _invert(products, inverse, deviation)
+    m = A_inverse @ scaled
+    certainty = 1.0 - np.diag(A_inverse)
+    slope_by_phi = 0.5 * (m**2 - certainty)
+    noise = _band_residuals(products, A_inverse, m * deviation, deviation)
+    slope_by_noise = 0.5 * (noise.expected * inverse - products.rows)
+    noise_log_prior, noise_prior_slope = noise_model.log_prior(
+        log_noise, products.step, products.alone
+    )
+    residual_square = float(products.square @ inverse) - float(m @ scaled)
+    likelihood = -0.5 * float(
+        products.rows @ (log_noise + np.log(2 * np.pi)) + log_det + residual_square
+    )
+    return ModelFit(
+        likelihood + prior.nats + noise_log_prior if residual_square > 0.0 else -np.inf,
+        np.concatenate(
+            [slope_by_noise + noise_prior_slope, prior.slopes.T @ slope_by_phi + prior.gradient]
+        ),
+        _curvature(products, prior, noise, A_inverse, m, inverse),
         m * deviation,
-        deviation * np.sqrt(np.diag(found)),
+        deviation * np.sqrt(np.diag(A_inverse)),
         log_noise,
         psi,
     )
 
 
-def _inverse(products: Products, inverse: Array, deviation: Array) -> tuple[Array, float]:
+def _invert(products: Products, inverse: Array, deviation: Array) -> tuple[Array, float]:
     """A^-1 of A = I + D G D, and log |A|."""
     A = (inverse @ products.G.reshape(len(inverse), -1)).reshape(products.G.shape[1:])
     A *= deviation
     A *= deviation[:, None]
     diagonal = np.diag_indices_from(A)
-    A[diagonal] = A[diagonal] * (1.0 + _ROUNDED) + 1.0
-    root, broken = linalg.lapack.dpotrf(A.T, lower=0, overwrite_a=1, clean=1)
-    if broken:
+    A[diagonal] = A[diagonal] * (1.0 + _JITTER) + 1.0
+    root, info = linalg.lapack.dpotrf(A.T, lower=0, overwrite_a=1, clean=1)
+    if info:
         raise np.linalg.LinAlgError("the columns of a model are alike to the last digit")
     log_det = 2.0 * float(np.sum(np.log(np.diag(root))))
     half, _ = linalg.lapack.dpotri(root, lower=0, overwrite_c=1)
-    own = np.diag(half).copy()
-    found = half + half.T
-    found[diagonal] = own
-    return np.asarray(found), log_det
+    half_diagonal = np.diag(half).copy()
+    A_inverse = half + half.T
+    A_inverse[diagonal] = half_diagonal
+    return np.asarray(A_inverse), log_det
 
 
-def _noise(products: Products, found: Array, mean: Array, deviation: Array) -> _Noise:
+def _band_residuals(
+    products: Products, A_inverse: Array, mean: Array, deviation: Array
+) -> _BandResiduals:
     fitted = products.G @ mean
     square = products.square - 2 * products.s @ mean + fitted @ mean
-    covariance = found * deviation
+    covariance = A_inverse * deviation
     covariance *= deviation[:, None]
-    unsure = products.G.reshape(len(square), -1) @ covariance.ravel()
-    return _Noise(square + unsure, square, products.s - fitted)
+    uncertainty = products.G.reshape(len(square), -1) @ covariance.ravel()
+    return _BandResiduals(square + uncertainty, square, products.s - fitted)
 
 
 def _curvature(
-    products: Products, prior: _Prior, noise: _Noise, found: Array, m: Array, inverse: Array
+    products: Products,
+    prior: _JointPrior,
+    noise: _BandResiduals,
+    A_inverse: Array,
+    m: Array,
+    inverse: Array,
 ) -> Array:
     """Average information of (log v, psi), its diagonal at least the expected, and the priors'."""
     deviation, count = np.exp(0.5 * prior.phi), len(inverse)
-    turned = noise.turned * inverse[:, None] * deviation
-    seen = turned @ found
+    projected = noise.turned * inverse[:, None] * deviation
+    projected_A_inverse = projected @ A_inverse
     by_phi = prior.slopes * m[:, None]
-    unlike = -found
-    unlike[np.diag_indices_from(unlike)] += 1.0
+    M = -A_inverse
+    M[np.diag_indices_from(M)] += 1.0
     H = np.zeros((count + by_phi.shape[1],) * 2)
-    H[:count, :count] = np.diag(noise.square * inverse) - seen @ turned.T
-    H[:count, count:] = seen @ by_phi
+    H[:count, :count] = np.diag(noise.square * inverse) - projected_A_inverse @ projected.T
+    H[:count, count:] = projected_A_inverse @ by_phi
     H[count:, :count] = H[:count, count:].T
-    H[count:, count:] = by_phi.T @ unlike @ by_phi
-    unsure = (noise.expected - noise.square) * inverse
+    H[count:, count:] = by_phi.T @ M @ by_phi
+    uncertainty = (noise.expected - noise.square) * inverse
     expected = [
-        products.rows - unsure,
-        np.einsum("ik,ij,jk->k", prior.slopes, unlike**2, prior.slopes, optimize=True),
+        products.rows - uncertainty,
+        np.einsum("ik,ij,jk->k", prior.slopes, M**2, prior.slopes, optimize=True),
     ]
-    own = np.diag_indices_from(H)
-    H[own] = np.maximum(H[own], np.concatenate(expected))
+    diagonal = np.diag_indices_from(H)
+    H[diagonal] = np.maximum(H[diagonal], np.concatenate(expected))
     H *= 0.5
-    H[:count, :count] += noise_model.stiffness(count, products.step, products.alone)
-    H[own] += np.concatenate([np.zeros(count), prior.stiffness])
+    H[:count, :count] += noise_model.prior_curvature(count, products.step, products.alone)
+    H[diagonal] += np.concatenate([np.zeros(count), prior.stiffness])
     return H
 
 
-def _laws(laws: Sequence[Law], psi: Array) -> _Prior:
+def _joint_prior(laws: Sequence[Law], psi: Array) -> _JointPrior:
     """The laws together."""
     starts = np.cumsum([0, *(len(law.start) for law in laws)])
-    mine = [psi[a:b] for a, b in itertools.pairwise(starts)]
-    phi = [law.log_variance(one) for law, one in zip(laws, mine, strict=True)]
-    rows = np.cumsum([0, *(len(one) for one in phi)])
+    psi_of_laws = [psi[a:b] for a, b in itertools.pairwise(starts)]
+    phi = [law.log_variance(law_psi) for law, law_psi in zip(laws, psi_of_laws, strict=True)]
+    rows = np.cumsum([0, *(len(law_psi) for law_psi in phi)])
     slopes = np.zeros((rows[-1], starts[-1]))
     gradient, stiffness, nats = np.zeros(starts[-1]), np.zeros(starts[-1]), 0.0
-    for k, (law, one) in enumerate(zip(laws, mine, strict=True)):
+    for k, (law, law_psi) in enumerate(zip(laws, psi_of_laws, strict=True)):
         own = slice(starts[k], starts[k + 1])
-        slopes[rows[k] : rows[k + 1], own] = law.slope(one)
-        density, gradient[own] = law.log_prior(one)
+        slopes[rows[k] : rows[k + 1], own] = law.slope(law_psi)
+        density, gradient[own] = law.log_prior(law_psi)
         stiffness[own] = law.stiffness
         nats += density
-    return _Prior(np.concatenate(phi), slopes, nats, gradient, stiffness)
+    return _JointPrior(np.concatenate(phi), slopes, nats, gradient, stiffness)
 
 
-def maximised(products: Products, laws: Sequence[Law], start: tuple[Array, Array]) -> At:
+def maximise(products: Products, laws: Sequence[Law], start: tuple[Array, Array]) -> ModelFit:
     """The likeliest hyperparameters, climbed to from a start (log noise, psi)."""
-    found = reached(products, laws, start, -np.inf)
+    found = maximise_above(products, laws, start, -np.inf)
     if found is None:
         raise ValueError("a climb that nothing ends has an end")
     return found
 
 
-def reached(
+def maximise_above(
     products: Products,
     laws: Sequence[Law],
     start: tuple[Array, Array],
-    asked: float,
+    required: float,
     *,
-    small: Sequence[int] = (),
-) -> At | None:
+    start_small: Sequence[int] = (),
+) -> ModelFit | None:
     """The same, None as soon as the climb will surely not reach so many nats.
 
     Newton's steps with the average information, between the ends of what is allowed.
@@ -230,25 +243,27 @@ def reached(
     low = np.concatenate([low, *(law.low for law in laws)])
     high = np.concatenate([high, *(law.high for law in laws)])
     x = np.clip(np.concatenate(start), low, high)
-    at = evaluated(products, laws, x[:count], x[count:])
-    if small:
+    at = evaluate(products, laws, x[:count], x[count:])
+    if start_small:
         first = np.cumsum([count, *(len(law.start) for law in laws)])
-        least = x.copy()
-        for k in small:
-            least[first[k] : first[k + 1]] = low[first[k] : first[k + 1]]
-        if (there := evaluated(products, laws, least[:count], least[count:])).nats > at.nats:
-            x, at = least, there
-    for _ in range(_STEPS):
-        step = _newton(at, x, low, high)
+        smallest = x.copy()
+        for k in start_small:
+            smallest[first[k] : first[k + 1]] = low[first[k] : first[k + 1]]
+        if (
+            fit_smallest := evaluate(products, laws, smallest[:count], smallest[count:])
+        ).nats > at.nats:
+            x, at = smallest, fit_smallest
+    for _ in range(_MOST_STEPS):
+        step = _newton_step(at, x, low, high)
         gain = 0.5 * float(at.gradient @ step)
-        if at.nats + _HOPED * max(gain, _FLAT) < asked:
+        if at.nats + _HOPED_FACTOR * max(gain, _CONVERGED_NATS) < required:
             return None
-        step *= min(1.0, _LONGEST / max(float(np.max(np.abs(step))), 1e-300))
-        if 0.5 * float(at.gradient @ step) < _FLAT:
+        step *= min(1.0, _LONGEST_STEP / max(float(np.max(np.abs(step))), 1e-300))
+        if 0.5 * float(at.gradient @ step) < _CONVERGED_NATS:
             break
-        for part in _PARTS:
+        for part in _STEP_SHARES:
             new = np.clip(x + part * step, low, high)
-            found = evaluated(products, laws, new[:count], new[count:])
+            found = evaluate(products, laws, new[:count], new[count:])
             if found.nats > at.nats:
                 break
         else:
@@ -257,39 +272,39 @@ def reached(
     return at
 
 
-def _newton(at: At, x: Array, low: Array, high: Array) -> Array:
+def _newton_step(at: ModelFit, x: Array, low: Array, high: Array) -> Array:
     """The step to the maximum of the quadratic that this point shows, inside of what is allowed.
 
     Where a logarithm ends at what is allowed and hardly differs from another, as the size and the
     corner of a course, what is left of the step may lead down: then a shorter one is taken.
     """
     step = np.zeros(len(x))
-    for damped in _DAMPED:
-        step = _bounded(at, x, low, high, damped)
+    for damping in _DAMPING:
+        step = _bounded_step(at, x, low, high, damping)
         if float(at.gradient @ step) >= 0.0:
             break
     return step
 
 
-def _bounded(at: At, x: Array, low: Array, high: Array, damped: float) -> Array:
+def _bounded_step(at: ModelFit, x: Array, low: Array, high: Array, damping: float) -> Array:
     """The step with so much of the curvature's diagonal added to it, end after end held."""
     g = at.gradient
-    H = at.curvature + np.diag(_LOOSE + damped * np.diag(at.curvature))
+    H = at.curvature + np.diag(_LEAST_CURVATURE + damping * np.diag(at.curvature))
     step = np.zeros(len(x))
     free = ~(((x <= low) & (g < 0.0)) | ((x >= high) & (g > 0.0)))
     while np.any(free):
-        rest = g[free] - H[np.ix_(free, ~free)] @ step[~free]
-        step[free] = _solved(H[np.ix_(free, free)], rest)
-        inside = np.clip(step, low - x, high - x)
-        beyond = free & (inside != step)
-        step = inside
-        if not np.any(beyond):
+        remaining_gradient = g[free] - H[np.ix_(free, ~free)] @ step[~free]
+        step[free] = _solve_scaled(H[np.ix_(free, free)], remaining_gradient)
+        allowed = np.clip(step, low - x, high - x)
+        clipped = free & (allowed != step)
+        step = allowed
+        if not np.any(clipped):
             break
-        free &= ~beyond
+        free &= ~clipped
     return step
 
 
-def _solved(H: Array, g: Array) -> Array:
+def _solve_scaled(H: Array, g: Array) -> Array:
     """H^-1 g of a curvature, each hyperparameter in its own unit.
 
     Beside something a thousand times louder than the noise some curvatures are 1e12 times others,

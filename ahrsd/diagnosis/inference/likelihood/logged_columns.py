@@ -22,22 +22,22 @@ from ahrsd.diagnosis.columns.roles import shown
 from ahrsd.diagnosis.effects.effect import Effect, Setting
 from ahrsd.diagnosis.inference.components import effect_components
 from ahrsd.diagnosis.inference.components.effect_components import LATE_STEP_S
-from ahrsd.diagnosis.inference.likelihood.candidates import Beside, beside
-from ahrsd.diagnosis.inference.likelihood.evidence import At
+from ahrsd.diagnosis.inference.likelihood.candidates import CandidateScan, candidate_scan
+from ahrsd.diagnosis.inference.likelihood.evidence import ModelFit
 from ahrsd.diagnosis.inference.likelihood.linearisation import Linearised
 from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
 #: rounds in which the likeliest mean is sought more finely
-_FINER = 2
+_REFINEMENT_ROUNDS = 2
 #: nats of a problem beside calibration, delay and logged causes
-Likely = Callable[[Problem], float]
+LogLikelihood = Callable[[Problem], float]
 Library = Mapping[str, Effect]
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class LoggerModel:
     """How a column was logged: means over `mean_s`, and `late_s` late (early where negative)."""
 
     column: str
@@ -57,56 +57,58 @@ class Reading:
         way = "late" if self.late_s > 0.0 else "early"
         return ", ".join([*how, *[f"logged {abs(self.late_s):.2g} s {way}"] * bool(self.late_s)])
 
-    def of(self, track: Track) -> Track:
+    def before_logging(self, track: Track) -> Track:
         """A track with the column as it was before it was logged."""
         values, time_s = track.covariates[self.column], track.time_s
         if self.mean_s > 0.0:
-            values = before_the_mean(time_s, values, self.mean_s)
+            values = deconvolve_mean(time_s, values, self.mean_s)
         values = np.interp(time_s + self.late_s, time_s, values)
         return track.with_columns({**track.covariates, self.column: values})
 
-    def neighbours(self, round_: int) -> list[Reading]:
+    def neighbours(self, round_: int) -> list[LoggerModel]:
         """Readings that are a little earlier and later, and of means of less and more."""
         step_s, factor = LATE_STEP_S / 2 ** (1 + round_), 2.0 ** (0.5 ** (1 + round_))
         around = [replace(self, late_s=round(self.late_s + way * step_s, 4)) for way in (-1, 1)]
         return around + [replace(self, mean_s=self.mean_s * by) for by in (1 / factor, factor)]
 
 
-def as_logged(problem: Problem, likely: Likely) -> Problem:
+def clean_columns(problem: Problem, log_likelihood: LogLikelihood) -> Problem:
     """The problem with each column without what its logger put there, where that is likelier.
 
     What is said of that is in its notes.
     """
     best = None
-    for read in (_drawn, _without_noise):
+    for clean in (_interpolate_held, _remove_noise):
         for name in sorted(problem.recorded.covariates):
-            other = read(problem, name)
-            if other is None:
+            changed = clean(problem, name)
+            if changed is None:
                 continue
-            best = likely(problem) if best is None else best
-            found = likely(other)
+            best = log_likelihood(problem) if best is None else best
+            found = log_likelihood(changed)
             if found > best + priors.ODDS_REAL:
-                problem, best = other, found
+                problem, best = changed, found
     return problem
 
 
-def _drawn(problem: Problem, name: str) -> Problem | None:
+def _interpolate_held(problem: Problem, name: str) -> Problem | None:
     """With a column drawn straight between its values, where these come seldom."""
-    seldom = tuple(one for one in held_columns(problem.recorded) if one.name == name)
-    if not seldom:
+    held = tuple(one for one in held_columns(problem.recorded) if one.name == name)
+    if not held:
         return None
-    said = f"column {shown(name)} comes {seldom[0].often}: drawn straight between its values"
-    return _with(problem, drawn_between(problem.recorded, seldom), said)
+    note = f"column {shown(name)} comes {held[0].often}: drawn straight between its values"
+    return _replace_recorded(problem, drawn_between(problem.recorded, held), note)
 
 
-def _without_noise(problem: Problem, name: str) -> Problem | None:
+def _remove_noise(problem: Problem, name: str) -> Problem | None:
     """With a column without its logger's noise, where that can be told from its course."""
     clean = cleaned(problem.recorded, (name,))
-    said = f"column {shown(name)} has noise of its own: what follows it is judged without it"
-    return None if clean is None else _with(problem, clean, said)
+    note = f"column {shown(name)} has noise of its own: what follows it is judged without it"
+    return None if clean is None else _replace_recorded(problem, clean, note)
 
 
-def of_means(made: Linearised, keys: Sequence[str], at: At, library: Library) -> Iterator[Reading]:
+def find_mean_columns(
+    made: Linearised, keys: Sequence[str], at: ModelFit, library: Library
+) -> Iterator[LoggerModel]:
     """Columns that are likelier means, by what one effect by each is then worth.
 
     made, keys, at: a model with calibration, delay and all causes as they are logged.  A mean over
@@ -114,32 +116,36 @@ def of_means(made: Linearised, keys: Sequence[str], at: At, library: Library) ->
     than any other time of the column: when a name is late, is a setting of its own.
     One effect alone: a late field and one by the current's change together are a mean as well.
     """
-    made = made.copied()
+    made = made.copy()
     for name in sorted(made.context.track.covariates):
-        asked = _effects_by(made.context, library, name)
-        if not asked:
+        effects = _effects_of_column(made.context, library, name)
+        if not effects:
             continue
-        scan = _without(made, keys, at, name)
-        late = [Reading(name, 0.0, late_s) for late_s in (0.0, *priors.LOGGED_LATE_S)]
-        least = max(_worth(scan, asked, late).values()) + priors.ODDS_REAL
-        best, nats = late[0], least
-        readings = [
-            Reading(name, mean_s, late_s)
+        scan = _scan_without_column(made, keys, at, name)
+        unaveraged = [LoggerModel(name, 0.0, late_s) for late_s in (0.0, *priors.LOGGED_LATE_S)]
+        required = (
+            max(_best_log_bayes_factors(scan, effects, unaveraged).values()) + priors.ODDS_REAL
+        )
+        best, nats = unaveraged[0], required
+        loggers = [
+            LoggerModel(name, mean_s, late_s)
             for mean_s in priors.LOGGED_MEANS_S
             for late_s in (mean_s / 2, 0.0)
         ]
-        for round_ in range(1 + _FINER):
-            for one, worth in _worth(scan, asked, readings).items():
-                if worth > nats:
-                    best, nats = one, worth
+        for round_ in range(1 + _REFINEMENT_ROUNDS):
+            for one, found in _best_log_bayes_factors(scan, effects, loggers).items():
+                if found > nats:
+                    best, nats = one, found
             if best.mean_s == 0.0:
                 break
-            readings = best.neighbours(round_)
+            loggers = best.neighbours(round_)
         if best.mean_s > 0.0:
             yield best
 
 
-def _effects_by(context: Context, library: Library, name: str) -> list[tuple[Effect, Setting]]:
+def _effects_of_column(
+    context: Context, library: Library, name: str
+) -> list[tuple[Effect, Setting]]:
     """Effects by a column in their first setting, where another time or mean changes them."""
     found = []
     for effect in library.values():
@@ -151,7 +157,9 @@ def _effects_by(context: Context, library: Library, name: str) -> list[tuple[Eff
     return found
 
 
-def _without(made: Linearised, keys: Sequence[str], at: At, name: str) -> Beside:
+def _scan_without_column(
+    made: Linearised, keys: Sequence[str], at: ModelFit, name: str
+) -> CandidateScan:
     """The model without what a column causes, in the noise that it leaves with it."""
     psi, kept, begin = [], [], 0
     for key in keys:
@@ -161,43 +169,50 @@ def _without(made: Linearised, keys: Sequence[str], at: At, name: str) -> Beside
             kept.append(key)
             psi.append(at.psi[begin : begin + width])
         begin += width
-    return beside(made, kept, replace(at, psi=np.concatenate([*psi, np.zeros(0)])))
+    return candidate_scan(made, kept, replace(at, psi=np.concatenate([*psi, np.zeros(0)])))
 
 
-def _worth(
-    scan: Beside, asked: Sequence[tuple[Effect, Setting]], readings: Sequence[Reading]
-) -> dict[Reading, float]:
+def _best_log_bayes_factors(
+    scan: CandidateScan, effects: Sequence[tuple[Effect, Setting]], loggers: Sequence[LoggerModel]
+) -> dict[LoggerModel, float]:
     """Nats of the likeliest of the effects by each reading."""
-    made, of = scan.made, dict[str, Reading]()
-    for one in readings:
-        context = replace(made.context, track=one.of(made.context.track))
-        for effect, setting in asked:
+    made, logger_of = scan.made, dict[str, LoggerModel]()
+    for one in loggers:
+        context = replace(made.context, track=one.before_logging(made.context.track))
+        for effect, setting in effects:
             new = effect_components.effect_component(context, effect, setting, 1)
             new = replace(new, key=f"{new.key} {one}")
             made.add([new])
-            of[new.key] = one
-    found = scan.worth(list(of))
-    return {one: max(found[key] for key, other in of.items() if other == one) for one in readings}
+            logger_of[new.key] = one
+    found = scan.log_bayes_factors(list(logger_of))
+    return {
+        one: max(found[key] for key, other in logger_of.items() if other == one) for one in loggers
+    }
 
 
-def read_as(problem: Problem, reading: Reading) -> Problem:
+def apply_logger_model(problem: Problem, logger: LoggerModel) -> Problem:
     """The problem with a column read so."""
-    said = f"column {shown(reading.column)} is read as {reading.words}"
-    logged = {**problem.logged, reading.column: reading.setting}
-    return replace(_with(problem, reading.of(problem.recorded), said), logged=logged)
+    note = f"column {shown(logger.column)} is read as {logger.words}"
+    logged = {**problem.logged, logger.column: logger.setting}
+    return replace(
+        _replace_recorded(problem, logger.before_logging(problem.recorded), note), logged=logged
+    )
 
 
-def as_recorded(setting: Setting, problem: Problem) -> Setting:
+def recorded_setting(setting: Setting, problem: Problem) -> Setting:
     """A setting by a column as it was recorded, of one by the column as it is read."""
-    how = problem.logged.get(str(setting.get("covariate")), {})
-    return {**setting, **{key: round(setting.get(key, 0.0) + by, 4) for key, by in how.items()}}
+    logger = problem.logged.get(str(setting.get("covariate")), {})
+    return {
+        **setting,
+        **{key: round(setting.get(key, 0.0) + shift, 4) for key, shift in logger.items()},
+    }
 
 
-def _with(problem: Problem, recorded: Track, said: str) -> Problem:
-    return replace(problem, recorded=recorded, notes=(*problem.notes, said))
+def _replace_recorded(problem: Problem, recorded: Track, note: str) -> Problem:
+    return replace(problem, recorded=recorded, notes=(*problem.notes, note))
 
 
-def before_the_mean(time_s: Array, values: Array, mean_s: float) -> Array:
+def deconvolve_mean(time_s: Array, values: Array, mean_s: float) -> Array:
     """(N,) values at times that are means over mean_s about these, as they were before.
 
     Each frequency is put back by what a mean leaves of it, as Wiener has it: where that is next to
@@ -206,7 +221,7 @@ def before_the_mean(time_s: Array, values: Array, mean_s: float) -> Array:
     count, lost = len(values), priors.LOGGED_LOST
     even_s = np.linspace(time_s[0], time_s[-1], count)
     hertz = np.arange(count) / (2.0 * count * (even_s[1] - even_s[0]))
-    left = np.sinc(hertz * mean_s)
+    transfer = np.sinc(hertz * mean_s)
     cosines = dct(np.interp(even_s, time_s, values), norm="ortho")
-    before = idct(cosines * left * (1.0 + lost) / (left**2 + lost), norm="ortho")
-    return np.asarray(np.interp(time_s, even_s, before))
+    restored = idct(cosines * transfer * (1.0 + lost) / (transfer**2 + lost), norm="ortho")
+    return np.asarray(np.interp(time_s, even_s, restored))

@@ -21,10 +21,10 @@ from ahrsd.diagnosis import priors
 from ahrsd.samples import Array
 
 #: median of the square of three normal numbers;  rounds in which a scale is found
-_MEDIAN_OF_3, _SCALED = 2.366, 12
+_MEDIAN_OF_3, _SCALE_ROUNDS = 2.366, 12
 
 
-def octaves(count: int) -> NDArray[np.intp]:
+def octave_edges(count: int) -> NDArray[np.intp]:
     """(B + 1,) edges of the bands among `count` cosines, lowest first."""
     edges = [count]
     while len(edges) < priors.BANDS and edges[-1] > 32:
@@ -32,21 +32,21 @@ def octaves(count: int) -> NDArray[np.intp]:
     return np.array([0, *edges[::-1]], dtype=np.intp)
 
 
-def with_band(
+def insert_narrow_bands(
     edges: NDArray[np.intp], low: int, high: int, width: int
 ) -> tuple[NDArray[np.intp], slice]:
     """Edges with bands of their own from one cosine to another, and their numbers.
 
     width: of one, cosines: what hums is louder in the middle than at its sides
     """
-    near = (high - low) // 2
-    kept = [e for e in edges.tolist()[1:-1] if e < low - near or e > high + near]
-    own = np.linspace(low, high, max(1, round((high - low) / width)) + 1).round().astype(int)
-    found = sorted({0, *kept, *own.tolist(), int(edges[-1])})
+    margin = (high - low) // 2
+    outside = [e for e in edges.tolist()[1:-1] if e < low - margin or e > high + margin]
+    inside = np.linspace(low, high, max(1, round((high - low) / width)) + 1).round().astype(int)
+    found = sorted({0, *outside, *inside.tolist(), int(edges[-1])})
     return np.array(found, dtype=np.intp), slice(found.index(low), found.index(high))
 
 
-def _deviations(count: int, deviation: float, alone: slice | None) -> Array:
+def _step_deviations(count: int, deviation: float, alone: slice | None) -> Array:
     """(B - 1,) of the steps of the spectrum; to bands that stand alone and from them any."""
     out = np.full(count - 1, deviation)
     if alone is not None:
@@ -61,7 +61,7 @@ def log_prior(
 
     deviation: octave to octave;  alone: numbers of bands that may stand out by any power
     """
-    deviations = _deviations(len(log_noise), deviation, alone)
+    deviations = _step_deviations(len(log_noise), deviation, alone)
     step = np.diff(log_noise) / deviations
     top = log_noise[-1] / priors.NOISE_TOP
     gradient = np.zeros(len(log_noise))
@@ -71,9 +71,9 @@ def log_prior(
     return -0.5 * float(step @ step + top**2) - float(np.sum(np.log(deviations))), gradient
 
 
-def stiffness(count: int, deviation: float, alone: slice | None = None) -> Array:
+def prior_curvature(count: int, deviation: float, alone: slice | None = None) -> Array:
     """(B, B) curvature of minus that log density."""
-    difference = np.diff(np.eye(count), axis=0) / _deviations(count, deviation, alone)[:, None]
+    difference = np.diff(np.eye(count), axis=0) / _step_deviations(count, deviation, alone)[:, None]
     found = difference.T @ difference
     found[-1, -1] += 1.0 / priors.NOISE_TOP**2
     return np.asarray(found)
@@ -85,7 +85,7 @@ def bounds(count: int) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Loudness:
+class NoiseLevels:
     """How loud each row is.
 
     amplitude (N,): of its noise;  tails: nats by which rows of Student's law are likelier than the
@@ -96,12 +96,12 @@ class Loudness:
     tails: float
 
 
-def even(rows: int) -> Loudness:
+def uniform_levels(rows: int) -> NoiseLevels:
     """All rows alike."""
-    return Loudness(np.ones(rows), 0.0)
+    return NoiseLevels(np.ones(rows), 0.0)
 
 
-def loudness(residual: Array, used: NDArray[np.bool], rate_hz: float) -> Loudness:
+def fit_noise_levels(residual: Array, used: NDArray[np.bool], rate_hz: float) -> NoiseLevels:
     """How loud each row is, from a residual (N, 3) without colour.
 
     The level is the moving median of the quick part alone: a step, a current or a course is slow or
@@ -109,18 +109,20 @@ def loudness(residual: Array, used: NDArray[np.bool], rate_hz: float) -> Loudnes
     Student's law: one far off counts for little, and what is strong there loses most of its
     evidence but never all.
     """
-    quick = np.diff(residual, n=2, axis=0, prepend=residual[:1], append=residual[-1:])
+    second_difference = np.diff(residual, n=2, axis=0, prepend=residual[:1], append=residual[-1:])
     rows = 2 * round(priors.LEVEL_S * rate_hz / 2) + 1
-    level = median_filter(_square(quick, used), size=min(rows, len(used)), mode="nearest")
+    level = median_filter(
+        _mean_squares(second_difference, used), size=min(rows, len(used)), mode="nearest"
+    )
     level = np.clip(level / max(float(np.median(level)), 1e-300), *priors.LEVELS)
-    square = 3.0 * _square(residual, used) / level
-    found = [_student(square[used], freedom) for freedom in priors.FREEDOMS]
-    normal = _student(square[used], np.inf)
-    best = max([normal, *found], key=lambda one: one.nats)
+    square = 3.0 * _mean_squares(residual, used) / level
+    laws = [_fit_student(square[used], freedom) for freedom in priors.FREEDOMS]
+    normal = _fit_student(square[used], np.inf)
+    best = max([normal, *laws], key=lambda one: one.nats)
     weight, rows = best.weight(square), int(np.count_nonzero(used))
     normal_nats = 1.5 * (np.sum(np.log(weight[used])) - rows * np.log(2 * np.pi * best.scale))
     normal_nats -= 0.5 * np.sum(weight[used] * square[used]) / best.scale
-    return Loudness(np.sqrt(level * best.scale / weight), float(best.nats - normal_nats))
+    return NoiseLevels(np.sqrt(level * best.scale / weight), float(best.nats - normal_nats))
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,22 +140,22 @@ class _Student:
         return np.asarray((self.freedom + 3.0) / (self.freedom + square / self.scale))
 
 
-def _student(square: Array, freedom: float) -> _Student:
+def _fit_student(square: Array, freedom: float) -> _Student:
     """The law with its likeliest scale, of rows' squares (n,)."""
     law = _Student(freedom, max(float(np.mean(square)) / 3.0, 1e-300), 0.0)
     if np.isinf(freedom):
         nats = -1.5 * len(square) * (np.log(2 * np.pi * law.scale) + 1.0)
         return replace(law, nats=float(nats))
     law = replace(law, scale=max(float(np.median(square)) / _MEDIAN_OF_3, 1e-300))
-    for _ in range(_SCALED):
+    for _ in range(_SCALE_ROUNDS):
         law = replace(law, scale=max(float(np.mean(law.weight(square) * square)) / 3.0, 1e-300))
     constant = gammaln((freedom + 3) / 2) - gammaln(freedom / 2)
     constant -= 1.5 * np.log(freedom * np.pi * law.scale)
-    off = np.log1p(square / (freedom * law.scale))
-    return replace(law, nats=float(len(square) * constant - (freedom + 3) / 2 * np.sum(off)))
+    log_terms = np.log1p(square / (freedom * law.scale))
+    return replace(law, nats=float(len(square) * constant - (freedom + 3) / 2 * np.sum(log_terms)))
 
 
-def _square(values: Array, used: NDArray[np.bool]) -> Array:
+def _mean_squares(values: Array, used: NDArray[np.bool]) -> Array:
     """(N,) mean squares of rows; the median where there is no reading."""
     square = np.sum(values**2, axis=1) / 3.0
     return np.where(used, square, np.median(square[used]) if np.any(used) else 1.0)

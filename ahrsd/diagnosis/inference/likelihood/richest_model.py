@@ -29,20 +29,24 @@ from ahrsd.diagnosis.inference.components.effect_components import (
 )
 from ahrsd.diagnosis.inference.components.gaussian_process import gaussian_process
 from ahrsd.diagnosis.inference.components.ordinary_remainder import ordinary_remainder
-from ahrsd.diagnosis.inference.likelihood.evidence import At, maximised
+from ahrsd.diagnosis.inference.likelihood.evidence import ModelFit, maximise
 from ahrsd.diagnosis.inference.likelihood.linearisation import (
     CALIBRATION,
     Linearised,
     Point,
-    as_columns_say,
-    first_point,
-    linearised,
-    moved,
-    regained,
-    relevelled,
-    step_of,
+    initial_point,
+    linearise,
+    refilter_with_columns,
+    refit_filter_noise,
+    refit_noise_level,
+    remaining_step,
+    step_to_maximum,
 )
-from ahrsd.diagnosis.inference.likelihood.logged_columns import as_logged, of_means, read_as
+from ahrsd.diagnosis.inference.likelihood.logged_columns import (
+    apply_logger_model,
+    clean_columns,
+    find_mean_columns,
+)
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered
 from ahrsd.diagnosis.where_and_when.locate import FRAMES
 
@@ -51,7 +55,7 @@ ROUNDS, NOISES, SETTLED = 6, 3, 5.0
 #: parts of a step that are tried, with the delay's or without
 STEPS: tuple[tuple[float, bool], ...] = ((1.0, True), (1.0, False), (0.3, False))
 #: deviations of an innovation beyond which a step has left every calibration that can be
-_RUN_AWAY = 1e6
+_DIVERGED = 1e6
 #: the sensor's course stands for all three where the remainder, with the other two, is in
 RICH_COURSES = ("free sensor",)
 #: of the ordinary remainder, by frame
@@ -71,38 +75,46 @@ class Base:
     whole: tuple[str, ...]
 
 
-def base_of(
-    point: Point, library: Mapping[str, Effect], named: Sequence[Component], *, whole: bool = True
+def build_base(
+    point: Point, library: Mapping[str, Effect], effects: Sequence[Component], *, whole: bool = True
 ) -> Base:
     """The base at a point.
 
     named: components known by name, made anew of this context;  whole: with remainder and courses
     """
     context = point.context
-    rest = ordinary_remainder(context) if whole else []
+    remainder_parts = ordinary_remainder(context) if whole else []
     lag = delay_component(context, library)
-    lags = [] if lag is None else [lag]
+    delay_parts = [] if lag is None else [lag]
     if point.problem.lag_s != 0.0:
-        lags.append(delay_form(context, point.problem.lag_s))
-    known = [rebuild_component(one, context, library) for one in named]
-    had = {one.effect for one in known}
-    driven = [one for one in logged_cause_components(context, library) if one.effect not in had]
-    bound = {one.key: one for one in rest if one.key in COURSES.values()}
-    free = [
-        gaussian_process(context, frame, like=bound.get(COURSES[frame]))
+        delay_parts.append(delay_form(context, point.problem.lag_s))
+    effect_parts = [rebuild_component(one, context, library) for one in effects]
+    fitted_effects = {one.effect for one in effect_parts}
+    cause_parts = [
+        one for one in logged_cause_components(context, library) if one.effect not in fitted_effects
+    ]
+    processes = {one.key: one for one in remainder_parts if one.key in COURSES.values()}
+    free_parts = [
+        gaussian_process(context, frame, like=processes.get(COURSES[frame]))
         for frame in FRAMES
         if whole
     ]
-    parts = [*rest, *lags, *known, *driven, *free]
-    made = linearised(as_columns_say(point, parts), context)
+    parts = [*remainder_parts, *delay_parts, *effect_parts, *cause_parts, *free_parts]
+    made = linearise(refilter_with_columns(point, parts), context)
     made.add(parts)
-    made.put_back(made.point.values)
-    remainder = tuple(one.key for one in rest)
-    few = (CALIBRATION, *(one.key for one in (*lags, *known, *driven)), *remainder)
-    return Base(made, remainder, (*few, *RICH_COURSES) if whole else few)
+    made.add_back(made.point.values)
+    remainder = tuple(one.key for one in remainder_parts)
+    always = (
+        CALIBRATION,
+        *(one.key for one in (*delay_parts, *effect_parts, *cause_parts)),
+        *remainder,
+    )
+    return Base(made, remainder, (*always, *RICH_COURSES) if whole else always)
 
 
-def fitted(made: Linearised, keys: Sequence[str], step: float, near: At | None = None) -> At:
+def fit_hyperparameters(
+    made: Linearised, keys: Sequence[str], step: float, near: ModelFit | None = None
+) -> ModelFit:
     """The likeliest hyperparameters of a model, from the highest band's power on.
 
     That is the sensor's own: from there an effect is not noise before it was asked for.
@@ -111,13 +123,13 @@ def fitted(made: Linearised, keys: Sequence[str], step: float, near: At | None =
     products = made.products(keys, step)
     laws = [made.seen[key].component.law for key in keys]
     if near is not None:
-        return maximised(products, laws, (near.log_noise, near.psi))
+        return maximise(products, laws, (near.log_noise, near.psi))
     psi = np.concatenate([law.start for law in laws])
     top = float(np.log(products.square[-1] / products.rows[-1]))
-    return maximised(products, laws, (np.full(len(products.rows), top), psi))
+    return maximise(products, laws, (np.full(len(products.rows), top), psi))
 
 
-def psi_by_key(made: Linearised, keys: Sequence[str], at: At) -> dict[str, np.ndarray]:
+def psi_by_key(made: Linearised, keys: Sequence[str], at: ModelFit) -> dict[str, np.ndarray]:
     """Hyperparameters of each component."""
     out, begin = {}, 0
     for key in keys:
@@ -127,25 +139,27 @@ def psi_by_key(made: Linearised, keys: Sequence[str], at: At) -> dict[str, np.nd
     return out
 
 
-def richest(problem: Problem, filtered: Filtered, library: Mapping[str, Effect]) -> Judged:
+def fit_richest_model(
+    problem: Problem, filtered: Filtered, library: Mapping[str, Effect]
+) -> FittedPoint:
     """The likeliest point of some at the richest model, nothing named, from a null's filter.
 
     First the delay and the logged causes alone, beside noise of any spectrum: a delay of a tenth of
     a second, or a motor's current, bend everything else that is fitted beside them.
     """
-    problem = _as_logged(problem, filtered, library)
-    small = _settled(_likeliest_delay(problem, filtered, library), library, (), whole=False)
+    problem = _choose_column_readings(problem, filtered, library)
+    small = _converge(_find_delay(problem, filtered, library), library, (), whole=False)
     instants = replace(problem, instants=True)
-    for lag_s in _delays_of_instants(small.base.made.point.problem):
-        early = _delayed(instants, filtered, library, lag_s)
-        if _is_smoother_alone(early, instants, filtered, library):
+    for lag_s in _instant_rate_delays(small.base.made.point.problem):
+        shifted = _fit_at_delay(instants, filtered, library, lag_s)
+        if _is_only_averaging(shifted, instants, filtered, library):
             continue
-        early = _settled(early, library, (), whole=False)
-        small = early if early.nats > small.nats + priors.ODDS_REAL else small
-    return settled(small.base.made.point, library, ())
+        shifted = _converge(shifted, library, (), whole=False)
+        small = shifted if shifted.nats > small.nats + priors.ODDS_REAL else small
+    return converge(small.base.made.point, library, ())
 
 
-def _delays_of_instants(problem: Problem) -> tuple[float, ...]:
+def _instant_rate_delays(problem: Problem) -> tuple[float, ...]:
     """Delays that a gyro may have whose values are rates at instants: it is early by half a step.
 
     That half alone, and where there is more, all of it, which is the magnetometer's as well.
@@ -153,91 +167,97 @@ def _delays_of_instants(problem: Problem) -> tuple[float, ...]:
     step_s = usual_step(problem.recorded.dt_s)
     if problem.lag_s <= 0.0 or step_s is None:
         return ()
-    more = of_magnetometer(problem.recorded, problem.lag_s)
-    return (step_s / 2, problem.lag_s) if more else (step_s / 2,)
+    both_sensors = of_magnetometer(problem.recorded, problem.lag_s)
+    return (step_s / 2, problem.lag_s) if both_sensors else (step_s / 2,)
 
 
-def _as_logged(problem: Problem, filtered: Filtered, library: Mapping[str, Effect]) -> Problem:
+def _choose_column_readings(
+    problem: Problem, filtered: Filtered, library: Mapping[str, Effect]
+) -> Problem:
     """The problem with each column read as its logger wrote it, where that is likelier."""
 
-    def likely(one: Problem) -> float:
-        return _delayed(one, filtered, library, 0.0).nats
+    def log_likelihood(one: Problem) -> float:
+        return _fit_at_delay(one, filtered, library, 0.0).nats
 
-    problem = as_logged(problem, likely).lagging(problem.lag_s)
+    problem = clean_columns(problem, log_likelihood).lagging(problem.lag_s)
     if not problem.recorded.covariates:
         return problem
-    here = _delayed(problem, filtered, library, 0.0)
-    for reading in of_means(here.base.made, here.base.whole, here.at, library):
-        other = read_as(problem, reading).lagging(problem.lag_s)
-        found = _delayed(other, filtered, library, 0.0)
+    here = _fit_at_delay(problem, filtered, library, 0.0)
+    for reading in find_mean_columns(here.base.made, here.base.whole, here.at, library):
+        other = apply_logger_model(problem, reading).lagging(problem.lag_s)
+        found = _fit_at_delay(other, filtered, library, 0.0)
         if found.nats > here.nats + priors.ODDS_REAL:
             problem, here = other, found
     return problem
 
 
-def _delayed(
+def _fit_at_delay(
     problem: Problem, filtered: Filtered, library: Mapping[str, Effect], lag_s: float
-) -> Judged:
+) -> FittedPoint:
     """The small model at a delay."""
-    start = first_point(problem.lagging(lag_s), filtered, (LAG,))
+    start = initial_point(problem.lagging(lag_s), filtered, (LAG,))
     values = {} if lag_s == 0.0 else {LAG: np.array([lag_s])}
-    return judged(replace(start, values=values), library, (), whole=False)
+    return fit_at_point(replace(start, values=values), library, (), whole=False)
 
 
-def _likeliest_delay(problem: Problem, filtered: Filtered, library: Mapping[str, Effect]) -> Judged:
+def _find_delay(problem: Problem, filtered: Filtered, library: Mapping[str, Effect]) -> FittedPoint:
     """The small model at the likeliest of some delays, sought up and down from none.
 
     Beside a calibration that a long delay has bent, what is linear in it may point the other way.
     A library without a late magnetometer has no delay.
     """
     if plain_delay(library, 1.0) is None:
-        return judged(first_point(problem, filtered, ()), library, (), whole=False)
-    best = none = _delayed(problem, filtered, library, 0.0)
-    for way in (priors.ORDINARY_LAG_S, -priors.ORDINARY_LAG_S):
+        return fit_at_point(initial_point(problem, filtered, ()), library, (), whole=False)
+    best = without = _fit_at_delay(problem, filtered, library, 0.0)
+    for step_s in (priors.ORDINARY_LAG_S, -priors.ORDINARY_LAG_S):
         while True:
-            lag_s = best.base.made.point.problem.lag_s + way
-            found = _delayed(problem, filtered, library, lag_s)
+            lag_s = best.base.made.point.problem.lag_s + step_s
+            found = _fit_at_delay(problem, filtered, library, lag_s)
             if found.nats < best.nats + priors.ODDS_REAL:  # between samples is smoother
                 break
-            if _points_back(found):
+            if _points_to_smaller_delay(found):
                 break
             best = found
-    if best is not none and _is_smoother_alone(best, problem, filtered, library):
-        return none
+    if best is not without and _is_only_averaging(best, problem, filtered, library):
+        return without
     return best
 
 
-def _is_smoother_alone(
-    here: Judged, problem: Problem, filtered: Filtered, library: Mapping[str, Effect]
+def _is_only_averaging(
+    here: FittedPoint, problem: Problem, filtered: Filtered, library: Mapping[str, Effect]
 ) -> bool:
     """Whether a gyro that is late by as much as it is early here makes readings about as likely.
 
     Moved in time its noise is averaged, either way.  Of nats that go by the square of what a delay
     is off by, one that is there has a quarter of the difference of the two.
     """
-    late = _delayed(problem, filtered, library, -here.base.made.point.problem.lag_s)
+    late = _fit_at_delay(problem, filtered, library, -here.base.made.point.problem.lag_s)
     return here.nats - late.nats < 4.0 * priors.ODDS_REAL
 
 
-def _points_back(here: Judged) -> bool:
+def _points_to_smaller_delay(here: FittedPoint) -> bool:
     """Whether readings say at a delay that it is nearer to none.
 
     Moved in time a gyro's noise is another one, and in some the readings are likelier, whatever the
     delay is; a delay that is there stays where it is.
     """
     lag_s = here.base.made.point.problem.lag_s
-    off, deviation = step_of(here.base.made, here.base.whole, here.at)  # of the delay the last
+    off, deviation = remaining_step(
+        here.base.made, here.base.whole, here.at
+    )  # of the delay the last
     return bool(-off[-1] * np.sign(lag_s) > priors.POINTS_BACK * deviation[-1])
 
 
-def settled(point: Point, library: Mapping[str, Effect], named: Sequence[Component]) -> Judged:
+def converge(
+    point: Point, library: Mapping[str, Effect], effects: Sequence[Component]
+) -> FittedPoint:
     """The point moved to where the richest model with these names is likeliest."""
-    return _settled(judged(point, library, named), library, named, whole=True)
+    return _converge(fit_at_point(point, library, effects), library, effects, whole=True)
 
 
-def _settled(
-    here: Judged, library: Mapping[str, Effect], named: Sequence[Component], *, whole: bool
-) -> Judged:
+def _converge(
+    here: FittedPoint, library: Mapping[str, Effect], effects: Sequence[Component], *, whole: bool
+) -> FittedPoint:
     """Moved while that makes the model likelier, and with gains of the noise that is left there.
 
     A step that makes it less likely, linear as it is, is taken in part or not at all; none is taken
@@ -245,85 +265,87 @@ def _settled(
     and the noise is estimated anew where they rest: what was not taken out yet is no noise.
     """
 
-    def judge(make: Callable[[], Point], near: Judged) -> Judged | None:
+    def judge(make: Callable[[], Point], near: FittedPoint) -> FittedPoint | None:
         try:
             point = make()
         except np.linalg.LinAlgError:  # a step too far
             return None
-        seen = np.all(np.abs(point.filtered.whitened) < _RUN_AWAY)  # false of what is not finite
-        return judged(point, library, named, whole=whole, near=near) if seen else None
+        bounded = np.all(np.abs(point.filtered.whitened) < _DIVERGED)  # false of what is not finite
+        return fit_at_point(point, library, effects, whole=whole, near=near) if bounded else None
 
-    here = _moved_to_rest(here, judge)
+    here = _take_steps(here, judge)
     for _ in range(NOISES):
-        for quieter in (_relevelled, _regained):
-            found = judge(partial(quieter, here), here)
+        for refit in (_refit_noise_level, _refit_filter_noise):
+            found = judge(partial(refit, here), here)
             if found is not None and found.nats > here.nats + SETTLED:
-                here = _moved_to_rest(found, judge)
+                here = _take_steps(found, judge)
                 break
         else:
             break
     return here
 
 
-def _relevelled(here: Judged) -> Point:
-    return relevelled(here.base.made, here.base.whole, here.at)
+def _refit_noise_level(here: FittedPoint) -> Point:
+    return refit_noise_level(here.base.made, here.base.whole, here.at)
 
 
-def _regained(here: Judged) -> Point:
-    return regained(here.base.made.point)
+def _refit_filter_noise(here: FittedPoint) -> Point:
+    return refit_filter_noise(here.base.made.point)
 
 
-def _moved_to_rest(
-    here: Judged, judge: Callable[[Callable[[], Point], Judged], Judged | None]
-) -> Judged:
+def _take_steps(
+    here: FittedPoint, judge: Callable[[Callable[[], Point], FittedPoint], FittedPoint | None]
+) -> FittedPoint:
     """Moved while that makes the model likelier, gains held."""
-    ways = STEPS
+    step_kinds = STEPS
     for _ in range(ROUNDS):
-        if _is_there(here):
+        if _has_converged(here):
             break
-        for k, (share, delayed) in enumerate(ways):
+        for k, (share, delayed) in enumerate(step_kinds):
             at = here.base.made, here.base.whole, here.at
-            found = judge(partial(moved, *at, share, delayed=delayed), here)
+            found = judge(partial(step_to_maximum, *at, share, delayed=delayed), here)
             if found is not None and found.nats > here.nats:
-                ways = ways[k:]
+                step_kinds = step_kinds[k:]
                 break
         else:
             break
-        gained, here = found.nats - here.nats, found
-        if gained < SETTLED:
+        gain, here = found.nats - here.nats, found
+        if gain < SETTLED:
             break
     return here
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
+class FittedPoint:
     """The richest model at a point; nats: by readings and not by rows, so that points compare."""
 
     base: Base
-    at: At
+    at: ModelFit
     nats: float
 
 
-def judged(
+def fit_at_point(
     point: Point,
     library: Mapping[str, Effect],
-    named: Sequence[Component],
+    effects: Sequence[Component],
     *,
     whole: bool = True,
-    near: Judged | None = None,
-) -> Judged:
+    near: FittedPoint | None = None,
+) -> FittedPoint:
     """The likeliest hyperparameters of the richest model at a point.
 
     near: the same at a point nearby
     """
-    base = base_of(point, library, named, whole=whole)
+    base = build_base(point, library, effects, whole=whole)
     step = priors.NOISE_STEP_REAL if whole else priors.NOISE_STEP_FREE
-    like = near is not None and near.base.whole == base.whole
-    at = fitted(base.made, base.whole, step, near.at if near is not None and like else None)
-    return Judged(base, at, at.nats + base.made.log_whitening)
+    same_components = near is not None and near.base.whole == base.whole
+    at = fit_hyperparameters(
+        base.made, base.whole, step, near.at if near is not None and same_components else None
+    )
+    return FittedPoint(base, at, at.nats + base.made.log_whitening)
 
 
-def _is_there(here: Judged) -> bool:
+def _has_converged(here: FittedPoint) -> bool:
     """Whether calibration and delay are where the model wants them."""
-    off, deviation = step_of(here.base.made, here.base.whole, here.at)
+    off, deviation = remaining_step(here.base.made, here.base.whole, here.at)
     return not np.any(np.abs(off) > priors.NEAR * deviation)

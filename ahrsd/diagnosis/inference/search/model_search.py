@@ -17,9 +17,13 @@ from scipy.special import log_ndtr
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.inference.components.component import Component
 from ahrsd.diagnosis.inference.components.effect_components import LAG
-from ahrsd.diagnosis.inference.likelihood.candidates import Beside, beside
-from ahrsd.diagnosis.inference.likelihood.evidence import At, reached
-from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, Linearised, by_key
+from ahrsd.diagnosis.inference.likelihood.candidates import CandidateScan, candidate_scan
+from ahrsd.diagnosis.inference.likelihood.evidence import ModelFit, maximise_above
+from ahrsd.diagnosis.inference.likelihood.linearisation import (
+    CALIBRATION,
+    Linearised,
+    coefficients_by_key,
+)
 from ahrsd.samples import Array
 
 BEAM, ASKED, MOST_MOVES = 2, 4, 8
@@ -39,10 +43,10 @@ class Hypothesis:
 
     names: Names
     keys: tuple[str, ...]
-    at: At
+    at: ModelFit
     score: float
 
-    def at_of(self, other: Hypothesis) -> At:
+    def at_of(self, other: Hypothesis) -> ModelFit:
         """Another hypothesis in the quieter noise of the two: what one lacks is no noise."""
         quiet = np.minimum(self.at.log_noise, other.at.log_noise)
         return replace(other.at, log_noise=quiet)
@@ -131,7 +135,7 @@ class Hypotheses:
             odds += self._again(members) + self._of_class(members)
             forms = set(keys) - members - {CALIBRATION}
             small = [k for k, key in enumerate(keys) if key in forms and key not in known]
-            at = reached(products, laws, (noise, start), asked - odds, small=small)
+            at = maximise_above(products, laws, (noise, start), asked - odds, start_small=small)
             if at is None:
                 return None
             odds += self._believed(keys, at)
@@ -189,13 +193,13 @@ class Hypotheses:
         more = len(rows) - len(set(rows))
         return more * float(np.log(priors.AGAIN / priors.EFFECT))
 
-    def _believed(self, keys: Sequence[str], at: At) -> float:
+    def _believed(self, keys: Sequence[str], at: ModelFit) -> float:
         """What it costs that a name's coefficient has a least value: its law has none below.
 
         The probability that it is above, by the readings, over that by its law before them.
         """
-        nats, values = 0.0, by_key(self.made, keys, at)
-        deviations, begin = by_key(self.made, keys, replace(at, mean=at.deviation)), 0
+        nats, values = 0.0, coefficients_by_key(self.made, keys, at)
+        deviations, begin = coefficients_by_key(self.made, keys, replace(at, mean=at.deviation)), 0
         for key in keys:
             one = self.component(key)
             psi = at.psi[begin : begin + len(one.law.start)]
@@ -227,7 +231,7 @@ class Space:
     effects: dict[str, list[str]]
     courses: Sequence[str]
     finer: Callable[[Component, int], list[Component]]
-    remembered: Callable[[Beside, Component, int], list[Component]]
+    remembered: Callable[[CandidateScan, Component, int], list[Component]]
     form: Callable[[Component], Component | None]
     steps_at: Callable[[float], list[Component]]
     while_there: Callable[[Component, Component], list[Component]]
@@ -318,7 +322,7 @@ def sharpened(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
         tried = []
         for rest in dict.fromkeys((best.names, best.names - set(space.courses))):
             fewer = all_sets.judge(rest - {key}, best)
-            scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
+            scan = candidate_scan(all_sets.made, fewer.keys, best.at_of(fewer))
             new = sought(all_sets, space, scan, key, range(FINER, SHARPEST))
             tried.append(rest - {key} | {new})
         best = all_sets.likeliest(best, tried)
@@ -381,7 +385,7 @@ def _begins_near(one: Component, moments_s: Sequence[float]) -> bool:
 def _propose_steps(all_sets: Hypotheses, space: Space, here: Hypothesis) -> None:
     """Put steps at the moments at which a set is most surprised among the candidates."""
     made = all_sets.made
-    for time_s in surprises(made.left_by(here.keys, here.at), made.context.track.time_s):
+    for time_s in surprises(made.residual(here.keys, here.at), made.context.track.time_s):
         _put_among(all_sets, space, space.steps_at(time_s))
 
 
@@ -432,8 +436,8 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
     candidates = [key for key in candidates if all_sets.is_asked(base, key)]
     if not candidates:
         return []
-    scan = beside(all_sets.made, model.keys, at)
-    worth = scan.worth(candidates)
+    scan = candidate_scan(all_sets.made, model.keys, at)
+    worth = scan.log_bayes_factors(candidates)
     best: dict[str, tuple[float, str]] = {}
     for key, nats in worth.items():
         one = all_sets.component(key)
@@ -479,20 +483,24 @@ def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
 
 
 def sought(
-    all_sets: Hypotheses, space: Space, scan: Beside, key: str, rounds: Iterable[int] = range(FINER)
+    all_sets: Hypotheses,
+    space: Space,
+    scan: CandidateScan,
+    key: str,
+    rounds: Iterable[int] = range(FINER),
 ) -> str:
     """The candidate with onset, scale and what it remembers sought more and more finely."""
     made, row = all_sets.made, all_sets.component(key).row
     remembers = row is not None and row.remembers > 0.0
-    scan = scan.in_quiet() if remembers else scan
-    worth = scan.worth([key])[key] + all_sets.component(key).prior
+    scan = scan.at_sensor_noise() if remembers else scan
+    worth = scan.log_bayes_factors([key])[key] + all_sets.component(key).prior
     for round_, again in itertools.product(rounds, range(1 + REMEMBERED * remembers)):
         one = all_sets.component(key)
         near = space.remembered(scan, one, round_) if again else space.finer(one, round_)
         if not near:
             continue
         made.add(near)
-        found = scan.worth([one.key for one in near])
+        found = scan.log_bayes_factors([one.key for one in near])
         total = {one: nats + all_sets.component(one).prior for one, nats in found.items()}
         first = max(total, key=lambda one: total[one])
         if total[first] > worth:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ahrsd.diagnosis.effects.effect import Setting
 from ahrsd.diagnosis.inference.components.component import Component
-from ahrsd.diagnosis.inference.likelihood.candidates import Beside
+from ahrsd.diagnosis.inference.likelihood.candidates import CandidateScan
 from ahrsd.diagnosis.inference.search.near_settings import changed, opened
 from ahrsd.samples import Array
 
@@ -21,7 +21,7 @@ from ahrsd.samples import Array
 _DIGITS = 3
 
 
-def remembered(scan: Beside, one: Component, round_: int) -> list[Setting]:
+def remembered(scan: CandidateScan, one: Component, round_: int) -> list[Setting]:
     """Settings of an effect with another memory, nearer by the round; none where it has none."""
     row = one.row
     if row is None or not row.remembers:
@@ -34,12 +34,12 @@ def remembered(scan: Beside, one: Component, round_: int) -> list[Setting]:
     return [{**one.setting, "memory": each} for each in sorted(kept)]
 
 
-def _step(scan: Beside, one: Component, memory: Array) -> Array:
+def _step(scan: CandidateScan, one: Component, memory: Array) -> Array:
     """(3,) to the likeliest memory as it is seen from here."""
     context = scan.made.context
     nearby = {k: each for k, each in changed(one, context).items() if k.startswith("memory")}
-    whole = opened(one, context, scan.likeliest(one)[0], nearby)
+    whole = opened(one, context, scan.estimate(one)[0], nearby)
     if whole is None:
         return np.zeros(3)
     parts = np.array([each["memory"] for each in nearby.values()]) - memory
-    return np.asarray(scan.likeliest(whole)[0][-len(nearby) :] @ parts)
+    return np.asarray(scan.estimate(whole)[0][-len(nearby) :] @ parts)

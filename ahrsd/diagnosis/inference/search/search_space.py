@@ -19,9 +19,9 @@ from ahrsd.diagnosis.inference.components.effect_components import (
     project_out,
     projected_key,
 )
-from ahrsd.diagnosis.inference.likelihood.candidates import Beside
+from ahrsd.diagnosis.inference.likelihood.candidates import CandidateScan
 from ahrsd.diagnosis.inference.likelihood.linearisation import Linearised
-from ahrsd.diagnosis.inference.likelihood.richest_model import Judged, psi_by_key
+from ahrsd.diagnosis.inference.likelihood.richest_model import FittedPoint, psi_by_key
 from ahrsd.diagnosis.inference.search.model_search import (
     Hypotheses,
     Hypothesis,
@@ -38,7 +38,7 @@ _TOGETHER = 500
 
 
 def best_at(
-    rich: Judged, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
+    rich: FittedPoint, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
 ) -> tuple[Hypotheses, Space, Hypothesis]:
     """The likeliest set at a richest model, searched from what is known and from nothing."""
     base = rich.base
@@ -99,18 +99,18 @@ def _passed(
             passed += [*parts, *beside]
             whole += held
         made.add(passed)
-        made.keep_lightly([one for _, parts in some for one in parts])
+        made.make_columns_lazy([one for _, parts in some for one in parts])
     if delay is not None:
         effects[delay.effect or LAG] = [LAG]
     return effects, whole
 
 
 def space_at(
-    rich: Judged, library: Mapping[str, Effect], named: Sequence[Component]
+    rich: FittedPoint, library: Mapping[str, Effect], named: Sequence[Component]
 ) -> tuple[Hypotheses, Space]:
     """The sets at a richest model, none judged yet, and what they may be made of."""
     base = rich.base
-    made, context = base.made.copied(), base.made.context
+    made, context = base.made.copy(), base.made.context
     effects, whole = _passed(made, library)
     forms = {}
     for one in named:
@@ -141,7 +141,7 @@ def space_at(
     def finer(one: Component, round_: int) -> list[Component]:
         return made_of(one, neighbouring_settings(one.setting, length_s, round_))
 
-    def closer(scan: Beside, one: Component, round_: int) -> list[Component]:
+    def closer(scan: CandidateScan, one: Component, round_: int) -> list[Component]:
         return made_of(one, remembered(scan, one, round_))
 
     def left_of(one: Component) -> Component | None:

@@ -31,8 +31,8 @@ from ahrsd.diagnosis.inference.components.component import (
     columns_in_frame,
     log_density,
 )
-from ahrsd.diagnosis.inference.likelihood.candidates import beside
-from ahrsd.diagnosis.inference.likelihood.evidence import At
+from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
+from ahrsd.diagnosis.inference.likelihood.evidence import ModelFit
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.where_and_when.locate import (
@@ -102,7 +102,7 @@ class SpellLaw:
 def switching(all_sets: Hypotheses, here: Hypothesis) -> list[Component]:
     """What a set leaves as sources that switch, in each frame; none where nothing does."""
     made = all_sets.made
-    left = made.left_by(here.keys, here.at) / made.point.loud.amplitude[:, None]
+    left = made.residual(here.keys, here.at) / made.point.loud.amplitude[:, None]
     left = np.where(made.point.filtered.used[:, None], left, 0.0)
     rows = max(1, round(priors.SPELL_PIECE_S * made.point.problem.rate_hz))
     spells, log_odds = _spells(left, made.point.filtered.used, rows, made.point.problem.rate_hz)
@@ -113,7 +113,7 @@ def switching(all_sets: Hypotheses, here: Hypothesis) -> list[Component]:
         spells = _closest(all_sets, here, quiet, spells, rows)
         log_odds -= 2 * len(spells) * float(np.log(rows))  # ends are sought to a row, not a piece
         found += [_coming(made.context, frame, spells, log_odds) for frame in FRAMES]
-    left = made.left_by(here.keys, quiet) / made.point.loud.amplitude[:, None]
+    left = made.residual(here.keys, quiet) / made.point.loud.amplitude[:, None]
     left = np.where(made.point.filtered.used[:, None], left, 0.0)
     moments = changes(left, 2 * rows)
     if priors.CHANGES <= len(moments) <= priors.MOST_WAVES:
@@ -136,14 +136,14 @@ def _spells(
 
 
 def _closest(
-    all_sets: Hypotheses, here: Hypothesis, at: At, spells: list[tuple[int, int]], rows: int
+    all_sets: Hypotheses, here: Hypothesis, at: ModelFit, spells: list[tuple[int, int]], rows: int
 ) -> list[tuple[int, int]]:
     """Spells with their ends where the readings are likeliest.
 
     A filter follows what stays, and swings back behind it: a residual has other ends.
     """
     made, count = all_sets.made, len(all_sets.made.context.track)
-    scan = beside(made, here.keys, at)
+    scan = candidate_scan(made, here.keys, at)
     for step in (rows, rows, max(1, rows // 2), 1):
         for end in (1, 0):
             tried: dict[str, tuple[int, tuple[int, int]]] = {}
@@ -156,9 +156,9 @@ def _closest(
                     one = _coming(made.context, "sensor", [(a, b)], 0.0, _FEW)
                     tried[one.key] = number, (a, b)
                     new.append(one)
-            trial = made.copied()  # what was tried ends with its round
+            trial = made.copy()  # what was tried ends with its round
             trial.add(new)
-            worth = replace(scan, made=trial).worth(list(tried))
+            worth = replace(scan, made=trial).log_bayes_factors(list(tried))
             best: dict[int, float] = {}
             for key, nats in worth.items():
                 number, spell = tried[key]
