@@ -1,1 +1,1 @@
-"""What a recording may be made of: effects, courses, what recordings ordinarily leave."""
+"""The components of a model: effects, Gaussian processes, the remainder of real recordings."""

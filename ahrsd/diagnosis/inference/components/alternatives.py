@@ -1,9 +1,9 @@
-"""What is asked beside names: sources of other laws than slow ones in time, and a name's own form.
+"""Alternatives to the effects of the library: unexplained sources, and coefficients that vary.
 
-A source that no name has is slow in time, or quick, or follows how the sensor turns.  Names that
-are flexible explain a part of it, and nothing else being there, take its evidence.  And what stands
-in for it has no constant coefficient: with one that is free in time it explains far more, while a
-name that is there explains no more than by chance.
+A source that is not in the library is slow in time, or quick, or depends on how the sensor turns.
+Flexible effects explain a part of it and, without an alternative, take its evidence.  An effect
+that stands in for such a source has no constant coefficient: with a coefficient that varies in time
+it explains far more, while a true effect explains no more than by chance.
 """
 
 from __future__ import annotations
@@ -26,14 +26,15 @@ from ahrsd.samples import Array
 
 BY_RATE, BY_TILT = "free by_rate", "free by_tilt"
 BY_HEADING, QUICK = "free by_heading", "free quick"
-#: half waves of a coefficient that is free in time
+#: number of half waves of a coefficient that varies in time
 _FACTOR_MODES = 16
 
 
 def alternative_sources(context: Context) -> list[Component]:
-    """Fields on the sensor that no name has: by its rate of turn, by its tilt, quick in time.
+    """Unexplained fields on the sensor: by its rate of turn, by its tilt, and quick in time.
 
-    What hangs, slides or levels itself goes by the tilt, where an accelerometer tells that.
+    What hangs, slides or levels itself depends on the tilt; an accelerometer is needed to know
+    that.
     """
     rate = context.rowwise_rate_b_rad_s
     rate = rate / max(float(np.sqrt(np.mean(np.sum(rate**2, axis=1)))), 1e-12)
@@ -47,7 +48,7 @@ def alternative_sources(context: Context) -> list[Component]:
 
 
 def _field_by_functions(key: str, functions: Array) -> Component:
-    """A field of any size on each axis of the sensor by functions (N, k) of its motion."""
+    """A field of any size along each axis of the sensor, by functions (N, k) of its motion."""
     flat = on_each_axis(functions)
     unit = priors.COURSE_UNIT["sensor"]
     low, high = (np.array([np.log(unit * one)]) for one in priors.COURSE_SIZES)
@@ -56,9 +57,9 @@ def _field_by_functions(key: str, functions: Array) -> Component:
 
 
 def field_by_heading(context: Context) -> Component:
-    """A field on the sensor in waves of the heading, as a turret's or a crane's that turns back.
+    """A field on the sensor in harmonics of the heading: a turret, or a crane that turns back.
 
-    Of a few seconds each time and of many directions it is noise of a colour in time.
+    If each turn takes a few seconds and goes to many directions, it is coloured noise in time.
     """
     columns, unit = heading_columns(context), priors.COURSE_UNIT["sensor"]
     low, high = (np.array([np.log(unit * one)]) for one in priors.COURSE_SIZES)
@@ -67,9 +68,9 @@ def field_by_heading(context: Context) -> Component:
 
 
 def single_remainder_parts(all_parts: Iterable[Component]) -> list[Component]:
-    """Parts of what every recording leaves, each of any size and beside none of the others.
+    """Parts of the ordinary remainder, each of any size and tested without the other parts.
 
-    Where one is there and not the others it is no ordinary remainder: a source that no name has.
+    If only one part is supported by the data it is no ordinary remainder but an unexplained source.
     """
     found = []
     for part in all_parts:
@@ -82,10 +83,11 @@ def single_remainder_parts(all_parts: Iterable[Component]) -> list[Component]:
 def coefficient_factors(
     effect: Component, contribution: Array, context: Context
 ) -> list[Component]:
-    """What a name adds (N, 3), by a factor that is free in time, and by one free in attitude.
+    """An effect's contribution (N, 3) times a factor varying in time, and times one in attitude.
 
-    Both are relative to its coefficient, and 0 in the mean: where an attitude hardly changes, a
-    factor that is free in it were else the name again, of one coefficient in place of many.
+    Both factors are relative to the effect's coefficient and have mean 0, weighted by the square of
+    the contribution.  Otherwise, where the attitude hardly changes, the factor would be the effect
+    itself with one coefficient in place of many.
     """
     weight = np.sum(contribution**2, axis=1)
     weight = weight / max(float(np.sum(weight)), 1e-300)
@@ -110,5 +112,5 @@ def coefficient_factors(
 
 
 def factor_keys(key: str) -> tuple[str, str]:
-    """Keys of the free factors of a name."""
+    """Keys of the two varying factors of an effect."""
     return f"{key}, free in time", f"{key}, free in attitude"

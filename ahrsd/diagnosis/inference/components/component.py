@@ -1,9 +1,10 @@
-"""What a component of the model is: columns on the readings, and the law of their coefficients.
+"""A component of the model: columns on the sensor readings and the prior law of their coefficients.
 
     readings = calibration + sum_j B_j w_j + noise,    w_j ~ N(0, diag(Phi_j(psi_j)))
 
-The columns are made of the context (the recording as the present model sees it); the law gives the
-variances and their slopes in its hyperparameters psi, all of which are logarithms.
+The columns B_j are computed from the context (the recording as the present model sees it).  The law
+gives the variances Phi_j and their slopes in the hyperparameters psi_j, all of which are
+logarithms.
 """
 
 from __future__ import annotations
@@ -22,46 +23,47 @@ from ahrsd.samples import Array
 
 
 class Law(Protocol):
-    """Variances (q,) of independent coefficients as a function of psi (k,), logarithms.
+    """Prior variances (q,) of independent coefficients as a function of psi (k,), all logarithms.
 
-    start, low, high (k,): where a search begins and between which it stays
+    start, low, high (k,): start and bounds of a search for psi
     """
 
     @property
     def start(self) -> Array:
-        """Where a search begins."""
+        """Start of a search."""
 
     @property
     def low(self) -> Array:
-        """Lowest psi."""
+        """Lower bound of psi."""
 
     @property
     def high(self) -> Array:
-        """Highest psi."""
+        """Upper bound of psi."""
 
     @property
     def stiffness(self) -> Array:
         """(k,) curvature of minus the log density of psi."""
 
     def log_variance(self, psi: Array) -> Array:
-        """(q,)."""
+        """(q,) log variances of the coefficients."""
 
     def slope(self, psi: Array) -> Array:
-        """(q, k) of the log variances in psi."""
+        """(q, k) derivatives of the log variances with respect to psi."""
 
     def log_prior(self, psi: Array) -> tuple[float, Array]:
         """Log density of psi and its gradient (k,)."""
 
 
-#: of a setting, s: from when and until when something is there
+#: keys of a setting, s: the times at which an effect begins and ends
 MOMENTS = ("onset_s", "end_s")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LazyColumns:
-    """Columns that are made whenever they are asked for.
+    """Columns that are computed anew at each access.
 
-    Those of a thousand candidates would be as much as their rows, and few of them are asked for.
+    The columns of a thousand candidates would take as much memory as their filtered rows, and few
+    of them are needed again.
     """
 
     make: Callable[[], Columns]
@@ -83,7 +85,7 @@ class LazyColumns:
 def columns_in_frame(
     context: Context, frame: Frame, time_functions: Callable[[], Array], count: int
 ) -> LazyColumns:
-    """Courses in time, (N, count), each along each axis of a frame: three columns a course."""
+    """Columns of functions of time (N, count), each along each axis of a frame: (N, 3, 3 count)."""
 
     def make() -> Columns:
         axes = unit_columns(context, frame)
@@ -97,14 +99,14 @@ def columns_in_frame(
 class Component:
     """One part of the model.
 
-    key:     its name in a hypothesis, unique
+    key:     unique identifier in a hypothesis
     frame:   sensor, world, gyro or link
-    columns: per unit of the coefficients
-    law:     of the coefficients
-    prior:   log odds of being there
-    row, setting: of the library, where it is one
-    beside: key of another that it holds and that is taken out of its columns: it is asked beside
-            that alone
+    columns: readings per unit of the coefficients
+    law:     prior law of the coefficients
+    prior:   prior log odds that the component is present
+    row, setting: the library's effect and its setting, where the component is one
+    beside: key of a component whose columns lie in the span of this one's and were projected out of
+            them; this component is tested only in a model that contains that one
     """
 
     key: str
@@ -118,17 +120,17 @@ class Component:
 
     @property
     def effect(self) -> str | None:
-        """Its identifier in the library, where it is there."""
+        """Identifier of its effect in the library, None where it is none."""
         return None if self.row is None else self.row.identifier
 
     @property
     def jumps(self) -> bool:
-        """Whether it is one vector from a moment on."""
+        """True for an effect that is one constant vector from its onset on."""
         return self.row is not None and self.row.jumps
 
     @property
     def moments_s(self) -> tuple[float, ...]:
-        """When it begins, and ends where its setting says so, s."""
+        """Times at which it begins and, where its setting has an end, at which it ends, s."""
         times_s = (self.setting.get(name) for name in MOMENTS)
         return tuple(float(one) for one in times_s if one is not None)
 
@@ -138,7 +140,7 @@ class Component:
         return self.columns.width
 
     def shifted_columns(self, share: float) -> Columns:
-        """Its columns by a share of the recording later, their end at the beginning."""
+        """Its columns later by a share of the recording; what is cut off at the end comes first."""
         mag, gyro = (
             None if part is None else np.roll(part, round(share * len(part)), axis=0)
             for part in (self.columns.mag, self.columns.gyro)
@@ -146,12 +148,12 @@ class Component:
         return Columns(mag, gyro)
 
     def moved(self, share: float) -> Component:
-        """A copy at another time: of the same law, with nothing to do with the readings."""
+        """A copy shifted in time: of the same law, but unrelated to the readings."""
         key = f"{self.key}, moved by {share}"
         return replace(self, key=key, columns=self.shifted_columns(share))
 
     def with_lazy_columns(self, context: Context) -> Component:
-        """The same, which makes its columns of the context whenever they are asked for."""
+        """The same component, whose columns are computed from the context at each access."""
         if self.row is None or self.beside:
             raise ValueError(f"{self.key} is no effect of the library in a setting")
         columns = self.columns
@@ -162,7 +164,7 @@ class Component:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FixedLaw:
-    """Variances that are known.  variance (q,)."""
+    """Known variances (q,) without hyperparameters."""
 
     variance: Array
     start: Array = field(default_factory=lambda: np.zeros(0))
@@ -171,23 +173,24 @@ class FixedLaw:
     stiffness: Array = field(default_factory=lambda: np.zeros(0))
 
     def log_variance(self, psi: Array) -> Array:
-        """(q,) logarithms."""
+        """(q,) log variances."""
         return np.asarray(np.log(self.variance))
 
     def slope(self, psi: Array) -> Array:
-        """(q, k) of the log variances."""
+        """(q, 0): no hyperparameters."""
         return np.zeros((len(self.variance), 0))
 
     def log_prior(self, psi: Array) -> tuple[float, Array]:
-        """Log density and gradient (k,)."""
+        """Log density 0 and an empty gradient."""
         return 0.0, np.zeros(0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaledLaw:
-    """One size for all: variance = scale^2 e^(2 psi).
+    """One size for all coefficients: variance = scale^2 e^(2 psi).
 
-    scale (q,);  low, high: of psi;  mean, spread: of its normal law; spread 0: even between them
+    scale (q,): unit of each coefficient;  low, high: bounds of psi
+    mean, spread: of the normal prior of psi; spread 0: uniform between the bounds
     """
 
     scale: Array
@@ -198,7 +201,7 @@ class ScaledLaw:
 
     @property
     def start(self) -> Array:
-        """Where a search begins."""
+        """Start of a search: the prior mean within the bounds."""
         return np.asarray(np.clip(np.array([self.mean]), self.low, self.high))
 
     @property
@@ -207,11 +210,11 @@ class ScaledLaw:
         return np.array([normal_curvature(self.spread)])
 
     def log_variance(self, psi: Array) -> Array:
-        """(q,) logarithms."""
+        """(q,) log variances."""
         return np.asarray(2.0 * np.log(self.scale) + 2.0 * psi[0])
 
     def slope(self, psi: Array) -> Array:
-        """(q, k) of the log variances."""
+        """(q, k) derivatives of the log variances with respect to psi."""
         return np.full((len(self.scale), 1), 2.0)
 
     def log_prior(self, psi: Array) -> tuple[float, Array]:
@@ -220,14 +223,17 @@ class ScaledLaw:
 
 
 def normal_curvature(spread: float) -> float:
-    """Curvature of minus the log density of one logarithm; spread 0: even."""
+    """Curvature of minus the log density of a hyperparameter; 0 if it is uniform (spread 0)."""
     return spread**-2 if spread > 0.0 else 0.0
 
 
 def log_density(
     value: float, mean: float, spread: float, low: float, high: float
 ) -> tuple[float, Array]:
-    """Of one logarithm: normal, or even between its ends (spread 0); and its slope (1,)."""
+    """Log density of one hyperparameter and its slope (1,).
+
+    It is normal, or uniform between its bounds where spread is 0.
+    """
     if spread > 0.0:
         scaled = (value - mean) / spread
         return -0.5 * scaled**2 - float(np.log(spread * np.sqrt(2 * np.pi))), np.array(

@@ -1,4 +1,4 @@
-"""The library's effects as components: one for each setting, and what a form leaves."""
+"""Effects of the library as components, one per setting, and components for their form."""
 
 from __future__ import annotations
 
@@ -24,29 +24,30 @@ from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.diagnosis.where_and_when.locate import Frame
 from ahrsd.samples import Array
 
-#: the delay that stands for all delays: which of them it is, is asked at the end
+#: key of the one delay in the search; which of the library's delays it is, is decided at the end
 LAG = "delay"
 LAG_FORM = "form of the delay"
 _PROJECTED = ", beside the delay"
-#: parts in which the transition of a step is free
+#: intervals of time round a step in which its transition is free
 STEP_PIECES = 20
-#: pieces of a pulse's form
+#: intervals of time in the form of a pulse
 PULSE_PIECES = 12
-#: of a component's power beyond another that is rounding: no reading tells the two
+#: share of a component's power outside the span of another's columns that is rounding: no reading
+#: can tell the two apart
 ROUNDING_SHARE = 1e-12
-#: s between the times at which a logged cause is tried
+#: s between the shifts in time at which a logged cause is tried
 LATE_STEP_S = priors.LOGGED_LATE_S[-1] - priors.LOGGED_LATE_S[-2]
-#: parts of a recording's length, and factors, to which onsets and scales are sought
+#: resolution of onsets in successive rounds of refinement, as shares of the recording's duration
 _REFINEMENT_SHARES = (1 / 40, 1 / 120, 1 / 400, 1 / 1200, 1 / 3600)
 
-#: degrees by which angles of a setting are first turned
+#: degrees by which angles of a setting are turned in the first round of refinement
 _TURN_DEG = 20.0
 
 
 def library_components(
     context: Context, library: Mapping[str, Effect]
 ) -> Iterator[tuple[str, list[Component]]]:
-    """Every effect's settings that can be computed here, with its identifier, one by one."""
+    """Yield each effect's identifier with a component per setting that can be computed here."""
     for name, effect in library.items():
         settings = () if effect.delay or effect.quick else effect.settings(context)
         settings = tuple(
@@ -58,10 +59,10 @@ def library_components(
 
 
 def logged_time_settings(context: Context, effect: Effect, setting: Setting) -> tuple[Setting, ...]:
-    """The setting with its logged cause as it came, and earlier and later where that matters.
+    """The setting with its logged cause as recorded, and shifted in time where that matters.
 
-    A current that is averaged in the logger, or stamped when it is written, is some tenths of a
-    second off, and held against the field as it is logged it explains nothing.
+    A current that the logger averages, or stamps when it is written, is some tenths of a second
+    off. Compared with the field at its logged time it then explains nothing.
     """
     if setting.get("covariate") not in context.track.covariates:
         return (setting,)
@@ -73,7 +74,7 @@ def logged_time_settings(context: Context, effect: Effect, setting: Setting) -> 
 
 
 def _centred(columns: Columns | LazyColumns) -> Array:
-    """(N, 3 p) columns about their means: a constant is the calibration's."""
+    """(N, 3 p) columns about their means: a constant belongs to the calibration."""
     side = columns.gyro if columns.mag is None else columns.mag
     if side is None:
         raise ValueError("an effect without columns has no setting")
@@ -82,10 +83,11 @@ def _centred(columns: Columns | LazyColumns) -> Array:
 
 
 def logged_cause_components(context: Context, library: Mapping[str, Effect]) -> list[Component]:
-    """Effects by a logged cause (a current, a temperature, ...), each in its first setting.
+    """Effects of a logged cause (a current, a temperature, ...), each in its first setting.
 
-    Their keys are the same at every point: a setting that follows the readings (a mean temperature)
-    would else be another component at the next, and what it took out of them were lost.
+    Their keys are the same at every linearisation point.  A setting may depend on the readings (a
+    mean temperature); with the setting in the key the component would be another one at the next
+    point, and the contribution subtracted from the readings would be lost.
     """
     out = []
     for name, effect in library.items():
@@ -101,7 +103,10 @@ def logged_cause_components(context: Context, library: Mapping[str, Effect]) -> 
 def effect_component(
     context: Context, effect: Effect, setting: Setting, settings_tried: int
 ) -> Component:
-    """An effect in one setting.  tried: settings among which it is chosen."""
+    """An effect in one setting.
+
+    settings_tried: number of settings among which this one is chosen; they share the prior odds
+    """
     searched = int(setting.get("searched", 1))
     log_odds = float(np.log(priors.EFFECT) - np.log(max(1, settings_tried) * max(1, searched)))
     log_odds += np.count_nonzero(setting.get("memory", ())) * float(np.log(priors.REMEMBERED))
@@ -119,7 +124,7 @@ def effect_component(
 def rebuild_component(
     known: Component, context: Context, library: Mapping[str, Effect]
 ) -> Component:
-    """A named component, its columns made of another context."""
+    """An effect's component with its columns computed from another context."""
     if known.row is None or known.key == LAG:
         return known
     rebuilt = replace(known, columns=known.row.columns(context, known.setting))
@@ -128,7 +133,7 @@ def rebuild_component(
 
 
 def delay_component(context: Context, library: Mapping[str, Effect]) -> Component | None:
-    """The delay between the sensors, of either sign; None where the library has no late field."""
+    """The delay between the sensors, of either sign; None if the library has no such delay."""
     effect, log_odds = plain_delay(library, 1.0), float(np.log(priors.DELAY))
     if effect is None:
         return None
@@ -137,7 +142,7 @@ def delay_component(context: Context, library: Mapping[str, Effect]) -> Componen
 
 
 def plain_delay(library: Mapping[str, Effect], sign: float) -> Effect | None:
-    """The library's delay of a sign that is told where nothing speaks for another."""
+    """The library's delay of a sign, reported if nothing supports another kind of delay."""
     plain = (one for one in library.values() if one.plain and one.delay * sign > 0.0)
     return next(plain, None)
 
@@ -145,9 +150,9 @@ def plain_delay(library: Mapping[str, Effect], sign: float) -> Effect | None:
 def contains_component(
     one: Component, part: Component, tolerance: float = priors.COLUMNS_ALIKE
 ) -> bool:
-    """Whether a component can be all that another is: its columns are among the first's.
+    """True if the columns of `part` lie in the span of the columns of `one`.
 
-    least: of the other's power that may be beyond
+    tolerance: share of the power of `part` that may lie outside the span
     """
     if one.width <= part.width or one.columns.on_mag != part.columns.on_mag:
         return False
@@ -159,7 +164,10 @@ def contains_component(
 
 
 def project_out(one: Component, part: Component) -> Component:
-    """A component that holds another, without it: both in one set would share what they have."""
+    """A component whose span contains another's column, with that column projected out.
+
+    Both in one model would otherwise share what they have in common.
+    """
     mag, part_mag = one.columns.mag, part.columns.mag
     if mag is None or part_mag is None:
         raise ValueError(f"{one.key} and {part.key} are not of the magnetometer")
@@ -170,30 +178,34 @@ def project_out(one: Component, part: Component) -> Component:
 
 
 def projected_key(key: str) -> str:
-    """Key of what a component has beyond the delay that it holds."""
+    """Key of a component from which the delay has been projected out."""
     return key if key.endswith(_PROJECTED) else f"{key}{_PROJECTED}"
 
 
 def delay_form(context: Context, lag_s: float) -> Component:
-    """What a delay by a filter does beyond a delay: of either, in part."""
+    """How a delay caused by a filter differs from a pure delay; for either sign, in part."""
     law = FixedLaw(np.array([priors.LAG_IS_FILTER**2]))
     return Component(LAG_FORM, "sensor", beyond_the_lag(context, abs(lag_s)), law)
 
 
 def component_key(name: str, setting: Setting) -> str:
-    """One text for an effect in a setting."""
+    """Key of an effect in a setting."""
     kept = {k: v for k, v in setting.items() if k != "searched"}
     return f"{name} {json.dumps(kept, sort_keys=True, default=str)}"
 
 
 def _effect_law(effect: Effect) -> ScaledLaw:
+    """One size for all coefficients, in units of the effect's usual sizes."""
     scale = np.array([one.scale for one in effect.parameters])
     low, high = np.log(priors.EFFECT_SIZES)
     return ScaledLaw(scale, np.array([low]), np.array([high]))
 
 
 def neighbouring_settings(setting: Setting, duration_s: float, round_: int) -> list[Setting]:
-    """The setting with its onset a little earlier and later, and its scale less and more."""
+    """Settings with times earlier and later, scales less and more, angles turned both ways.
+
+    The steps become smaller from round to round.
+    """
     out: list[Setting] = []
     share = _REFINEMENT_SHARES[min(round_, len(_REFINEMENT_SHARES) - 1)]
     for name in MOMENTS:
@@ -218,11 +230,11 @@ def neighbouring_settings(setting: Setting, duration_s: float, round_: int) -> l
 def form_component(
     known: Component, context: Context, library: Mapping[str, Effect]
 ) -> Component | None:
-    """What an effect leaves of its form; None where nothing is known of that.
+    """A component for the error of an effect's form in time; None where no such form is known.
 
-    A step takes its time: within some seconds of its onset the source may be at any size.  What
-    comes once a period may swell and fade.  A cause that changes quickly is logged late, or as a
-    mean of some time: its change in time.
+    A step takes time: within some seconds of its onset the source may have any size.  A pulse that
+    comes once a period may grow and fade.  A cause that changes quickly may be logged late or as a
+    mean over some time; its form is its change in time.
     """
     law = known.law
     if not isinstance(law, ScaledLaw):
@@ -250,7 +262,7 @@ def form_component(
 
 
 def _time_differences(around: list[Array | None]) -> Array | None:
-    """(N, 3, 2 p) first and second difference of columns before, at and behind a time."""
+    """(N, 3, 2 p) first and second difference of columns earlier than, at and later than a time."""
     before, at, behind = around
     if before is None or at is None or behind is None:
         return None
@@ -258,7 +270,7 @@ def _time_differences(around: list[Array | None]) -> Array | None:
 
 
 def _step_form(known: Component, law: ScaledLaw, context: Context, frame: Frame) -> Component:
-    """Of a step: pieces of time round its onset, and its end, each along each axis of its frame."""
+    """Form of a step: intervals of time round its onset and its end, along each axis."""
     width_s, moments_s = 2 * priors.APPROACH_S / STEP_PIECES, known.moments_s
 
     def piece_indicators() -> Array:
@@ -276,7 +288,7 @@ def _step_form(known: Component, law: ScaledLaw, context: Context, frame: Frame)
 
 
 def _pulse_form(known: Component, law: ScaledLaw, context: Context, frame: Frame) -> Component:
-    """Of pulses: pieces of a period, from a width before to one behind, along each axis."""
+    """Form of pulses: intervals from one width before a pulse to one after, along each axis."""
     setting = known.setting
     piece_s = 3.0 * setting["width_s"] / PULSE_PIECES
 
@@ -297,9 +309,9 @@ def interval_components(
     library: Mapping[str, Effect],
     settings_tried: int,
 ) -> list[Component]:
-    """What comes with one step and goes with another, as each vector that jumps.
+    """Effects that begin with one step and end with another, one for each effect that jumps.
 
-    What was put on is taken off: one vector where two steps have one each.
+    A source that is put on and taken off is one vector; two steps would have one vector each.
     """
     first, last = begins.moments_s[0], ends.moments_s[-1]
     effects = [row for row in library.values() if row.jumps]

@@ -1,10 +1,10 @@
-"""A course in time, in a frame, as a Gaussian process of cosines.
+"""A Gaussian process in time, in a frame, as a sum of cosines.
 
     x(t) = sum_k w_k cos(pi k (t - t0) / T),    var w_k = size^2 c / (1 + (k / corner)^2)
 
-with c such that the variance over the recording is size^2.  With a corner of one half wave it is a
-walk, with a corner beyond all of them white.  The constant is left out: the calibration has it.
-Each axis of the frame has such a course of its own, all of one size.
+c is such that the variance over the recording is size^2.  With a corner of one half wave the
+process is a random walk; with a corner beyond all modes it is white.  The constant is left out, as
+the calibration contains it.  Each axis of the frame has a process of its own, all of one size.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.where_and_when.locate import Frame
 from ahrsd.samples import Array
 
-#: half waves of a course: one in so many seconds, and from few to many
+#: number of modes (half waves): one in so many seconds, and its lower and upper limit
 _MODE_S, _FEWEST_MODES, _MOST_MODES = 5.0, 16, 28
-#: the same of a quick one
+#: the same for a process with short waves
 _QUICK_MODE_S, _MOST_QUICK_MODES = 1.5, 80
 
 
@@ -36,8 +36,8 @@ _QUICK_MODE_S, _MOST_QUICK_MODES = 1.5, 80
 class GaussianProcessLaw:
     """psi: logarithms of the size, in units of `unit`, and of the corner, in half waves.
 
-    order (q,): of each coefficient;  mean, spread: of the log size; spread 0: even;  most: units
-    corners: between which the corner is
+    order (q,): of each coefficient's mode;  mean, spread: normal prior of the log size; spread 0:
+    uniform;  most: largest size, in units;  corners: bounds of the corner
     """
 
     order: Array
@@ -49,17 +49,17 @@ class GaussianProcessLaw:
 
     @property
     def start(self) -> Array:
-        """Where a search begins."""
+        """Start of a search."""
         return np.array([self.mean, np.log(4.0)])
 
     @property
     def low(self) -> Array:
-        """Lowest psi."""
+        """Lower bounds of psi."""
         return np.log([priors.COURSE_SIZES[0], self.corners[0]])
 
     @property
     def high(self) -> Array:
-        """Highest psi."""
+        """Upper bounds of psi."""
         return np.log([self.most, self.corners[1]])
 
     @property
@@ -68,19 +68,19 @@ class GaussianProcessLaw:
         return np.array([normal_curvature(self.spread), 0.0])
 
     def _shape(self, psi: Array) -> tuple[Array, Array]:
-        """Log shape (q,) before it is scaled, and its slope in the log corner (q,)."""
+        """Log of the unscaled variances (q,), and its slope in the log corner (q,)."""
         squared_ratio = (self.order * np.exp(-psi[1])) ** 2
         return -np.log1p(squared_ratio), 2.0 * squared_ratio / (1.0 + squared_ratio)
 
     def log_variance(self, psi: Array) -> Array:
-        """(q,) logarithms."""
+        """(q,) log variances."""
         shape, _ = self._shape(psi)
         axes = len(shape) / len(np.unique(self.order))
         log_power = np.log(np.sum(np.exp(shape)) / axes / 2.0)  # a cosine has half of its square
         return np.asarray(2 * np.log(self.unit) + 2 * psi[0] + shape - log_power)
 
     def slope(self, psi: Array) -> Array:
-        """(q, k) of the log variances."""
+        """(q, k) derivatives of the log variances with respect to psi."""
         shape, shape_slope = self._shape(psi)
         power_share = np.exp(shape) / np.sum(np.exp(shape))
         return np.column_stack([np.full(len(shape), 2.0), shape_slope - power_share @ shape_slope])
@@ -100,9 +100,10 @@ def gaussian_process(
     like: Component | None = None,
     quick: str | None = None,
 ) -> Component:
-    """A course in one frame; of ordinary size where that is given, else of any.
+    """A Gaussian process in one frame, of any size or, where `ordinary` is given, of ordinary size.
 
-    like: one of the same frame, whose columns it takes;  quick: key of one with short waves too
+    like: a component of the same frame whose columns are shared;  quick: key of a process that has
+    short waves as well
     """
     mode_count = np.clip(context.track.duration_s / _MODE_S, _FEWEST_MODES, _MOST_MODES)
     if quick is not None:
@@ -126,6 +127,6 @@ def gaussian_process(
 
 
 def _cosine_modes(time_s: Array, order: NDArray[np.int_]) -> Array:
-    """(N, k) half waves."""
+    """(N, k) half waves over the recording."""
     phase = np.pi * (time_s - time_s[0]) / (time_s[-1] - time_s[0])
     return np.asarray(np.cos(phase[:, None] * order))

@@ -1,8 +1,9 @@
-"""What every real recording leaves, with sizes measured on untouched ones (`priors`).
+"""The ordinary remainder: what every real recording contains beyond a calibration.
 
-A room differs from place to place and its field from time to time, a sensor is not quite linear, a
-gyro not quite straight.  All of that is locked to time, attitude, rate and force, and without
-components of its own the library's flexible names would be told for it.
+Its sizes were measured on untouched recordings (`priors`).  The field in a room differs from place
+to place and in time, a sensor is not quite linear, a gyro's axes are not quite straight.  All of
+that depends on time, attitude, rate and force.  Without components of its own the flexible effects
+of the library would be reported for it.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.estimator.locked import harmonics, of_change, on_each_axis, squares
 from ahrsd.samples import Array
 
-#: a gyro's matrix, and of its coefficients the turns: rates have turn x rate more
+#: key of the gyro's matrix, and its coefficients that are turns: they add turn x rate to the rates
 GYRO_MATRIX, TURNS = "gyro_matrix", slice(0, 3)
 _GRAVITY = 9.81
 
 
 def ordinary_remainder(context: Context) -> list[Component]:
-    """Its components along a recording."""
+    """Its components for a recording."""
     found = [
         gaussian_process(context, "world", priors.ORDINARY["world_course"]),
         gaussian_process(context, "gyro", priors.ORDINARY["gyro_course"]),
@@ -45,7 +46,7 @@ def ordinary_remainder(context: Context) -> list[Component]:
 
 
 def _remainder_component(context: Context, key: str, frame: str, functions: Array) -> Component:
-    """Each function (N, k) along each axis of the sensor, all coefficients of one size."""
+    """Functions (N, k), each along each axis of the sensor, all coefficients of one size."""
     law = ordinary_size_law(priors.ORDINARY[key], np.ones(3 * functions.shape[1]))
     flat = on_each_axis(functions)
     columns = Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
@@ -53,16 +54,16 @@ def _remainder_component(context: Context, key: str, frame: str, functions: Arra
 
 
 def ordinary_size_law(size: priors.Size, scale: Array) -> ScaledLaw:
-    """The law of an ordinary size, of coefficients in units of `scale` (q,)."""
+    """Lognormal law of an ordinary size, of coefficients in units of `scale` (q,)."""
     mean = float(np.log(size.median))
     low, high = mean - 4.0 * size.spread, float(np.log(size.most))
     return ScaledLaw(scale, np.array([low]), np.array([high]), mean, size.spread)
 
 
 def still_intervals(time_s: Array, gyro_rad_s: Array) -> list[tuple[float, float]]:
-    """The longest spells in which a sensor hardly turns, from and to, s, in their order.
+    """The longest intervals in which a sensor hardly turns, from and to, s, in order of time.
 
-    None where it hardly turns in most of its time: then that is its motion.
+    Empty if it hardly turns for most of the recording: then that is its motion.
     """
     rows = max(1, round(priors.SMOOTHED_S * len(time_s) / float(time_s[-1] - time_s[0])))
     rate = np.linalg.norm(uniform_filter1d(gyro_rad_s, rows, axis=0), axis=1)
@@ -76,14 +77,14 @@ def still_intervals(time_s: Array, gyro_rad_s: Array) -> list[tuple[float, float
 
 
 def field_by_change(context: Context) -> Component:
-    """A matrix on the field's change, without what is alike on all axes: that is the delay."""
+    """A matrix times the field's rate of change, less the part equal on all axes (a delay)."""
     columns = of_change(context.field_dot_b)
     law = ordinary_size_law(priors.ORDINARY["by_change"], np.ones(columns.shape[2]))
     return Component("by_change", "sensor", Columns(mag=columns), law)
 
 
 def mount_bending(context: Context) -> Component:
-    """A mount that gives: turned by what force and angular acceleration do to it."""
+    """A flexible mount, turned by force and angular acceleration."""
     effect = next(one for one in EFFECTS.values() if one.ordinary_part == "bending")
     law = ordinary_size_law(
         priors.ORDINARY["bending"], np.array([one.scale for one in effect.parameters])
@@ -92,7 +93,7 @@ def mount_bending(context: Context) -> Component:
 
 
 def gyro_matrix(context: Context) -> Component:
-    """Of the rates: three turns, three scales, three shears, of known ordinary sizes."""
+    """Errors linear in the rates: 3 turns, 3 scales, 3 shears, of known ordinary sizes."""
     w = context.rowwise_rate_b_rad_s
     columns = np.zeros((len(w), 3, 9))
     for axis in range(3):
