@@ -1,1 +1,1 @@
-"""The recording linearised at a model, and how likely a set of components is there."""
+"""The recording linearised at a model, and the likelihood of a set of components there."""

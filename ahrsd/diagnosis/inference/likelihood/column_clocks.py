@@ -1,8 +1,8 @@
-"""Whether a logged column runs by another clock than the sensor, asked at the richest model.
+"""Test whether a logged column has another clock than the sensor, with the richest model.
 
-Its free course on the sensor holds what is missing, whatever it is.  A column that explains most of
-that course at some other time (`clocks`) is asked there, beside all of the richest model but the
-course and what follows the column as it was logged.
+The richest model's free field on the sensor contains whatever is missing.  If a column explains
+most of that field at some other time (`clocks`), the shift is tested by Bayes factors.  The model
+is then the richest model without the free field and without what depends on the column as logged.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _FREE_FIELD = RICH_COURSES[0]
 
 
 def find_wrong_clock(fitted: FittedPoint) -> Late | None:
-    """The clock of the column that explains most of the richest model's free course, if wrong."""
+    """The clock of the column that explains most of the richest model's free field, if wrong."""
     track = fitted.base.made.context.track
     if not track.covariates:
         return None
@@ -41,7 +41,7 @@ def find_wrong_clock(fitted: FittedPoint) -> Late | None:
 
 
 def _free_field(fitted: FittedPoint) -> Located:
-    """The free course on the sensor, stretch by stretch."""
+    """The free field on the sensor, interval by interval."""
     base, track = fitted.base, fitted.base.made.context.track
     cut = segments(track.time_s, max(2, int(track.duration_s / priors.ON_TIME_S)))
     value, coefficient_deviation = (
@@ -56,7 +56,7 @@ def _free_field(fitted: FittedPoint) -> Located:
 
 
 class _ClockEvidence:
-    """A field by one column at other times, against the readings beside a model."""
+    """Evidence for the field of one column shifted in time, given a model (`ColumnEvidence`)."""
 
     def __init__(self, fitted: FittedPoint, column: str) -> None:
         base, track = fitted.base, fitted.base.made.context.track

@@ -1,14 +1,14 @@
-"""Noise along one direction: a source that is quicker than any course, or never comes twice alike.
+"""Noise along one direction: a source quicker than the Gaussian processes, or never repeating.
 
-A sensor's own noise is independent from axis to axis, whatever its colour, and its axes differ by a
-level that is the same in every octave.  A current, or iron that moves, acts along one direction of
-the sensor, in some octaves and not in others:
+A sensor's own noise is independent from axis to axis, whatever its colour, and its axes differ by
+levels that are the same in every octave.  A current, or iron that moves, acts along one direction
+of the sensor, in some octaves and not in others:
 
     covariance in octave b:  v_b (D + p_b a a^T),   D diagonal, |D| = 1, p_b >= 0
                           =  v_b L (I + q_b w w^T) L,   L = D^(1/2), w a unit vector
 
-L and w are the likeliest; each q_b is averaged over none and a grid of sizes.  What a loud gyro
-leaves is across the field, along two directions: its evidence is taken off.
+L and w maximise the posterior; each q_b is averaged over zero and a grid of sizes.  The error of a
+noisy gyro is perpendicular to the field, along two directions: its evidence is subtracted.
 """
 
 from __future__ import annotations
@@ -27,17 +27,18 @@ from ahrsd.diagnosis.inference.likelihood.noise_model import octave_edges
 from ahrsd.diagnosis.model import directions
 from ahrsd.samples import Array
 
-#: directions to begin with, of each axis and of each octave's loudest, the likeliest of them
+#: number of starts of the maximisation: the most probable of the three axes and each octave's
+#: direction of largest power
 _STARTS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectedNoise:
-    """What is louder along one direction.
+    """Noise with more power along one direction.
 
     level (3,): of each axis, their product 1;  along (3,): unit vector of the axes in these levels
     share (B,): q of each octave;  square (B,): mean square of the source in the residual there
-    edges_hz (B + 1,): ends of the octaves;  nats: by which it is likelier
+    edges_hz (B + 1,): edges of the octaves;  nats: log odds of the source
     """
 
     level: Array
@@ -49,19 +50,19 @@ class DirectedNoise:
 
     @property
     def direction(self) -> Array:
-        """(3,) unit vector of the sensor along which it acts."""
+        """(3,) unit vector of the sensor along which the source acts."""
         acts = self.level * self.along
         return np.asarray(acts / np.linalg.norm(acts))
 
     def whitening(self, band_hz: Array) -> Array:
-        """(B, 3, 3) that make bands with these middles (B,) alike on all axes."""
+        """(B, 3, 3) matrices that equalise the noise of all axes in bands with middles band_hz."""
         share = self.share[np.searchsorted(self.edges_hz[1:-1], band_hz)]
         shrinkage = 1.0 / np.sqrt(1.0 + share) - 1.0
         along = np.eye(3) + shrinkage[:, None, None] * np.outer(self.along, self.along)
         return np.asarray(along / self.level)
 
     def power(self, band_hz: Array, variance: Array) -> Array:
-        """(B,) mean square of the source in bands with these middles.
+        """(B,) mean square of the source in bands with middles band_hz.
 
         variance (B,): by which the residual was divided there
         """
@@ -72,10 +73,10 @@ class DirectedNoise:
 def fit_directed_noise(
     residual: Array, field_b: Array, rate_hz: float, used_share: float
 ) -> DirectedNoise:
-    """The likeliest source of one direction in a residual (N, 3) of about unit variance.
+    """The most probable source of one direction in a residual (N, 3) of about unit variance.
 
-    field_b: (N, 3), none where it is not known;  used: share of rows that are readings
-    nats are of its odds, as those of a course that nothing names.
+    field_b: (N, 3), zero where it is not known;  used_share: share of rows that are readings
+    nats are its log odds, with the prior of an unexplained Gaussian process.
     """
     count = len(residual)
     edges = octave_edges(count)
@@ -100,7 +101,10 @@ def fit_directed_noise(
 
 
 def _fit(square: Array, rows: Array) -> tuple[Array, Array, Array, float]:
-    """Levels, direction, shares and nats, of covariances (B, 3, 3) of so many rows (B,)."""
+    """Levels, direction, shares and nats gained over no source.
+
+    square: (B, 3, 3) covariances;  rows: (B,) their numbers of rows
+    """
     level, log_null = _maximise(lambda x: _log_posterior(square, rows, x, None)[0], np.zeros(2))
 
     def log_posterior(x: Array) -> float:
@@ -115,7 +119,7 @@ def _fit(square: Array, rows: Array) -> tuple[Array, Array, Array, float]:
 
 
 def _maximise(objective: Callable[[Array], float], start: Array) -> tuple[Array, float]:
-    """Where a smooth function of few numbers is largest, near a start, and its value there."""
+    """Maximum of a smooth function of few variables near a start, and its value there."""
 
     def cost(x: Array) -> float:
         return -objective(x)
@@ -132,9 +136,9 @@ def _levels(log_ratio: Array) -> Array:
 def _log_posterior(
     square: Array, rows: Array, log_ratio: Array, w: Array | None
 ) -> tuple[float, Array]:
-    """Log likelihood and prior of the levels, each octave's power at its likeliest; its shares.
+    """Log likelihood plus log prior of the levels, and the expected shares.
 
-    w: direction, None where there is no source
+    Each octave's power is at its maximum.  w: direction, None for no source
     """
     level = _levels(log_ratio)
     scaled = square / level / level[:, None]
@@ -164,7 +168,10 @@ def _log_posterior(
 def _across_field_nats(
     cosines: Array, along_cosines: Array, bands: list[tuple[int, int]], rows: NDArray[np.float64]
 ) -> float:
-    """Nats by which power along the field and across it differ, octave by octave, 0 at least."""
+    """Log likelihood gained by separate powers along and across the field, summed over octaves.
+
+    An octave counts only where the power across the field is the larger one.
+    """
     out = 0.0
     for (a, b), count in zip(bands, rows, strict=True):
         if count == 0.0:

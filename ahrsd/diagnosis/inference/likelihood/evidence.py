@@ -1,19 +1,19 @@
-"""The log marginal likelihood of a model, its gradient and curvature, and where it is largest.
+"""The log marginal likelihood of a model, its gradient and curvature, and its maximisation.
 
     y = B w + e,    w_j ~ N(0, Phi_j(psi)),    e in band b white of variance v_b
 
-With the bands' products G_b = B_b^T B_b, s_b = B_b^T y_b, y_b^T y_b and n_b rows, everything else
-is algebra of the size of B: with D = Phi^(1/2), G = sum_b G_b / v_b, s likewise, A = I + D G D and
-m = A^-1 D s,
+The data enter by the bands' products G_b = B_b^T B_b, s_b = B_b^T y_b, y_b^T y_b and their numbers
+of rows n_b; all else is algebra of the size of B.  With D = Phi^(1/2), G = sum_b G_b / v_b, s =
+sum_b s_b / v_b, A = I + D G D and m = A^-1 D s,
 
     2 L = -sum_b n_b log v_b - log |A| - sum_b y_b^T y_b / v_b + m^T D s - n log 2 pi
 
     dL / d log phi_j = (m_j^2 - 1 + (A^-1)_jj) / 2
-    dL / d log v_b   = (r_b / v_b - n_b + tr(A^-1 D G_b D) / v_b) / 2
+    dL / d log v_b   = (|r_b|^2 / v_b - n_b + tr(A^-1 D G_b D) / v_b) / 2
 
-with r_b the square of the band's residual.  The calibration is in B with its own wide prior, so
-this is a restricted likelihood.  Priors of psi and log v are added: what is maximised is their
-joint density, and every hypothesis is judged at its own maximum.
+with r_b the band's residual.  The calibration is in B with its own wide prior, so this is a
+restricted likelihood.  Log priors of psi and log v are added: their joint density is maximised, and
+every hypothesis is judged at its own maximum.
 
 A step to the maximum takes the average information (Gilmour, Thompson and Cullis 1995), half of
 Z^T P Z with Z the columns dV P y and P the projection of the restricted likelihood: the mean of
@@ -21,9 +21,10 @@ observed and expected curvature, without a trace of a product.  With M = I - A^-
 t_b = A^-1 D B_b^T r_b / v_b it is
 
     2 H(phi_i, phi_j) = m_i M_ij m_j,    2 H(v_b, phi_j) = t_bj m_j,
-    2 H(v_b, v_c) = |r_b|^2 / v_b where b = c, less (B_b^T r_b / v_b)^T D A^-1 D (B_c^T r_c / v_c)
+    2 H(v_b, v_c) = |r_b|^2 / v_b if b = c, less (B_b^T r_b / v_b)^T D A^-1 D (B_c^T r_c / v_c)
 
-Where a variance is far too large m is nothing: its diagonal is at least the expected one.
+If a variance is far too large, m nearly vanishes and with it this curvature; so its diagonal is at
+least the expected one.
 """
 
 from __future__ import annotations
@@ -39,25 +40,26 @@ from ahrsd.diagnosis.inference.components.component import Law
 from ahrsd.diagnosis.inference.likelihood import noise_model
 from ahrsd.samples import Array
 
-#: relative: columns that are alike but for rounding would else leave no root
+#: relative increase of the diagonal: if columns are equal but for rounding, there would be no root
 _JITTER = 1e-10
-#: a maximum is reached where a step would gain less, nats; steps; and the longest, of a logarithm
+#: gain of a step, nats, below which the maximum is reached; most steps; longest step of a logarithm
 _CONVERGED_NATS, _MOST_STEPS, _LONGEST_STEP = 0.02, 40, 2.0
-#: how many times what a step foretells the rest of a climb may gain
+#: largest gain of the remaining steps, as a multiple of the gain predicted of the next step
 _HOPED_FACTOR = 5.0
-#: parts of a step that are tried
+#: shares of a step that are tried in turn
 _STEP_SHARES = (1.0, 0.3, 0.1, 0.02)
-#: curvature of a logarithm that nothing tells of;  parts of the curvature's diagonal that are added
-#: to it until a step leads up
+#: curvature of a logarithm that is not constrained;  multiples of the curvature's diagonal that are
+#: added to it in turn until a step leads up
 _LEAST_CURVATURE, _DAMPING = 0.02, (0.0, 0.1, 1.0, 10.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Products:
-    """What the data say, band by band.
+    """Products of the columns and the data, band by band.
 
-    G (B, q, q), s (B, q), square (B,), rows (B,);  step: of the noise's spectrum (`noise_model`)
-    alone: numbers of bands that stand alone in it
+    G (B, q, q), s (B, q), square (B,), rows (B,);  step: prior deviation of the noise's spectrum
+    from octave to octave (`noise_model`);  alone: indices of bands that are not tied to their
+    neighbours
     """
 
     G: Array
@@ -70,11 +72,11 @@ class Products:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelFit:
-    """The model at one point of its hyperparameters.
+    """A model at one point of its hyperparameters.
 
-    nats: log likelihood and log priors; -inf where rounding is more than what is left
+    nats: log likelihood and log priors; -inf where rounding exceeds the residual's square
     gradient (k,), curvature (k, k): in (log v, psi)
-    mean, deviation: (q,) of the coefficients
+    mean, deviation: (q,) of the coefficients' posterior
     """
 
     nats: float
@@ -88,7 +90,7 @@ class ModelFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _JointPrior:
-    """The laws at one psi: log variances (q,), slopes (q, k), log density with slope, stiffness."""
+    """The laws at one psi: log variances (q,), slopes (q, k), log density, slope and stiffness."""
 
     phi: Array
     slopes: Array
@@ -99,11 +101,11 @@ class _JointPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BandResiduals:
-    """Of each band: expected square (B,), square of the likeliest residual (B,), B^T r (B, q)."""
+    """Of each band: expected and maximum-likelihood square of the residual (B,), B^T r (B, q)."""
 
     expected: Array
     square: Array
-    turned: Array
+    score: Array
 
 
 def evaluate(products: Products, laws: Sequence[Law], log_noise: Array, psi: Array) -> ModelFit:
@@ -158,6 +160,7 @@ def _invert(products: Products, inverse: Array, deviation: Array) -> tuple[Array
 def _band_residuals(
     products: Products, A_inverse: Array, mean: Array, deviation: Array
 ) -> _BandResiduals:
+    """Squares of the bands' residuals at the posterior mean, and products with them."""
     fitted = products.G @ mean
     square = products.square - 2 * products.s @ mean + fitted @ mean
     covariance = A_inverse * deviation
@@ -174,9 +177,9 @@ def _curvature(
     m: Array,
     inverse: Array,
 ) -> Array:
-    """Average information of (log v, psi), its diagonal at least the expected, and the priors'."""
+    """Average information of (log v, psi), its diagonal at least the expected, plus the priors'."""
     deviation, count = np.exp(0.5 * prior.phi), len(inverse)
-    projected = noise.turned * inverse[:, None] * deviation
+    projected = noise.score * inverse[:, None] * deviation
     projected_A_inverse = projected @ A_inverse
     by_phi = prior.slopes * m[:, None]
     M = -A_inverse
@@ -200,7 +203,7 @@ def _curvature(
 
 
 def _joint_prior(laws: Sequence[Law], psi: Array) -> _JointPrior:
-    """The laws together."""
+    """The laws of all components together."""
     starts = np.cumsum([0, *(len(law.start) for law in laws)])
     psi_of_laws = [psi[a:b] for a, b in itertools.pairwise(starts)]
     phi = [law.log_variance(law_psi) for law, law_psi in zip(laws, psi_of_laws, strict=True)]
@@ -217,7 +220,7 @@ def _joint_prior(laws: Sequence[Law], psi: Array) -> _JointPrior:
 
 
 def maximise(products: Products, laws: Sequence[Law], start: tuple[Array, Array]) -> ModelFit:
-    """The likeliest hyperparameters, climbed to from a start (log noise, psi)."""
+    """The most probable hyperparameters, found by Newton steps from a start (log noise, psi)."""
     found = maximise_above(products, laws, start, -np.inf)
     if found is None:
         raise ValueError("a climb that nothing ends has an end")
@@ -232,11 +235,12 @@ def maximise_above(
     *,
     start_small: Sequence[int] = (),
 ) -> ModelFit | None:
-    """The same, None as soon as the climb will surely not reach so many nats.
+    """The same; None as soon as the maximum is surely below `required` nats.
 
-    Newton's steps with the average information, between the ends of what is allowed.
-    small: laws that begin at their smallest where that is likelier: of many coefficients that
-    nothing tells a size comes down by half a logarithm a step, and a climb looks as if it ended
+    Newton steps with the average information, within the bounds of the hyperparameters.
+    start_small: indices of laws that start at their lower bound if that is more probable.  A size
+    of many coefficients that the data do not constrain decreases by half a logarithm a step, which
+    looks like convergence.
     """
     count = len(products.rows)
     low, high = noise_model.bounds(count)
@@ -273,10 +277,10 @@ def maximise_above(
 
 
 def _newton_step(at: ModelFit, x: Array, low: Array, high: Array) -> Array:
-    """The step to the maximum of the quadratic that this point shows, inside of what is allowed.
+    """The step to the maximum of the local quadratic approximation, within the bounds.
 
-    Where a logarithm ends at what is allowed and hardly differs from another, as the size and the
-    corner of a course, what is left of the step may lead down: then a shorter one is taken.
+    If a logarithm is at its bound and is strongly correlated with another, as the size and the
+    corner of a Gaussian process, the remaining step may lead down: then the curvature is damped.
     """
     step = np.zeros(len(x))
     for damping in _DAMPING:
@@ -287,7 +291,7 @@ def _newton_step(at: ModelFit, x: Array, low: Array, high: Array) -> Array:
 
 
 def _bounded_step(at: ModelFit, x: Array, low: Array, high: Array, damping: float) -> Array:
-    """The step with so much of the curvature's diagonal added to it, end after end held."""
+    """The step with a multiple of the curvature's diagonal added, bound after bound held fixed."""
     g = at.gradient
     H = at.curvature + np.diag(_LEAST_CURVATURE + damping * np.diag(at.curvature))
     step = np.zeros(len(x))
@@ -307,7 +311,7 @@ def _bounded_step(at: ModelFit, x: Array, low: Array, high: Array, damping: floa
 def _solve_scaled(H: Array, g: Array) -> Array:
     """H^-1 g of a curvature, each hyperparameter in its own unit.
 
-    Beside something a thousand times louder than the noise some curvatures are 1e12 times others,
+    Given a source a thousand times larger than the noise, some curvatures are 1e12 times others,
     and unscaled the matrix is singular to rounding.
     """
     scale = 1.0 / np.sqrt(np.diag(H))

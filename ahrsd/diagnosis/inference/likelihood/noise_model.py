@@ -1,11 +1,11 @@
-"""The noise: a power per octave, a level per moment, and Student's law of the readings.
+"""The noise: a power per octave, a level per time, and Student's law of the readings.
 
     e_n = a_n s_n,     s stationary, its power per octave v_b;  a_n known in each pass
 
-The octaves are of cosines over the whole recording, of readings that were divided by a_n.  v is a
-smooth spectrum: octave to octave a step of its logarithm, so that the lowest, which has few
-cosines, cannot swallow an effect for nothing.  a_n follows the residual of the richest model, never
-that of the null: it must not be the mismatch's own.
+The octaves consist of cosines over the whole recording, of readings divided by a_n.  v is a smooth
+spectrum: its logarithm changes from octave to octave by a step with a normal prior.  So the lowest
+octave, which has few cosines, cannot absorb an effect at no cost.  a_n is computed from the residual
+of the richest model, never from that of the null model: it must not contain the mismatch itself.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.special import gammaln
 from ahrsd.diagnosis import priors
 from ahrsd.samples import Array
 
-#: median of the square of three normal numbers;  rounds in which a scale is found
+#: median of the sum of squares of three standard normal numbers;  iterations for a scale
 _MEDIAN_OF_3, _SCALE_ROUNDS = 2.366, 12
 
 
@@ -35,9 +35,9 @@ def octave_edges(count: int) -> NDArray[np.intp]:
 def insert_narrow_bands(
     edges: NDArray[np.intp], low: int, high: int, width: int
 ) -> tuple[NDArray[np.intp], slice]:
-    """Edges with bands of their own from one cosine to another, and their numbers.
+    """Edges with narrow bands inserted from cosine `low` to `high`, and their indices.
 
-    width: of one, cosines: what hums is louder in the middle than at its sides
+    width: of one band, cosines: a narrow-band source has more power in the middle than at its sides
     """
     margin = (high - low) // 2
     outside = [e for e in edges.tolist()[1:-1] if e < low - margin or e > high + margin]
@@ -47,7 +47,7 @@ def insert_narrow_bands(
 
 
 def _step_deviations(count: int, deviation: float, alone: slice | None) -> Array:
-    """(B - 1,) of the steps of the spectrum; to bands that stand alone and from them any."""
+    """(B - 1,) prior deviations of the spectrum's steps; wide at the bands that are not tied."""
     out = np.full(count - 1, deviation)
     if alone is not None:
         out[max(0, alone.start - 1) : alone.stop] = priors.NOISE_TOP
@@ -59,7 +59,7 @@ def log_prior(
 ) -> tuple[float, Array]:
     """Log density of the bands' log powers (B,), and its gradient.
 
-    deviation: octave to octave;  alone: numbers of bands that may stand out by any power
+    deviation: from octave to octave;  alone: indices of bands that may have any power
     """
     deviations = _step_deviations(len(log_noise), deviation, alone)
     step = np.diff(log_noise) / deviations
@@ -86,10 +86,10 @@ def bounds(count: int) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseLevels:
-    """How loud each row is.
+    """Noise level of each row.
 
-    amplitude (N,): of its noise;  tails: nats by which rows of Student's law are likelier than the
-    normal ones of these amplitudes, near the residual that they were made of
+    amplitude (N,): of its noise;  tails: log likelihood of the rows under Student's law, less that
+    under the normal laws of these amplitudes, near the residual from which they were computed
     """
 
     amplitude: Array
@@ -97,17 +97,17 @@ class NoiseLevels:
 
 
 def uniform_levels(rows: int) -> NoiseLevels:
-    """All rows alike."""
+    """The same level in all rows."""
     return NoiseLevels(np.ones(rows), 0.0)
 
 
 def fit_noise_levels(residual: Array, used: NDArray[np.bool], rate_hz: float) -> NoiseLevels:
-    """How loud each row is, from a residual (N, 3) without colour.
+    """Noise levels from a residual (N, 3) that is white in time.
 
-    The level is the moving median of the quick part alone: a step, a current or a course is slow or
-    short, and a level that followed it would leave no evidence of it.  Beyond the level a row has
-    Student's law: one far off counts for little, and what is strong there loses most of its
-    evidence but never all.
+    The level is the moving median of the quick part alone.  A step, a current or a Gaussian process
+    is slow or short, and a level that followed it would leave no evidence of it.  Relative to the
+    level a row has Student's law: an outlier counts for little, and what is strong there loses most
+    of its evidence but never all.
     """
     second_difference = np.diff(residual, n=2, axis=0, prepend=residual[:1], append=residual[-1:])
     rows = 2 * round(priors.LEVEL_S * rate_hz / 2) + 1
@@ -134,14 +134,14 @@ class _Student:
     nats: float
 
     def weight(self, square: Array) -> Array:
-        """What a row of this square counts for, 1 where the law is normal."""
+        """Weights of rows with these squares, 1 where the law is normal."""
         if np.isinf(self.freedom):
             return np.ones(len(square))
         return np.asarray((self.freedom + 3.0) / (self.freedom + square / self.scale))
 
 
 def _fit_student(square: Array, freedom: float) -> _Student:
-    """The law with its likeliest scale, of rows' squares (n,)."""
+    """The law with its maximum-likelihood scale, of rows' squares (n,)."""
     law = _Student(freedom, max(float(np.mean(square)) / 3.0, 1e-300), 0.0)
     if np.isinf(freedom):
         nats = -1.5 * len(square) * (np.log(2 * np.pi * law.scale) + 1.0)
