@@ -1,8 +1,8 @@
 """The recording linearised at a model: rows by frequency, products of components band by band.
 
 At the point (calibration c, coefficients w) the innovations are e = y - B w - C (c - c0) to first
-order; y = e + B w + C (c - c0), so every hypothesis is judged with zero-mean priors at one point,
-whichever components hold at it.
+order.  With y = e + B w + C (c - c0), every hypothesis is judged with zero-mean priors at one
+point, whichever components were subtracted there.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
 CALIBRATION = "calibration"
-#: columns that pass the filter together, at most, and numbers that they have
+#: most columns, and most numbers in them, that pass the filter together
 _BATCH_COLUMNS, _BATCH_NUMBERS = 96, 4_000_000
-#: number of the readings among the batches
+#: index of y among the batches
 _Y = -1
-#: rows whose products are made at once
+#: rows that are multiplied at once
 _PRODUCT_ROWS = 8192
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ContextSource:
-    """What a context is made of."""
+    """What a context is computed from."""
 
     filtered: Filtered
     terms_gyro: Array | None
@@ -56,14 +56,15 @@ class _ContextSource:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Point:
-    """Where everything is linearised.
+    """The point of linearisation.
 
-    values: coefficients by component that are taken out of the readings
-    terms_mag, terms_gyro: (N, 3) what they add;  loud: rows of the noise
+    values: coefficients by component that are subtracted from the readings
+    terms_mag, terms_gyro: (N, 3) their contribution;  loud: noise level of each row
     exact: components that are taken out of the track itself: the delay
-    misread: (N, 3) rad/s of terms_gyro that a name stands for.  Columns are made of rates without
-             it, but with all that has none: of rates less their own squares, squares run away
-    directed: what makes the noise louder along one direction, None where nothing does
+    misread: (N, 3) rad/s, the part of terms_gyro that effects of the library explain.  Columns are
+             computed from the rates less this part only: squares of rates from which squares were
+             subtracted would diverge
+    directed: noise along one direction, None for none
     """
 
     problem: Problem
@@ -78,13 +79,13 @@ class Point:
 
     @property
     def context(self) -> Context:
-        """The recording as columns are made of it."""
+        """The recording from which columns are computed."""
         return build_context(self.problem.track, _ContextSource(self.filtered, self.misread))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilteredComponent:
-    """A component and where its rows are: columns of one of the arrays that passed together."""
+    """A component and the columns that hold its rows in one of the batches."""
 
     component: Component
     batch: int
@@ -93,13 +94,15 @@ class FilteredComponent:
 
 @dataclass(eq=False)
 class Linearised:
-    """A point, the context there, and products of components, each made once.
+    """A point, its context, and products of components, each computed once.
 
-    batches: (3 M, p) rows of components that passed the filter together, as the noise sees them,
-             in single precision, which is one part in ten million of a column
-    apart: what has a batch of its own: each that was a member of a model
-    alone: numbers of bands of the noise that stand alone, None where there are none
-    whitening: (B, 3, 3) that make each band alike on all axes, None where it is
+    batches: (3 M, p) rows of components that passed the filter together: divided by the noise
+             level, by frequency, whitened across axes; in single precision, one part in ten million
+             of a column
+    blocks: products of two batches, band by band
+    apart: keys of components with a batch of their own: members of some model
+    alone: indices of noise bands that are not tied to their neighbours, None for none
+    whitening: (B, 3, 3) that equalise the noise of all axes in each band, None if it is equal
     """
 
     point: Point
@@ -115,9 +118,9 @@ class Linearised:
     apart: set[str] = field(default_factory=set)
 
     def add(self, components: Sequence[Component]) -> None:
-        """Pass components through the filter; what is known already is left out.
+        """Pass components through the filter, unless they are known.
 
-        Components that have their columns in common pass once.
+        Components that share their columns pass once.
         """
         new = [one for one in components if one.key not in self.seen]
         known = {id(one.component.columns): one for one in self.seen.values()}
@@ -145,17 +148,17 @@ class Linearised:
             self.seen[one.key] = replace(twin, component=one)
 
     def whiten_axes(self, rows: Array) -> Array:
-        """Rows by frequency (3 M, p) in axes along which the noise is alike."""
+        """Rows by frequency (3 M, p) in axes along which the noise is equal."""
         return rows if self.whitening is None else self._multiply_bands(rows, self.whitening)
 
     def unwhiten_axes(self, rows: Array) -> Array:
-        """The inverse of that."""
+        """The inverse of `whiten_axes`."""
         if self.whitening is None:
             return rows
         return self._multiply_bands(rows, np.asarray(np.linalg.inv(self.whitening)))
 
     def _multiply_bands(self, rows: Array, matrices: Array) -> Array:
-        """Rows by frequency (3 M, p), the three of each multiplied by its band's matrix."""
+        """Rows by frequency (3 M, p), the three of a frequency multiplied by its band's matrix."""
         out = rows.reshape(-1, 3, rows.shape[1]).copy()
         for matrix, (a, b) in zip(
             matrices.astype(rows.dtype), itertools.pairwise(self.edges), strict=True
@@ -164,13 +167,13 @@ class Linearised:
         return out.reshape(rows.shape)
 
     def _batch_width(self) -> int:
-        """Columns that pass the filter together: fewer of a long recording, to save memory."""
+        """Number of columns that pass the filter together: fewer in a long recording (memory)."""
         return int(
             np.clip(_BATCH_NUMBERS // (3 * len(self.point.loud.amplitude)), 1, _BATCH_COLUMNS)
         )
 
     def copy(self) -> Linearised:
-        """The same, to which components can be added that end with it."""
+        """A copy to which components can be added without changing this one."""
         seen, rows, blocks = dict(self.seen), list(self.batches), dict(self.blocks)
         return replace(self, seen=seen, batches=rows, blocks=blocks, apart=set(self.apart))
 
@@ -180,14 +183,17 @@ class Linearised:
         return self.batches[one.batch][:, one.columns].astype(float)
 
     def make_columns_lazy(self, components: Sequence[Component]) -> None:
-        """Keep no columns of effects that have passed: they are made again when asked for."""
+        """Drop columns of effects that have passed the filter; each access computes them again."""
         for one in components:
             known = self.seen[one.key]
             if known.component is one:
                 self.seen[one.key] = replace(known, component=one.with_lazy_columns(self.context))
 
     def _give_own_batches(self, keys: Sequence[str]) -> None:
-        """Give each a batch of its own: it meets all others, and its neighbours need not."""
+        """Give each component a batch of its own.
+
+        It is multiplied with all others; its neighbours in the old batch need not be.
+        """
         for key in set(keys) - self.apart:
             one = self.seen[key]
             self.batches.append(self.batches[one.batch][:, one.columns].copy())
@@ -196,13 +202,13 @@ class Linearised:
         self.apart.update(keys)
 
     def add_back(self, values: Mapping[str, Array]) -> None:
-        """Add what is taken out of the readings to y, for components that are known here."""
+        """Add to y what was subtracted from the readings for components that are known here."""
         for key, value in values.items():
             self.y = self.y + self.rows(key) @ value
         self.blocks = {pair: found for pair, found in self.blocks.items() if _Y not in pair}
 
     def block(self, left: int, right: int) -> Array:
-        """(B, p, p') products of two batches band by band; of _Y (B, p, 1) with y."""
+        """(B, p, p') products of two batches band by band; (B, p, 1) with y if `right` is _Y."""
         if (left, right) not in self.blocks:
             X = self.batches[left]
             Y = self.y[:, None] if right == _Y else self.batches[right]
@@ -214,7 +220,7 @@ class Linearised:
         return self.blocks[left, right]
 
     def multiply_batches(self, left: Sequence[int], right: Sequence[int]) -> None:
-        """Make the products of two groups of batches together: each is widened to double once."""
+        """Compute products of two groups of batches, each converted to double precision once."""
         same = left is right
         left_columns, right_columns = (self._batch_slices(one) for one in (left, right))
         out = np.zeros((len(self.edges) - 1, left_columns[-1].stop, right_columns[-1].stop))
@@ -250,7 +256,10 @@ class Linearised:
         return [(3 * int(a), 3 * int(b)) for a, b in itertools.pairwise(self.edges)]
 
     def products(self, keys: Sequence[str], step: float) -> Products:
-        """All that the data say of these components; step: prior of the noise's spectrum."""
+        """All products of these components and y.
+
+        step: prior deviation of the noise's spectrum from octave to octave
+        """
         self._give_own_batches(keys)
         batches_of = [self.seen[key].batch for key in keys]
         new = [k for k in batches_of if (k, k) not in self.blocks]
@@ -276,7 +285,7 @@ class Linearised:
 
     @property
     def log_whitening(self) -> float:
-        """By how much the rows are denser than readings, nats: makes points comparable."""
+        """Log density of the readings less that of the rows, nats: makes points comparable."""
         done, used, loud = self.point.filtered, self.point.filtered.used, self.point.loud
         own = done.log_likelihood + 0.5 * np.sum(done.whitened**2, axis=1) + 1.5 * np.log(2 * np.pi)
         nats = float(loud.tails + np.sum(own[used]) - 3.0 * np.sum(np.log(loud.amplitude[used])))
@@ -288,9 +297,9 @@ class Linearised:
     def candidate_products(
         self, keys: Sequence[str], others: Sequence[str], inverse: Array
     ) -> tuple[Array, list[Array], Array]:
-        """Products of a model's components with many others, in noise of inverse powers (B,).
+        """Products of a model's components with candidates, bands weighted by inverse powers (B,).
 
-        (q, p) with the model, each other with itself, and (p,) with y
+        (q, p) with the model, of each candidate with itself, and (p,) with y
         """
         self._give_own_batches(keys)
         own_batches = [self.seen[key].batch for key in keys]
@@ -317,7 +326,7 @@ class Linearised:
         return np.concatenate([self.products_with_y(key) for key in keys], axis=1)
 
     def residual(self, keys: Sequence[str], at: ModelFit) -> Array:
-        """(N, 3) the residual of a model in time, its colour taken out and its levels left in."""
+        """(N, 3) the residual of a model in time, white, times the noise level of each row."""
         rows, begin = self.y.copy(), 0
         for key in keys:
             width = self.seen[key].component.width
@@ -330,25 +339,26 @@ class Linearised:
 
 
 def cosine_rows(cube: Array) -> Array:
-    """(3 M, p) orthonormal cosines of (N, 3, p), frequency by frequency.
+    """(3 M, p) orthonormal cosine transform of (N, 3, p), frequency by frequency.
 
-    M: rows with none behind the last, which are not counted: a count without large factors is fast
+    M: number of rows, zeros appended: a length without large prime factors is fast.  The zeros do
+    not count as readings.
     """
     count = transform_length(len(cube))
     return np.asarray(dct(cube, n=count, axis=0, norm="ortho")).reshape(3 * count, -1)
 
 
 def transform_length(rows: int) -> int:
-    """Cosines for so many rows."""
+    """Length of the cosine transform of so many rows."""
     return int(next_fast_len(rows, real=True))
 
 
 def refilter_with_columns(point: Point, components: Sequence[Component]) -> Point:
-    """The same coefficients taken out of the readings as these components' columns have them.
+    """The same coefficients, with the contribution to the readings computed from these columns.
 
-    Columns follow the point (an attitude, a rate), and those of the point before took out another
-    field: put back by the new ones, the difference would be a mismatch of our own making.  What no
-    component stands for any more is in the readings again.
+    Columns depend on the point (an attitude, a rate); those of the point before subtracted another
+    field.  If the new columns added it back, the difference would be an artificial mismatch.  What
+    no component explains any more remains in the readings.
     """
     known = {one.key: one for one in components}
     values = {key: value for key, value in point.values.items() if key in known}
@@ -361,7 +371,7 @@ def refilter_with_columns(point: Point, components: Sequence[Component]) -> Poin
 
 
 def omit_readings(point: Point, spans_s: Sequence[tuple[float, float]]) -> Point:
-    """The same point without the magnetometer's readings of some spans, from and to, s.
+    """The same point without the magnetometer's readings in some intervals, from and to, s.
 
     The gyro carries the field across.
     """
@@ -380,7 +390,7 @@ def omit_readings(point: Point, spans_s: Sequence[tuple[float, float]]) -> Point
 
 
 def _merge_intervals(spans_s: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-    """Spans in their order, those that overlap as one."""
+    """Intervals in order of time, overlapping ones merged."""
     out: list[tuple[float, float]] = []
     for begin_s, end_s in sorted(spans_s):
         if out and begin_s <= out[-1][1]:
@@ -391,7 +401,7 @@ def _merge_intervals(spans_s: Sequence[tuple[float, float]]) -> tuple[tuple[floa
 
 
 def refit_filter_noise(point: Point) -> Point:
-    """The same point with the filter's noise estimated anew, and gains of that."""
+    """The same point with the filter's noise estimated again, and gains from that noise."""
     problem, mag, gyro = point.problem, point.terms_mag, point.terms_gyro
     model = point.filtered.model
     filtered = run_filter(problem.track, model, mag, gyro)
@@ -402,9 +412,10 @@ def refit_filter_noise(point: Point) -> Point:
 def linearise(
     point: Point, context: Context, band_hz: tuple[float, float] | None = None
 ) -> Linearised:
-    """The recording at a point, the calibration known and put back.
+    """Linearise the recording at a point; the calibration's contribution is added back.
 
-    context: of which all columns are made;  band_hz: in which the noise may have any power
+    context: from which all columns are computed;  band_hz: band in which the noise may have any
+    power
     """
     regressing_filter = regressing(point.filtered, context.rate_b_rad_s)
     count = transform_length(len(point.filtered.whitened))
@@ -448,9 +459,10 @@ def model_from_coefficients(values: Array, like: NullModel) -> NullModel:
 
 
 def initial_point(problem: Problem, filtered: Filtered, exact: tuple[str, ...]) -> Point:
-    """The null's calibration in the sensors' own noise, nothing taken out, all rows alike.
+    """The null model's calibration in the magnetometer's own noise, nothing subtracted.
 
-    Own noise is that of differences from reading to reading: the null's is the mismatch's as well.
+    Own noise is that of differences between readings; the null model's contains the mismatch too.
+    All rows have the same noise level.
     """
     differences = noise_fit.first_guess(problem.track, problem.spec)
     model = _cap_noise(
@@ -465,12 +477,12 @@ def initial_point(problem: Problem, filtered: Filtered, exact: tuple[str, ...]) 
 def step_to_maximum(
     made: Linearised, keys: Sequence[str], at: ModelFit, share: float = 1.0, *, delayed: bool = True
 ) -> Point:
-    """The point at a model's likeliest coefficients, in the noise of the point before.
+    """The point at the most probable coefficients of a model, in the noise of the point before.
 
-    A delay is taken out of the track exactly, all else out of the readings, and these are averaged
-    to the working rate by what is known there.  Gains that followed
-    would whiten what is not yet taken out by another filter: no linear model tells that.
-    share: of the way there;  delayed: whether the delay moves too
+    A delay is taken out of the track exactly, all else is subtracted from the readings.  Both are
+    averaged to the working rate with the new calibration.  The gains stay as they were: gains that
+    followed would whiten what is not subtracted yet by another filter, which no linear model
+    describes. share: of the whole step;  delayed: whether the delay moves too
     """
     point, problem = made.point, made.point.problem
     values = {
@@ -500,7 +512,7 @@ def step_to_maximum(
 
 
 def refit_noise_level(made: Linearised, keys: Sequence[str], at: ModelFit) -> Point:
-    """The same point with the noise's level that a model leaves."""
+    """The same point with the noise levels of a model's residual."""
     residual, point = made.residual(keys, at), made.point
     levels = noise_model.fit_noise_levels(residual, point.filtered.used, point.problem.rate_hz)
     return replace(point, loud=levels)
@@ -509,7 +521,7 @@ def refit_noise_level(made: Linearised, keys: Sequence[str], at: ModelFit) -> Po
 def directed_noise_of_residual(
     made: Linearised, keys: Sequence[str], at: ModelFit
 ) -> DirectedNoise:
-    """What is louder along one direction of the sensor, of what a model leaves."""
+    """Noise along one direction of the sensor in the residual of a model."""
     point = made.point
     residual = made.residual(keys, at) / point.loud.amplitude[:, None]
     residual = np.where(point.filtered.used[:, None], residual, 0.0)
@@ -522,7 +534,7 @@ def directed_noise_of_residual(
 
 
 def remaining_step(made: Linearised, keys: Sequence[str], at: ModelFit) -> tuple[Array, Array]:
-    """How far the likeliest calibration and delay are from the point, and how well known."""
+    """Step from the point to the most probable calibration and delay, and its deviations."""
     prior = prior_of(made.point.problem.track).mean
     before = {
         CALIBRATION: calibration_coefficients(made.point.filtered.model) - prior,
@@ -536,7 +548,7 @@ def remaining_step(made: Linearised, keys: Sequence[str], at: ModelFit) -> tuple
 
 
 def _cap_noise(found: NullModel, before: NullModel) -> NullModel:
-    """The noise that was found, but for what is louder than before: that would be the misfit's."""
+    """The noise that was found, but no larger than before: more would be the mismatch's."""
     return replace(
         found,
         sigma_mag_gauss=min(found.sigma_mag_gauss, before.sigma_mag_gauss),
@@ -545,7 +557,7 @@ def _cap_noise(found: NullModel, before: NullModel) -> NullModel:
 
 
 def coefficients_by_key(made: Linearised, keys: Sequence[str], at: ModelFit) -> dict[str, Array]:
-    """Likeliest coefficients of each component."""
+    """Posterior mean of the coefficients, by component."""
     out, begin = {}, 0
     for key in keys:
         width = made.seen[key].component.width
@@ -557,7 +569,7 @@ def coefficients_by_key(made: Linearised, keys: Sequence[str], at: ModelFit) -> 
 def total_contribution(
     count: int, components: Mapping[str, Component], values: Mapping[str, Array]
 ) -> tuple[Array, Array]:
-    """(count, 3) gauss and rad/s, what components add to the readings."""
+    """(count, 3) gauss and rad/s, what components contribute to the readings."""
     mag, gyro = np.zeros((count, 3)), np.zeros((count, 3))
     for key, value in values.items():
         columns = components[key].columns

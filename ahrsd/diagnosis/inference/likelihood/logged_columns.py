@@ -1,10 +1,11 @@
-"""How each logged column is read: as its logger wrote it.
+"""How the logger recorded each column: held values, noise, means.
 
-A logger holds a value until the next, adds noise of its own, and takes means.  What a column is
-then is no longer what flowed: held it is late, noise makes what follows it too small, and a mean
-lacks what is quick, which a delay or a field by the column's change explains as well.  Each column
-has one reading, for all names by it, and it is chosen before anything is searched: where the
-readings of the sensor are likelier so, beside calibration, delay and all causes that are logged.
+A logger holds a value until the next, adds noise of its own, and averages.  The column then differs
+from, say, the current that flowed.  A held value is late; noise makes the coefficient of the column
+too small; a mean lacks what is quick, which a delay or a field by the column's change would then
+explain.  Each column has one logger model, for all effects that use it.  It is chosen before the
+search, where it makes the sensor's readings more probable, given calibration, delay and all logged
+causes.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
-#: rounds in which the likeliest mean is sought more finely
+#: rounds of refinement of the most probable mean
 _REFINEMENT_ROUNDS = 2
-#: nats of a problem beside calibration, delay and logged causes
+#: log likelihood of a problem given calibration, delay and logged causes, nats
 LogLikelihood = Callable[[Problem], float]
 Library = Mapping[str, Effect]
 
@@ -46,16 +47,16 @@ class LoggerModel:
 
     @property
     def setting(self) -> dict[str, float]:
-        """What a setting by the column says of it."""
+        """The keys of a setting that describe it."""
         known = {"mean_s": self.mean_s, "late_s": self.late_s}
         return {key: value for key, value in known.items() if value}
 
     @property
     def words(self) -> str:
         """In words."""
-        how = [f"the mean of {self.mean_s:.2g} s"] * (self.mean_s > 0.0)
+        words = [f"the mean of {self.mean_s:.2g} s"] * (self.mean_s > 0.0)
         way = "late" if self.late_s > 0.0 else "early"
-        return ", ".join([*how, *[f"logged {abs(self.late_s):.2g} s {way}"] * bool(self.late_s)])
+        return ", ".join([*words, *[f"logged {abs(self.late_s):.2g} s {way}"] * bool(self.late_s)])
 
     def before_logging(self, track: Track) -> Track:
         """A track with the column as it was before it was logged."""
@@ -66,16 +67,18 @@ class LoggerModel:
         return track.with_columns({**track.covariates, self.column: values})
 
     def neighbours(self, round_: int) -> list[LoggerModel]:
-        """Readings that are a little earlier and later, and of means of less and more."""
+        """Logger models a little earlier and later, and with shorter and longer means."""
         step_s, factor = LATE_STEP_S / 2 ** (1 + round_), 2.0 ** (0.5 ** (1 + round_))
         around = [replace(self, late_s=round(self.late_s + way * step_s, 4)) for way in (-1, 1)]
-        return around + [replace(self, mean_s=self.mean_s * by) for by in (1 / factor, factor)]
+        return around + [
+            replace(self, mean_s=self.mean_s * scale) for scale in (1 / factor, factor)
+        ]
 
 
 def clean_columns(problem: Problem, log_likelihood: LogLikelihood) -> Problem:
-    """The problem with each column without what its logger put there, where that is likelier.
+    """The problem without the logger's artefacts in its columns, where that is more probable.
 
-    What is said of that is in its notes.
+    Its notes say so.
     """
     best = None
     for clean in (_interpolate_held, _remove_noise):
@@ -84,14 +87,14 @@ def clean_columns(problem: Problem, log_likelihood: LogLikelihood) -> Problem:
             if changed is None:
                 continue
             best = log_likelihood(problem) if best is None else best
-            found = log_likelihood(changed)
-            if found > best + priors.ODDS_REAL:
-                problem, best = changed, found
+            likelihood = log_likelihood(changed)
+            if likelihood > best + priors.ODDS_REAL:
+                problem, best = changed, likelihood
     return problem
 
 
 def _interpolate_held(problem: Problem, name: str) -> Problem | None:
-    """With a column drawn straight between its values, where these come seldom."""
+    """With a column interpolated linearly between its values, if these are rare; else None."""
     held = tuple(one for one in held_columns(problem.recorded) if one.name == name)
     if not held:
         return None
@@ -100,7 +103,7 @@ def _interpolate_held(problem: Problem, name: str) -> Problem | None:
 
 
 def _remove_noise(problem: Problem, name: str) -> Problem | None:
-    """With a column without its logger's noise, where that can be told from its course."""
+    """With a column without its logger's noise; None if that is not separable from the signal."""
     clean = cleaned(problem.recorded, (name,))
     note = f"column {shown(name)} has noise of its own: what follows it is judged without it"
     return None if clean is None else _replace_recorded(problem, clean, note)
@@ -109,12 +112,13 @@ def _remove_noise(problem: Problem, name: str) -> Problem | None:
 def find_mean_columns(
     made: Linearised, keys: Sequence[str], at: ModelFit, library: Library
 ) -> Iterator[LoggerModel]:
-    """Columns that are likelier means, by what one effect by each is then worth.
+    """Columns that are more probably means, by the Bayes factor of one effect of each column.
 
-    made, keys, at: a model with calibration, delay and all causes as they are logged.  A mean over
-    the time before comes late by half of it; one about the moment does not.  It has to be likelier
-    than any other time of the column: when a name is late, is a setting of its own.
-    One effect alone: a late field and one by the current's change together are a mean as well.
+    made, keys, at: a model with calibration, delay and all causes as they are logged.
+    A mean over the time before is late by half of it; a mean centred on its time is not.  A mean
+    has to be more probable than any shift of the column in time, which is a setting of the effect.
+    Only one effect at a time is tested: a late field and one by the current's change together
+    imitate a mean.
     """
     made = made.copy()
     for name in sorted(made.context.track.covariates):
@@ -133,9 +137,9 @@ def find_mean_columns(
             for late_s in (mean_s / 2, 0.0)
         ]
         for round_ in range(1 + _REFINEMENT_ROUNDS):
-            for one, found in _best_log_bayes_factors(scan, effects, loggers).items():
-                if found > nats:
-                    best, nats = one, found
+            for one, log_bayes_factor in _best_log_bayes_factors(scan, effects, loggers).items():
+                if log_bayes_factor > nats:
+                    best, nats = one, log_bayes_factor
             if best.mean_s == 0.0:
                 break
             loggers = best.neighbours(round_)
@@ -146,7 +150,7 @@ def find_mean_columns(
 def _effects_of_column(
     context: Context, library: Library, name: str
 ) -> list[tuple[Effect, Setting]]:
-    """Effects by a column in their first setting, where another time or mean changes them."""
+    """Effects of a column in their first setting, where a shift in time or a mean changes them."""
     found = []
     for effect in library.values():
         if effect.delay or effect.quick or not effect.needs:
@@ -160,7 +164,7 @@ def _effects_of_column(
 def _scan_without_column(
     made: Linearised, keys: Sequence[str], at: ModelFit, name: str
 ) -> CandidateScan:
-    """The model without what a column causes, in the noise that it leaves with it."""
+    """The model without the effects of a column, in the noise that it has with them."""
     psi, kept, begin = [], [], 0
     for key in keys:
         one = made.seen[key].component
@@ -175,7 +179,7 @@ def _scan_without_column(
 def _best_log_bayes_factors(
     scan: CandidateScan, effects: Sequence[tuple[Effect, Setting]], loggers: Sequence[LoggerModel]
 ) -> dict[LoggerModel, float]:
-    """Nats of the likeliest of the effects by each reading."""
+    """Largest log Bayes factor of the effects for each logger model."""
     made, logger_of = scan.made, dict[str, LoggerModel]()
     for one in loggers:
         context = replace(made.context, track=one.before_logging(made.context.track))
@@ -191,7 +195,7 @@ def _best_log_bayes_factors(
 
 
 def apply_logger_model(problem: Problem, logger: LoggerModel) -> Problem:
-    """The problem with a column read so."""
+    """The problem with a column corrected for its logger."""
     note = f"column {shown(logger.column)} is read as {logger.words}"
     logged = {**problem.logged, logger.column: logger.setting}
     return replace(
@@ -200,7 +204,7 @@ def apply_logger_model(problem: Problem, logger: LoggerModel) -> Problem:
 
 
 def recorded_setting(setting: Setting, problem: Problem) -> Setting:
-    """A setting by a column as it was recorded, of one by the column as it is read."""
+    """A setting by a column as recorded, from one by the column as corrected for its logger."""
     logger = problem.logged.get(str(setting.get("covariate")), {})
     return {
         **setting,
@@ -213,10 +217,10 @@ def _replace_recorded(problem: Problem, recorded: Track, note: str) -> Problem:
 
 
 def deconvolve_mean(time_s: Array, values: Array, mean_s: float) -> Array:
-    """(N,) values at times that are means over mean_s about these, as they were before.
+    """(N,) values before averaging, from means over mean_s about these times.
 
-    Each frequency is put back by what a mean leaves of it, as Wiener has it: where that is next to
-    nothing, it stays away.
+    Each frequency is divided by the mean's transfer function with a Wiener filter: where that is
+    close to zero, the frequency remains suppressed.
     """
     count, lost = len(values), priors.LOGGED_LOST
     even_s = np.linspace(time_s[0], time_s[-1], count)

@@ -4,8 +4,8 @@
 
 The octaves consist of cosines over the whole recording, of readings divided by a_n.  v is a smooth
 spectrum: its logarithm changes from octave to octave by a step with a normal prior.  So the lowest
-octave, which has few cosines, cannot absorb an effect at no cost.  a_n is computed from the residual
-of the richest model, never from that of the null model: it must not contain the mismatch itself.
+octave, which has few cosines, cannot absorb an effect at no cost.  a_n is computed from the
+residual of the richest model, never from that of the null model: it must not contain the mismatch.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""The richest model: calibration, delay, ordinary remainder and free courses in every frame.
+"""The richest model: calibration, delay, ordinary remainder, and a free Gaussian process.
 
-It is where everything is linearised.  In the null, what is missing counts as noise: beside a magnet
-of 0.14 G its sigma was ten times too large, the calibration was bent to it, and the step never got
-its evidence.  Here courses hold what is missing, whatever it is; the noise is what they leave, the
-calibration is the one beside them, and a name has to do better than they do.
+Everything is linearised there.  In the null model what is missing counts as noise: with a magnet of
+0.14 G its sigma was ten times too large, the calibration was biased by it, and the step never got
+its evidence.  In the richest model Gaussian processes absorb whatever is missing.  The noise is
+their residual, the calibration is the one fitted with them, and an effect has to explain the data
+better than they do.
 """
 
 from __future__ import annotations
@@ -50,15 +51,15 @@ from ahrsd.diagnosis.inference.likelihood.logged_columns import (
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered
 from ahrsd.diagnosis.where_and_when.locate import FRAMES
 
-#: linearisations in one noise, noises, and nats that a further one must gain
+#: most linearisations in one noise, most noise estimates, and nats that a further one must gain
 ROUNDS, NOISES, SETTLED = 6, 3, 5.0
-#: parts of a step that are tried, with the delay's or without
+#: shares of a step that are tried in turn, and whether the delay moves with it
 STEPS: tuple[tuple[float, bool], ...] = ((1.0, True), (1.0, False), (0.3, False))
-#: deviations of an innovation beyond which a step has left every calibration that can be
+#: standard deviations of an innovation beyond which a step has left all possible calibrations
 _DIVERGED = 1e6
-#: the sensor's course stands for all three where the remainder, with the other two, is in
+#: key of the free process on the sensor; the remainder contains those of the world and the gyro
 RICH_COURSES = ("free sensor",)
-#: of the ordinary remainder, by frame
+#: keys of the ordinary remainder's Gaussian processes, by frame
 COURSES = {frame: f"{frame}_course" for frame in FRAMES}
 
 
@@ -66,8 +67,9 @@ COURSES = {frame: f"{frame}_course" for frame in FRAMES}
 class Base:
     """A linearisation with everything but candidates.
 
-    remainder: keys of what real recordings leave;  whole: keys of the richest model, or of that of
-    the first steps: calibration, delay, logged causes
+    remainder: keys of the ordinary remainder
+    whole: keys of the richest model, or of the small model of the first steps: calibration, delay,
+           logged causes
     """
 
     made: Linearised
@@ -80,7 +82,8 @@ def build_base(
 ) -> Base:
     """The base at a point.
 
-    named: components known by name, made anew of this context;  whole: with remainder and courses
+    effects: components of known effects, rebuilt from this context
+    whole: with remainder and Gaussian processes
     """
     context = point.context
     remainder_parts = ordinary_remainder(context) if whole else []
@@ -115,10 +118,10 @@ def build_base(
 def fit_hyperparameters(
     made: Linearised, keys: Sequence[str], step: float, near: ModelFit | None = None
 ) -> ModelFit:
-    """The likeliest hyperparameters of a model, from the highest band's power on.
+    """The most probable hyperparameters of a model, starting at the power of the highest band.
 
-    That is the sensor's own: from there an effect is not noise before it was asked for.
-    near: of the same components at a point nearby, from where the climb is short
+    That is the sensor's own noise: so an effect does not count as noise before it is tested.
+    near: fit of the same components at a point nearby, from which fewer steps are needed
     """
     products = made.products(keys, step)
     laws = [made.seen[key].component.law for key in keys]
@@ -142,10 +145,11 @@ def psi_by_key(made: Linearised, keys: Sequence[str], at: ModelFit) -> dict[str,
 def fit_richest_model(
     problem: Problem, filtered: Filtered, library: Mapping[str, Effect]
 ) -> FittedPoint:
-    """The likeliest point of some at the richest model, nothing named, from a null's filter.
+    """The most probable point of linearisation with the richest model, without effects.
 
-    First the delay and the logged causes alone, beside noise of any spectrum: a delay of a tenth of
-    a second, or a motor's current, bend everything else that is fitted beside them.
+    It starts from a null model's filter.  First delay and logged causes alone are fitted, in noise
+    of any spectrum: a delay of a tenth of a second, or a motor's current, biases all else that is
+    fitted together with it.
     """
     problem = _choose_column_readings(problem, filtered, library)
     small = _converge(_find_delay(problem, filtered, library), library, (), whole=False)
@@ -160,21 +164,22 @@ def fit_richest_model(
 
 
 def _instant_rate_delays(problem: Problem) -> tuple[float, ...]:
-    """Delays that a gyro may have whose values are rates at instants: it is early by half a step.
+    """Delays to test if the gyro's values are rates at instants, and so early by half a step.
 
-    That half alone, and where there is more, all of it, which is the magnetometer's as well.
+    Half a step alone and, if the delay is more than that, all of it, as then the magnetometer is
+    late too.
     """
     step_s = usual_step(problem.recorded.dt_s)
     if problem.lag_s <= 0.0 or step_s is None:
         return ()
-    both_sensors = of_magnetometer(problem.recorded, problem.lag_s)
-    return (step_s / 2, problem.lag_s) if both_sensors else (step_s / 2,)
+    exceeds_half_step = of_magnetometer(problem.recorded, problem.lag_s)
+    return (step_s / 2, problem.lag_s) if exceeds_half_step else (step_s / 2,)
 
 
 def _choose_column_readings(
     problem: Problem, filtered: Filtered, library: Mapping[str, Effect]
 ) -> Problem:
-    """The problem with each column read as its logger wrote it, where that is likelier."""
+    """The problem with each column corrected for its logger, where that is more probable."""
 
     def log_likelihood(one: Problem) -> float:
         return _fit_at_delay(one, filtered, library, 0.0).nats
@@ -195,16 +200,16 @@ def _fit_at_delay(
     problem: Problem, filtered: Filtered, library: Mapping[str, Effect], lag_s: float
 ) -> FittedPoint:
     """The small model at a delay."""
-    start = initial_point(problem.lagging(lag_s), filtered, (LAG,))
+    point = initial_point(problem.lagging(lag_s), filtered, (LAG,))
     values = {} if lag_s == 0.0 else {LAG: np.array([lag_s])}
-    return fit_at_point(replace(start, values=values), library, (), whole=False)
+    return fit_at_point(replace(point, values=values), library, (), whole=False)
 
 
 def _find_delay(problem: Problem, filtered: Filtered, library: Mapping[str, Effect]) -> FittedPoint:
-    """The small model at the likeliest of some delays, sought up and down from none.
+    """The small model at the most probable delay, sought in steps up and down from zero.
 
-    Beside a calibration that a long delay has bent, what is linear in it may point the other way.
-    A library without a late magnetometer has no delay.
+    A search is needed: in a calibration that a long delay has biased, the linear estimate may have
+    the wrong sign.  A library without a magnetometer delay has no delay.
     """
     if plain_delay(library, 1.0) is None:
         return fit_at_point(initial_point(problem, filtered, ()), library, (), whole=False)
@@ -226,43 +231,44 @@ def _find_delay(problem: Problem, filtered: Filtered, library: Mapping[str, Effe
 def _is_only_averaging(
     here: FittedPoint, problem: Problem, filtered: Filtered, library: Mapping[str, Effect]
 ) -> bool:
-    """Whether a gyro that is late by as much as it is early here makes readings about as likely.
+    """True if the opposite delay makes the readings about as probable.
 
-    Moved in time its noise is averaged, either way.  Of nats that go by the square of what a delay
-    is off by, one that is there has a quarter of the difference of the two.
+    Shifted in time the gyro's noise is averaged, in either direction.  The log likelihood falls
+    with the square of the delay's error: a true delay gains over none a quarter of what it gains
+    over its opposite.
     """
     late = _fit_at_delay(problem, filtered, library, -here.base.made.point.problem.lag_s)
     return here.nats - late.nats < 4.0 * priors.ODDS_REAL
 
 
 def _points_to_smaller_delay(here: FittedPoint) -> bool:
-    """Whether readings say at a delay that it is nearer to none.
+    """True if at this delay the linear estimate of it is significantly closer to zero.
 
-    Moved in time a gyro's noise is another one, and in some the readings are likelier, whatever the
-    delay is; a delay that is there stays where it is.
+    Shifted in time the gyro's noise differs, and the readings may be more probable by that alone.
+    At a true delay the estimate stays where it is.
     """
     lag_s = here.base.made.point.problem.lag_s
-    off, deviation = remaining_step(
-        here.base.made, here.base.whole, here.at
-    )  # of the delay the last
+    # the last entry is the delay's
+    off, deviation = remaining_step(here.base.made, here.base.whole, here.at)
     return bool(-off[-1] * np.sign(lag_s) > priors.POINTS_BACK * deviation[-1])
 
 
 def converge(
     point: Point, library: Mapping[str, Effect], effects: Sequence[Component]
 ) -> FittedPoint:
-    """The point moved to where the richest model with these names is likeliest."""
+    """The point at which the richest model with these effects is most probable."""
     return _converge(fit_at_point(point, library, effects), library, effects, whole=True)
 
 
 def _converge(
     here: FittedPoint, library: Mapping[str, Effect], effects: Sequence[Component], *, whole: bool
 ) -> FittedPoint:
-    """Moved while that makes the model likelier, and with gains of the noise that is left there.
+    """Step while the model becomes more probable, and estimate the noise again at the end.
 
-    A step that makes it less likely, linear as it is, is taken in part or not at all; none is taken
-    that is less than the calibration and the delay are known to.  Coefficients move in held noise,
-    and the noise is estimated anew where they rest: what was not taken out yet is no noise.
+    If a full step makes the model less probable, as the model is not linear, a part of it is taken
+    or none.  No step is taken that is below the uncertainty of calibration and delay.  Coefficients
+    move in fixed noise; the noise is estimated where they have converged, since before that the
+    residual contains what is not subtracted yet.
     """
 
     def judge(make: Callable[[], Point], near: FittedPoint) -> FittedPoint | None:
@@ -296,7 +302,7 @@ def _refit_filter_noise(here: FittedPoint) -> Point:
 def _take_steps(
     here: FittedPoint, judge: Callable[[Callable[[], Point], FittedPoint], FittedPoint | None]
 ) -> FittedPoint:
-    """Moved while that makes the model likelier, gains held."""
+    """Step while the model becomes more probable, with fixed gains."""
     step_kinds = STEPS
     for _ in range(ROUNDS):
         if _has_converged(here):
@@ -317,7 +323,10 @@ def _take_steps(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedPoint:
-    """The richest model at a point; nats: by readings and not by rows, so that points compare."""
+    """The richest model at a point.
+
+    nats: log density of the readings and not of the rows, so that points can be compared
+    """
 
     base: Base
     at: ModelFit
@@ -332,9 +341,9 @@ def fit_at_point(
     whole: bool = True,
     near: FittedPoint | None = None,
 ) -> FittedPoint:
-    """The likeliest hyperparameters of the richest model at a point.
+    """The most probable hyperparameters of the richest model at a point.
 
-    near: the same at a point nearby
+    near: fit at a point nearby
     """
     base = build_base(point, library, effects, whole=whole)
     step = priors.NOISE_STEP_REAL if whole else priors.NOISE_STEP_FREE
@@ -346,6 +355,6 @@ def fit_at_point(
 
 
 def _has_converged(here: FittedPoint) -> bool:
-    """Whether calibration and delay are where the model wants them."""
+    """True if calibration and delay are at the model's maximum, within their uncertainty."""
     off, deviation = remaining_step(here.base.made, here.base.whole, here.at)
     return not np.any(np.abs(off) > priors.NEAR * deviation)
