@@ -19,11 +19,15 @@ from ahrsd.diagnosis.inference.components.component import Component, ScaledLaw
 from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.likelihood.evidence import ModelFit
 from ahrsd.diagnosis.inference.likelihood.linearisation import coefficients_by_key, linearise
-from ahrsd.diagnosis.inference.likelihood.richest_model import RICH_COURSES, FittedPoint, psi_by_key
+from ahrsd.diagnosis.inference.likelihood.richest_model import (
+    FREE_PROCESSES,
+    FittedPoint,
+    psi_by_key,
+)
 from ahrsd.diagnosis.model import Columns
 from ahrsd.diagnosis.where_and_when.locate import Located, segments
 
-_FREE_FIELD = RICH_COURSES[0]
+_FREE_FIELD = FREE_PROCESSES[0]
 
 
 def find_wrong_clock(fitted: FittedPoint) -> Late | None:
@@ -49,10 +53,10 @@ def _free_field(fitted: FittedPoint) -> Located:
         for at in (fitted.at, replace(fitted.at, mean=fitted.at.deviation))
     )
     phase = np.pi * (cut.middle_s - track.time_s[0]) / track.duration_s
-    waves = np.cos(phase[:, None] * np.arange(1, len(value) + 1))
-    deviation = np.sqrt(np.mean(waves**2 @ coefficient_deviation**2, axis=1))
+    modes = np.cos(phase[:, None] * np.arange(1, len(value) + 1))
+    deviation = np.sqrt(np.mean(modes**2 @ coefficient_deviation**2, axis=1))
     flat = np.array([1.0, 0.0, 0.0])
-    return Located("sensor", 0.0, cut, waves @ value, deviation, flat)
+    return Located("sensor", 0.0, cut, modes @ value, deviation, flat)
 
 
 class _ClockEvidence:
@@ -84,10 +88,10 @@ class _ClockEvidence:
         candidates = [self._component(clock) for clock in clocks]
         self._made.add(candidates)
         at: ModelFit = self._at
-        worth = candidate_scan(self._made, self._keys, at).log_bayes_factors(
+        log_bayes_factors = candidate_scan(self._made, self._keys, at).log_bayes_factors(
             [one.key for one in candidates]
         )
-        return [worth[one.key] for one in candidates]
+        return [log_bayes_factors[one.key] for one in candidates]
 
     def _component(self, clock: tuple[float, float]) -> Component:
         values = at_clock(self._made.context.track, self.column, clock, self.middle_s)

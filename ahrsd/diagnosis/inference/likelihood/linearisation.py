@@ -261,9 +261,9 @@ class Linearised:
         step: prior deviation of the noise's spectrum from octave to octave
         """
         self._give_own_batches(keys)
-        batches_of = [self.seen[key].batch for key in keys]
-        new = [k for k in batches_of if (k, k) not in self.blocks]
-        known = [k for k in batches_of if (k, k) in self.blocks]
+        own_batches = [self.seen[key].batch for key in keys]
+        new = [k for k in own_batches if (k, k) not in self.blocks]
+        known = [k for k in own_batches if (k, k) in self.blocks]
         if new:
             self.multiply_batches(new, new)
         if new and known:
@@ -414,8 +414,8 @@ def linearise(
 ) -> Linearised:
     """Linearise the recording at a point; the calibration's contribution is added back.
 
-    context: from which all columns are computed;  band_hz: band in which the noise may have any
-    power
+    context: from which all columns are computed
+    band_hz: band in which the noise may have any power
     """
     regressing_filter = regressing(point.filtered, context.rate_b_rad_s)
     count = transform_length(len(point.filtered.whitened))
@@ -468,9 +468,15 @@ def initial_point(problem: Problem, filtered: Filtered, exact: tuple[str, ...]) 
     model = _cap_noise(
         replace(filtered.model, sigma_mag_gauss=differences.sigma_mag_gauss), filtered.model
     )
-    again = run_filter(problem.track, model)
+    own_noise = run_filter(problem.track, model)
     return Point(
-        problem, again, {}, None, None, noise_model.uniform_levels(len(again.whitened)), exact
+        problem,
+        own_noise,
+        {},
+        None,
+        None,
+        noise_model.uniform_levels(len(own_noise.whitened)),
+        exact,
     )
 
 
@@ -482,7 +488,9 @@ def step_to_maximum(
     A delay is taken out of the track exactly, all else is subtracted from the readings.  Both are
     averaged to the working rate with the new calibration.  The gains stay as they were: gains that
     followed would whiten what is not subtracted yet by another filter, which no linear model
-    describes. share: of the whole step;  delayed: whether the delay moves too
+    describes.
+
+    share: of the whole step;  delayed: whether the delay moves too
     """
     point, problem = made.point, made.point.problem
     values = {
@@ -547,12 +555,12 @@ def remaining_step(made: Linearised, keys: Sequence[str], at: ModelFit) -> tuple
     return np.concatenate(steps), np.concatenate([deviation[key] for key in known_keys])
 
 
-def _cap_noise(found: NullModel, before: NullModel) -> NullModel:
+def _cap_noise(fitted: NullModel, before: NullModel) -> NullModel:
     """The noise that was found, but no larger than before: more would be the mismatch's."""
     return replace(
-        found,
-        sigma_mag_gauss=min(found.sigma_mag_gauss, before.sigma_mag_gauss),
-        sigma_gyro_rad_s=min(found.sigma_gyro_rad_s, before.sigma_gyro_rad_s),
+        fitted,
+        sigma_mag_gauss=min(fitted.sigma_mag_gauss, before.sigma_mag_gauss),
+        sigma_gyro_rad_s=min(fitted.sigma_gyro_rad_s, before.sigma_gyro_rad_s),
     )
 
 

@@ -52,15 +52,15 @@ from ahrsd.diagnosis.innovation_filter.innovation import Filtered
 from ahrsd.diagnosis.where_and_when.locate import FRAMES
 
 #: most linearisations in one noise, most noise estimates, and nats that a further one must gain
-ROUNDS, NOISES, SETTLED = 6, 3, 5.0
+_STEP_ROUNDS, _NOISE_ROUNDS, _CONVERGED_NATS = 6, 3, 5.0
 #: shares of a step that are tried in turn, and whether the delay moves with it
-STEPS: tuple[tuple[float, bool], ...] = ((1.0, True), (1.0, False), (0.3, False))
+_STEP_KINDS: tuple[tuple[float, bool], ...] = ((1.0, True), (1.0, False), (0.3, False))
 #: standard deviations of an innovation beyond which a step has left all possible calibrations
 _DIVERGED = 1e6
 #: key of the free process on the sensor; the remainder contains those of the world and the gyro
-RICH_COURSES = ("free sensor",)
+FREE_PROCESSES = ("free sensor",)
 #: keys of the ordinary remainder's Gaussian processes, by frame
-COURSES = {frame: f"{frame}_course" for frame in FRAMES}
+REMAINDER_PROCESSES = {frame: f"{frame}_course" for frame in FRAMES}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,9 +96,9 @@ def build_base(
     cause_parts = [
         one for one in logged_cause_components(context, library) if one.effect not in fitted_effects
     ]
-    processes = {one.key: one for one in remainder_parts if one.key in COURSES.values()}
+    processes = {one.key: one for one in remainder_parts if one.key in REMAINDER_PROCESSES.values()}
     free_parts = [
-        gaussian_process(context, frame, like=processes.get(COURSES[frame]))
+        gaussian_process(context, frame, like=processes.get(REMAINDER_PROCESSES[frame]))
         for frame in FRAMES
         if whole
     ]
@@ -112,7 +112,7 @@ def build_base(
         *(one.key for one in (*delay_parts, *effect_parts, *cause_parts)),
         *remainder,
     )
-    return Base(made, remainder, (*always, *RICH_COURSES) if whole else always)
+    return Base(made, remainder, (*always, *FREE_PROCESSES) if whole else always)
 
 
 def fit_hyperparameters(
@@ -151,7 +151,7 @@ def fit_richest_model(
     of any spectrum: a delay of a tenth of a second, or a motor's current, biases all else that is
     fitted together with it.
     """
-    problem = _choose_column_readings(problem, filtered, library)
+    problem = _correct_columns(problem, filtered, library)
     small = _converge(_find_delay(problem, filtered, library), library, (), whole=False)
     instants = replace(problem, instants=True)
     for lag_s in _instant_rate_delays(small.base.made.point.problem):
@@ -176,7 +176,7 @@ def _instant_rate_delays(problem: Problem) -> tuple[float, ...]:
     return (step_s / 2, problem.lag_s) if exceeds_half_step else (step_s / 2,)
 
 
-def _choose_column_readings(
+def _correct_columns(
     problem: Problem, filtered: Filtered, library: Mapping[str, Effect]
 ) -> Problem:
     """The problem with each column corrected for its logger, where that is more probable."""
@@ -188,11 +188,11 @@ def _choose_column_readings(
     if not problem.recorded.covariates:
         return problem
     here = _fit_at_delay(problem, filtered, library, 0.0)
-    for reading in find_mean_columns(here.base.made, here.base.whole, here.at, library):
-        other = apply_logger_model(problem, reading).lagging(problem.lag_s)
-        found = _fit_at_delay(other, filtered, library, 0.0)
+    for logger in find_mean_columns(here.base.made, here.base.whole, here.at, library):
+        corrected = apply_logger_model(problem, logger).lagging(problem.lag_s)
+        found = _fit_at_delay(corrected, filtered, library, 0.0)
         if found.nats > here.nats + priors.ODDS_REAL:
-            problem, here = other, found
+            problem, here = corrected, found
     return problem
 
 
@@ -237,8 +237,8 @@ def _is_only_averaging(
     with the square of the delay's error: a true delay gains over none a quarter of what it gains
     over its opposite.
     """
-    late = _fit_at_delay(problem, filtered, library, -here.base.made.point.problem.lag_s)
-    return here.nats - late.nats < 4.0 * priors.ODDS_REAL
+    opposite = _fit_at_delay(problem, filtered, library, -here.base.made.point.problem.lag_s)
+    return here.nats - opposite.nats < 4.0 * priors.ODDS_REAL
 
 
 def _points_to_smaller_delay(here: FittedPoint) -> bool:
@@ -249,8 +249,8 @@ def _points_to_smaller_delay(here: FittedPoint) -> bool:
     """
     lag_s = here.base.made.point.problem.lag_s
     # the last entry is the delay's
-    off, deviation = remaining_step(here.base.made, here.base.whole, here.at)
-    return bool(-off[-1] * np.sign(lag_s) > priors.POINTS_BACK * deviation[-1])
+    steps, deviation = remaining_step(here.base.made, here.base.whole, here.at)
+    return bool(-steps[-1] * np.sign(lag_s) > priors.POINTS_BACK * deviation[-1])
 
 
 def converge(
@@ -280,10 +280,10 @@ def _converge(
         return fit_at_point(point, library, effects, whole=whole, near=near) if bounded else None
 
     here = _take_steps(here, judge)
-    for _ in range(NOISES):
+    for _ in range(_NOISE_ROUNDS):
         for refit in (_refit_noise_level, _refit_filter_noise):
             found = judge(partial(refit, here), here)
-            if found is not None and found.nats > here.nats + SETTLED:
+            if found is not None and found.nats > here.nats + _CONVERGED_NATS:
                 here = _take_steps(found, judge)
                 break
         else:
@@ -303,8 +303,8 @@ def _take_steps(
     here: FittedPoint, judge: Callable[[Callable[[], Point], FittedPoint], FittedPoint | None]
 ) -> FittedPoint:
     """Step while the model becomes more probable, with fixed gains."""
-    step_kinds = STEPS
-    for _ in range(ROUNDS):
+    step_kinds = _STEP_KINDS
+    for _ in range(_STEP_ROUNDS):
         if _has_converged(here):
             break
         for k, (share, delayed) in enumerate(step_kinds):
@@ -316,7 +316,7 @@ def _take_steps(
         else:
             break
         gain, here = found.nats - here.nats, found
-        if gain < SETTLED:
+        if gain < _CONVERGED_NATS:
             break
     return here
 
@@ -356,5 +356,5 @@ def fit_at_point(
 
 def _has_converged(here: FittedPoint) -> bool:
     """True if calibration and delay are at the model's maximum, within their uncertainty."""
-    off, deviation = remaining_step(here.base.made, here.base.whole, here.at)
-    return not np.any(np.abs(off) > priors.NEAR * deviation)
+    steps, deviation = remaining_step(here.base.made, here.base.whole, here.at)
+    return not np.any(np.abs(steps) > priors.NEAR * deviation)
