@@ -43,17 +43,11 @@ def alternative_sources(context: Context) -> list[Component]:
     if context.world_levelled:
         down_b = context.R_nb[:, 2]
         functions_by_key[BY_TILT] = np.column_stack([down_b, harmonics(down_b)[:, :5]])
-    found = [_field_by_functions(key, functions) for key, functions in functions_by_key.items()]
+    found = [
+        _unexplained_field(key, Columns(mag=on_each_axis(functions)))
+        for key, functions in functions_by_key.items()
+    ]
     return [*found, gaussian_process(context, "sensor", quick=QUICK)]
-
-
-def _field_by_functions(key: str, functions: Array) -> Component:
-    """A field of any size along each axis of the sensor, by functions (N, k) of its motion."""
-    flat = on_each_axis(functions)
-    unit = priors.COURSE_UNIT["sensor"]
-    low, high = (np.array([np.log(unit * one)]) for one in priors.COURSE_SIZES)
-    law = ScaledLaw(np.ones(flat.shape[2]), low, high, mean=float(np.log(unit)))
-    return Component(key, "sensor", Columns(mag=flat), law, float(np.log(priors.COURSE)))
 
 
 def field_by_heading(context: Context) -> Component:
@@ -61,10 +55,15 @@ def field_by_heading(context: Context) -> Component:
 
     If each turn takes a few seconds and goes to many directions, it is coloured noise in time.
     """
-    columns, unit = heading_columns(context), priors.COURSE_UNIT["sensor"]
+    return _unexplained_field(BY_HEADING, heading_columns(context))
+
+
+def _unexplained_field(key: str, columns: Columns) -> Component:
+    """A field on the sensor of any size, all coefficients of one size."""
+    unit = priors.COURSE_UNIT["sensor"]
     low, high = (np.array([np.log(unit * one)]) for one in priors.COURSE_SIZES)
     law = ScaledLaw(np.ones(columns.width), low, high, mean=float(np.log(unit)))
-    return Component(BY_HEADING, "sensor", columns, law, float(np.log(priors.COURSE)))
+    return Component(key, "sensor", columns, law, float(np.log(priors.COURSE)))
 
 
 def single_remainder_parts(all_parts: Iterable[Component]) -> list[Component]:
