@@ -48,14 +48,14 @@ def library_components(
     context: Context, library: Mapping[str, Effect]
 ) -> Iterator[tuple[str, list[Component]]]:
     """Yield each effect's identifier with a component per setting that can be computed here."""
-    for name, effect in library.items():
+    for identifier, effect in library.items():
         settings = () if effect.delay or effect.quick else effect.settings(context)
         settings = tuple(
             shifted for one in settings for shifted in logged_time_settings(context, effect, one)
         )
         components = [effect_component(context, effect, one, len(settings)) for one in settings]
         if components:
-            yield name, components
+            yield identifier, components
 
 
 def logged_time_settings(context: Context, effect: Effect, setting: Setting) -> tuple[Setting, ...]:
@@ -90,13 +90,13 @@ def logged_cause_components(context: Context, library: Mapping[str, Effect]) -> 
     point, and the contribution subtracted from the readings would be lost.
     """
     out = []
-    for name, effect in library.items():
+    for identifier, effect in library.items():
         roles = [need for need in effect.needs if "accel" not in need]
         applicable = roles and not effect.delay and not effect.quick
         settings = effect.settings(context) if applicable else ()
         if settings:
             first = effect_component(context, effect, settings[0], len(settings))
-            out.append(replace(first, key=f"{name} as logged"))
+            out.append(replace(first, key=f"{identifier} as logged"))
     return out
 
 
@@ -183,15 +183,18 @@ def projected_key(key: str) -> str:
 
 
 def delay_form(context: Context, lag_s: float) -> Component:
-    """How a delay caused by a filter differs from a pure delay; for either sign, in part."""
+    """The difference between a delay caused by a filter and a pure delay, of either sign.
+
+    Its coefficient is the share of the delay that the filter causes.
+    """
     law = FixedLaw(np.array([priors.LAG_IS_FILTER**2]))
     return Component(LAG_FORM, "sensor", beyond_the_lag(context, abs(lag_s)), law)
 
 
-def component_key(name: str, setting: Setting) -> str:
+def component_key(identifier: str, setting: Setting) -> str:
     """Key of an effect in a setting."""
     kept = {k: v for k, v in setting.items() if k != "searched"}
-    return f"{name} {json.dumps(kept, sort_keys=True, default=str)}"
+    return f"{identifier} {json.dumps(kept, sort_keys=True, default=str)}"
 
 
 def _effect_law(effect: Effect) -> ScaledLaw:
@@ -282,9 +285,9 @@ def _step_form(known: Component, law: ScaledLaw, context: Context, frame: Frame)
         return np.hstack(pieces)
 
     columns = columns_in_frame(context, frame, piece_indicators, STEP_PIECES * len(moments_s))
-    sized = ScaledLaw(np.full(columns.width, float(law.scale[0])), law.low, law.high)
+    piece_law = ScaledLaw(np.full(columns.width, float(law.scale[0])), law.low, law.high)
     moments = {name: known.setting[name] for name in MOMENTS if name in known.setting}
-    return Component(f"form of {known.key}", frame, columns, sized, setting=moments)
+    return Component(f"form of {known.key}", frame, columns, piece_law, setting=moments)
 
 
 def _pulse_form(known: Component, law: ScaledLaw, context: Context, frame: Frame) -> Component:
@@ -298,8 +301,8 @@ def _pulse_form(known: Component, law: ScaledLaw, context: Context, frame: Frame
         return np.asarray(piece[:, None] == np.arange(PULSE_PIECES), dtype=float)
 
     columns = columns_in_frame(context, frame, piece_indicators, PULSE_PIECES)
-    sized = ScaledLaw(np.full(columns.width, float(law.scale[0])), law.low, law.high)
-    return Component(f"form of {known.key}", frame, columns, sized)
+    piece_law = ScaledLaw(np.full(columns.width, float(law.scale[0])), law.low, law.high)
+    return Component(f"form of {known.key}", frame, columns, piece_law)
 
 
 def interval_components(
@@ -309,14 +312,14 @@ def interval_components(
     library: Mapping[str, Effect],
     settings_tried: int,
 ) -> list[Component]:
-    """Effects that begin with one step and end with another, one for each effect that jumps.
+    """Effects that jump, each from the onset of one step to the end of another.
 
     A source that is put on and taken off is one vector; two steps would have one vector each.
     """
     first, last = begins.moments_s[0], ends.moments_s[-1]
-    effects = [row for row in library.values() if row.jumps]
+    effects = [effect for effect in library.values() if effect.jumps]
     components = [
-        effect_component(context, row, {"onset_s": first, "end_s": last}, settings_tried)
-        for row in effects
+        effect_component(context, effect, {"onset_s": first, "end_s": last}, settings_tried)
+        for effect in effects
     ]
     return [one for one in components if one.columns.on_mag == begins.columns.on_mag]

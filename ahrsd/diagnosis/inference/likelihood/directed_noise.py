@@ -105,13 +105,13 @@ def _fit(square: Array, rows: Array) -> tuple[Array, Array, Array, float]:
 
     square: (B, 3, 3) covariances;  rows: (B,) their numbers of rows
     """
-    level, log_null = _maximise(lambda x: _log_posterior(square, rows, x, None)[0], np.zeros(2))
+    log_ratio, log_null = _maximise(lambda x: _log_posterior(square, rows, x, None)[0], np.zeros(2))
 
     def log_posterior(x: Array) -> float:
         return _log_posterior(square, rows, x[:2], x[2:])[0]
 
-    loudest = [np.linalg.eigh(one)[1][:, -1] for one, n in zip(square, rows, strict=True) if n]
-    starts = [np.concatenate([level, one]) for one in (*np.eye(3), *loudest)]
+    principal = [np.linalg.eigh(one)[1][:, -1] for one, n in zip(square, rows, strict=True) if n]
+    starts = [np.concatenate([log_ratio, one]) for one in (*np.eye(3), *principal)]
     found = [_maximise(log_posterior, one) for one in sorted(starts, key=log_posterior)[-_STARTS:]]
     best, nats = max(found, key=lambda one: one[1])
     _, share = _log_posterior(square, rows, best[:2], best[2:])
@@ -152,17 +152,13 @@ def _log_posterior(
     along = np.einsum("i,bij,j->b", w, scaled, w)[:, None]
     grid = np.array(priors.DIRECTED_SHARES)
     power = (total_power[:, None] - along + along / (1.0 + grid)) / 3.0
-    log_source = -0.5 * rows[:, None] * (3.0 * np.log(power) + np.log1p(grid))
-    terms = np.concatenate([log_null[:, None], log_source - np.log(len(grid))], axis=1) - np.log(
-        2.0
-    )
-    log_evidence = np.logaddexp.reduce(terms, axis=1)
-    source_probability = 1.0 - np.exp(terms[:, 0] - log_evidence)
+    source = -0.5 * rows[:, None] * (3.0 * np.log(power) + np.log1p(grid))
+    terms = np.concatenate([log_null[:, None], source - np.log(len(grid))], axis=1) - np.log(2.0)
+    nats = np.logaddexp.reduce(terms, axis=1)
+    source_probability = 1.0 - np.exp(terms[:, 0] - nats)
     most_probable = np.maximum(2.0 * along[:, 0] / (total_power - along[:, 0]) - 1.0, 0.0)
     share = source_probability * most_probable
-    return float(np.sum(np.where(rows > 0, log_evidence, 0.0))) + prior, np.where(
-        rows > 0, share, 0.0
-    )
+    return float(np.sum(np.where(rows > 0, nats, 0.0))) + prior, np.where(rows > 0, share, 0.0)
 
 
 def _across_field_nats(

@@ -101,7 +101,7 @@ class _JointPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BandResiduals:
-    """Of each band: expected and maximum-likelihood square of the residual (B,), B^T r (B, q)."""
+    """Of each band: residual square, expected and at the posterior mean (B,), B^T r (B, q)."""
 
     expected: Array
     square: Array
