@@ -23,7 +23,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
 )
 from ahrsd.diagnosis.answer.text import (
     along,
-    assumed,
+    evidence_text,
     headline,
     in_one_sentence,
     ordinary_left,
@@ -125,7 +125,7 @@ def validation(found: Validation) -> Figure:
     """Gain of whole models over the calibration alone on parts that were not fitted."""
     bars = {
         "calibration alone": (0.0, GREY),
-        "moved in time": (found.placebo, BEFORE),
+        "time-shifted copies": (found.placebo, BEFORE),
         "named": (found.named, AFTER),
         "named, rest drawn freely": (found.named + found.free, SERIES[1]),
     }
@@ -299,7 +299,7 @@ _STATISTICS = {
     "covariates": "correlation with a logged column or its rate",
 }
 _BY_CONDITION = (
-    "what is left by condition",
+    "residual by condition",
     "Under which conditions readings and model differ, before and after: a row a quantity, low "
     "values left, high ones right. Dark is much; noise alone has 1 to 3.",
 )
@@ -309,7 +309,7 @@ _NOT_FITTED = (
     "fitted to. Moved in time: the same effects where they cannot be.",
 )
 _BY_FRAME = (
-    "what is left, by frame",
+    "residual by frame",
     "What is left after the named effects, drawn freely in three frames; grey: two standard "
     "deviations.",
 )
@@ -342,21 +342,21 @@ def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
 
 def _finding(found: Diagnosis, one: Finding) -> dict[str, object]:
     held, cost = one.heldout, one.cost_if_left_out
-    rows = [("read as", read)] if (read := setting_text(one.setting)) else []
+    rows = [("setting", read)] if (read := setting_text(one.setting)) else []
     if cost is not None:
         off = (
             f"hard iron off by {number(cost.hard_iron_shift_gauss * _MG, 'mG')}, heading by "
             f"{number(cost.heading_error_deg, 'deg')}"
         )
-        rows.append(("without it", off))
+        rows.append(("cost if left out", off))
     if held is not None:
         gain = (
-            f"{held.nll_gain_per_sample:+.4f} nats per sample; the same effect moved in time gains "
-            f"at most {held.placebo_gain:+.4f}"
+            f"{held.nll_gain_per_sample:+.4f} nats per sample; time-shifted copies of the effect "
+            f"gain at most {held.placebo_gain:+.4f}"
         )
         rows.append(("on data not fitted", gain))
     if one.priors is not None:
-        rows.append(("by what is assumed", assumed(one.priors)))
+        rows.append(("evidence", evidence_text(one.priors)))
     if one.alternatives:
         rest = ", ".join(f"{a.effect} ({a.confidence:.1%})" for a in one.alternatives)
         rows.append(("or else", rest))
@@ -391,13 +391,13 @@ def _unexplained(found: Diagnosis) -> list[tuple[str, str]]:
     if left.size is not None:
         rows.append(("size", told_size(left.size, left.unit)))
     if left.ordinary is not None:
-        rows += [("part", text) for text in size_lines(left.ordinary)]
-        rows += [("yardstick", left.ordinary.why)] if left.ordinary.why else []
+        rows += [("component", text) for text in size_lines(left.ordinary)]
+        rows += [("why", left.ordinary.why)] if left.ordinary.why else []
     if left.single_source_share is not None:
         rows.append(("one source", f"{left.single_source_share:.0%} of it has one direction"))
     rows += [
         (
-            "moves with",
+            "follows",
             f"{shown(s.channel)}, correlation {s.correlation:+.2f}, p = {s.p_value:.1g}",
         )
         for s in left.follows
@@ -410,8 +410,8 @@ def _how_real(found: Diagnosis) -> str:
 
     if found.drawn is not None and found.drawn.courses and not stands_out(found.drawn):
         return (
-            "All of it together is more than chance, but at no moment does it leave the band that "
-            "its own uncertainty draws: that it is there is known, its course is not."
+            "All of it together is more than chance, but at no moment does it leave its own "
+            "uncertainty band: that it exists is known, its time series is not."
         )
     return "It is real: it has a place and a size."
 

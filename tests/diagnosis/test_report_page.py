@@ -107,20 +107,20 @@ def diagnosis(**changes):
 
 def test_the_words_of_a_diagnosis():
     assert lines(diagnosis())[:13] == [
-        "dive <7>.csv: MISMATCH: 1 effect left out and something that the library has no name for "
-        "(p = 1e-09)",
+        "dive <7>.csv: MISMATCH: 1 effect left out and an unknown cause (p = 1e-09)",
         "",
         "1. the field of a motor current (motor_current_field), 97.0% sure",
         "   where      120.0-260.5 s; axes y z; turns with the vehicle; motor_current_a > 6",
         "   size       field_per_ampere_y = 0.0013 +- 4e-05 gauss/A",
-        "   read as    by the column motor_<1>_a; logged 0.25 s late; each value the mean of 0.4 s",
-        "   left out   m += k I(t)",
-        "   without it hard iron off by 1.40 mG, heading by 0.35 deg",
-        "   held out   +0.0520 nats/sample (moved in time: at most +0.0006)",
+        "   setting    by the column motor_<1>_a; logged 0.25 s late; each value the mean of 0.4 s",
+        "   equation   m += k I(t)",
+        "   cost       hard iron off by 1.40 mG, heading by 0.35 deg if it is left out",
+        "   held out   +0.0520 nats/sample on readings not fitted (time-shifted copies: at most "
+        "+0.0006)",
         "   or else    vibration_rectification 2.0%",
         "   to be sure pulse the motor at rest on one heading",
         "",
-        "not in the library:",
+        "unknown, here (nothing in the library explains it):",
     ]
 
 
@@ -203,7 +203,7 @@ def test_what_stays_in_its_own_band_is_not_called_real(tmp_path, size, real):
     found = replace(found, drawn=replace(found.drawn, courses=(drawn_course,)))
     text = page_of(found, tmp_path)
     assert ("It is real" in text) is real
-    assert ("at no moment does it leave the band" in text) is not real
+    assert ("at no moment does it leave its own" in text) is not real
 
 
 def test_statistics_are_named_in_words(usual):
@@ -253,7 +253,7 @@ def test_where_nothing_is_found_and_the_checks_fail_nobody_says_that_all_agrees(
     none = Unexplained(False)
     silent = diagnosis(mismatch=False, findings=(), unexplained=none, posterior_predictive=checks)
     assert lines(silent)[0] == (
-        "dive <7>.csv: nothing was found, and yet they differ in: line (see the checks)"
+        "dive <7>.csv: no cause found, but recording and model differ in: line (see the checks)"
     )
 
 

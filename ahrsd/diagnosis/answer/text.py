@@ -57,9 +57,13 @@ def lines(found: Diagnosis) -> list[str]:
     for number, finding in enumerate(found.findings, start=1):
         out += ["", f"{number}. {headline(finding)}", *_finding_lines(finding)]
     if found.unexplained.detected:
-        out += ["", "not in the library:", *_unexplained_lines(found.unexplained)]
+        out += [
+            "",
+            "unknown, here (nothing in the library explains it):",
+            *_unexplained_lines(found.unexplained),
+        ]
     elif ordinary_left(found) is not None:
-        out += ["", "left, and ordinary:", *_unexplained_lines(found.unexplained)]
+        out += ["", "remaining residual, ordinary:", *_unexplained_lines(found.unexplained)]
     if not found.mismatch and found.undecided is None and found.sensitivity:
         out += ["", f"this recording would have shown: {sensitivity(found.sensitivity)}"]
     failed = found.failed_checks
@@ -78,8 +82,10 @@ def _whiteness(found: Diagnosis) -> str:
     after = [name for name, test in found.omnibus.items() if test.p_after < priors.TEST_FAILED]
     if not before and not after:
         return "white, Gaussian and even"
-    left = f"still {', '.join(after)}" if after else "nothing with the repaired model"
-    return f"fail {', '.join(before) or 'nothing'} before; {left}"
+    return (
+        f"without the findings fail {', '.join(before) or 'nothing'}; "
+        f"the repaired model fails {', '.join(after) or 'nothing'}"
+    )
 
 
 def verdict(found: Diagnosis) -> str:
@@ -88,23 +94,24 @@ def verdict(found: Diagnosis) -> str:
     failed, ordinary = found.failed_checks, ordinary_left(found)
     said = "" if ordinary is None else in_one_sentence(ordinary)
     if found.undecided is not None:
-        return f"nothing can be told: {found.undecided}"
+        return f"no verdict: {found.undecided}"
     if not found.mismatch and said:
         return (
-            f"nothing beyond the ordinary: what is left is {said}; it is there "
-            f"(p = {found.p_value:.1g} that nothing is)"
+            f"nothing beyond the ordinary: the residual is {said}; "
+            f"p = {found.p_value:.1g} that there is none"
         )
     if not found.mismatch and failed:
-        return f"nothing was found, and yet they differ in: {', '.join(failed)} (see the checks)"
+        where = ", ".join(failed)
+        return f"no cause found, but recording and model differ in: {where} (see the checks)"
     if not found.mismatch:
         return "recording and model agree"
     parts = []
     if names:
         parts.append(f"{names} effect{'s' if names > 1 else ''} left out")
     if found.unexplained.detected:
-        parts.append("something that the library has no name for")
+        parts.append("an unknown cause")
     text = " and ".join(parts) or "recording and simulation differ (see the notes)"
-    rest = f"; what else is left is {said}" if said else ""
+    rest = f"; the remaining residual is {said}" if said else ""
     return f"MISMATCH: {text} (p = {found.p_value:.1g}){rest}"
 
 
@@ -121,21 +128,21 @@ def _finding_lines(finding: Finding) -> list[str]:
             f"   {'size' if k == 0 else '':<10} {value_text(v)}"
             for k, v in enumerate(finding.parameters)
         ),
-        f"   read as    {read}" if (read := setting_text(finding.setting)) else "",
-        f"   left out   {finding.equation}" if finding.equation else "",
+        f"   setting    {read}" if (read := setting_text(finding.setting)) else "",
+        f"   equation   {finding.equation}" if finding.equation else "",
     ]
     if cost is not None:
         out.append(
-            f"   without it hard iron off by {cost.hard_iron_shift_gauss * _MG:.2f} mG, heading by "
-            f"{cost.heading_error_deg:.2f} deg"
+            f"   cost       hard iron off by {cost.hard_iron_shift_gauss * _MG:.2f} mG, heading by "
+            f"{cost.heading_error_deg:.2f} deg if it is left out"
         )
     if held is not None:
         out.append(
-            f"   held out   {held.nll_gain_per_sample:+.4f} nats/sample (moved in time: at most "
-            f"{held.placebo_gain:+.4f})"
+            f"   held out   {held.nll_gain_per_sample:+.4f} nats/sample on readings not fitted "
+            f"(time-shifted copies: at most {held.placebo_gain:+.4f})"
         )
     if finding.priors is not None:
-        out.append(f"   assumed    {assumed(finding.priors)}")
+        out.append(f"   evidence   {evidence_text(finding.priors)}")
     if finding.alternatives:
         rest = ", ".join(f"{a.effect} {a.confidence:.1%}" for a in finding.alternatives)
         out.append(f"   or else    {rest}")
@@ -144,12 +151,12 @@ def _finding_lines(finding: Finding) -> list[str]:
     return [line for line in out if line]
 
 
-def assumed(one: OnPriors) -> str:
-    """`95 nats of odds (3 are asked), 94 at least with half or twice of what was assumed`."""
+def evidence_text(one: OnPriors) -> str:
+    """`95 nats (3 required); at least 94 with each prior halved or doubled`."""
     least = min(nats for each in one.assumed for nats in (each.half_nats, each.double_nats))
     return (
-        f"{one.log_odds:.0f} nats of odds ({one.asked:.0f} are asked), {least:.0f} at least with "
-        "half or twice of what was assumed"
+        f"{one.log_odds:.0f} nats ({one.asked:.0f} required); at least {least:.0f} with each prior "
+        "halved or doubled"
     )
 
 
@@ -185,22 +192,23 @@ def _unexplained_lines(left: Unexplained) -> list[str]:
     if left.size is not None:
         out.append(f"   size       {told_size(left.size, left.unit)}")
     if left.ordinary is not None:
-        out += [f"   part       {text}" for text in size_lines(left.ordinary)]
-        out += [f"   yardstick  {left.ordinary.why}"] if left.ordinary.why else []
+        out += [f"   component  {text}" for text in size_lines(left.ordinary)]
+        out += [f"   why        {left.ordinary.why}"] if left.ordinary.why else []
     if left.single_source_share is not None and left.single_source_share > 0.8:
         out.append(
             f"   one source of fixed direction explains {left.single_source_share:.0%} of it"
         )
     out += [
-        f"   moves with {shown(one.channel)} (correlation {one.correlation:+.2f}, "
+        f"   follows    {shown(one.channel)} (correlation {one.correlation:+.2f}, "
         f"p = {one.p_value:.1g})"
         for one in left.follows
     ]
     if left.priors is not None:
-        out.append(f"   assumed    {assumed(left.priors)}")
+        out.append(f"   evidence   {evidence_text(left.priors)}")
     if left.heldout is not None:
         out.append(
-            f"   held out   {left.heldout.nll_gain_per_sample:+.4f} nats/sample if drawn freely"
+            f"   held out   {left.heldout.nll_gain_per_sample:+.4f} nats/sample with a free time "
+            "series in its place"
         )
     return out
 
@@ -245,9 +253,9 @@ def in_one_sentence(one: Ordinary) -> str:
     more = f" and {told_size(one.gyro_rad_s, 'rad/s')} of the gyro" if gyro else ""
     return (
         f"ordinary for a real recording: {told_size(one.field_gauss, 'gauss')}, "
-        f"{one.heading_deg:.2g} deg of heading{more} (95 % of such recordings leave up to "
-        f"{told_size(one.field_up_to_gauss, 'gauss')}, {one.heading_up_to_deg:.2g} deg; "
-        f"{one.recordings} were measured)"
+        f"{one.heading_deg:.2g} deg of heading{more} (95 % of {one.recordings} untouched "
+        f"recordings have less than {told_size(one.field_up_to_gauss, 'gauss')}, "
+        f"{one.heading_up_to_deg:.2g} deg)"
     )
 
 
@@ -265,8 +273,8 @@ def size_lines(one: Ordinary) -> list[str]:
     there = [part for part in one.components if part.there]
     if not there:
         return [
-            f"{told_size(one.field_gauss, 'gauss')}, {one.heading_deg:.2g} deg of heading, of no "
-            "one component"
+            f"{told_size(one.field_gauss, 'gauss')}, {one.heading_deg:.2g} deg of heading, in no "
+            "single component"
         ]
     return [component_text(part) for part in sorted(there, key=lambda part: -part.evidence_nats)]
 
@@ -298,7 +306,7 @@ TOLD: Mapping[str, Told] = {
     "hold_samples": Told("each reading held for {} samples"),
     "time_constant_s": Told("time constant {} s"),
     "radius_gauss": Told("half width of the loop {} mG", times=1e3),
-    "shape": Told("course: {}"),
+    "shape": Told("shape: {}"),
     "length_s": Told("lasts {} s"),
     "length_m": Told("falls off within {} m"),
     "distance_m": Told("its size is that of its field {} m away"),

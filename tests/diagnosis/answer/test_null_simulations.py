@@ -78,7 +78,7 @@ def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> 
     found = beyond_chance(track, ask)
     assert not found.unexplained.detected
     assert verdict(found) == (
-        "nothing can be told: a simulation of the model alone with this noise cannot be diagnosed"
+        "no verdict: a simulation of the model alone with this noise cannot be diagnosed"
     )
 
 

@@ -43,7 +43,7 @@ def test_a_rotated_board_is_ordinary_and_a_watch_beside_a_sensor_is_not():
     assert board.unexplained.ordinary.field_gauss == pytest.approx(5.0e-3, rel=0.3)
     watch = diagnose(recorded("vn100_distorters/vn7Hard"))
     assert watch.unexplained.detected
-    assert "a course in time on the sensor" in watch.unexplained.ordinary.why
+    assert "a field on the sensor that varies with time" in watch.unexplained.ordinary.why
 
 
 @pytest.mark.slow

@@ -76,7 +76,7 @@ def test_a_report_has_all_that_is_told_of_it(reported):
     (term,) = model.terms
     assert term.identifier == "hard_iron_step"
     assert model.noise.mag_gauss == pytest.approx(1e-3, rel=0.1)
-    for line in ("held out", "without it", "checks:", "innovations:"):
+    for line in ("held out", "cost", "checks:", "innovations:"):
         assert line in reported.words
     (one,) = reported.body["findings"]
     assert one["term"] == 0

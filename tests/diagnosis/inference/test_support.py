@@ -313,12 +313,10 @@ def test_a_name_that_gains_no_more_than_its_copies_or_owes_itself_to_a_prior_is_
     )  # fmt: skip
     assert doubts((told,)) == ()
     (copied,) = doubts((replace(told, heldout=replace(held, placebo_gain=0.02)),))
-    assert copied.startswith(
-        "hysteresis: other readings than it was fitted to are foretold no better"
-    )
+    assert copied.startswith("hysteresis: it predicts readings that it was not fitted to no better")
     owed = OnPriors(3.4, 3.0, False, (Assumed(NAME, 2.7, 4.1), Assumed(NOISE, 5.0, 1.2)))
     (note,) = doubts((replace(told, priors=owed),))
     assert note == (
-        "hysteresis owes its name to what is assumed: with twice of steps of the noise from octave "
-        "to octave it has 1 nats of odds, 3 are asked"
+        "hysteresis depends on a prior: with the noise steps between octaves doubled its evidence "
+        "is 1 nats, 3 are required"
     )

@@ -50,22 +50,26 @@ from ahrsd.diagnosis.where_and_when import locate
 from ahrsd.samples import Array
 
 _WORDS = {
-    "world_course": "a field that differs from time to time and place to place",
-    "gyro_course": "a course in time of the gyro",
-    "by_direction": "a field by attitude",
-    "by_change": "axes that are late by different times",
-    "field_by_rate": "a field by the rates",
-    "by_rate_squared": "an error of the gyro by the squares of its rates",
-    "gyro_matrix": "a crooked gyro with scales of its own",
-    "by_force": "an error of the gyro by force",
-    "bending": "a mount that gives",
-    BY_RATE: "a field by the rates",
-    BY_TILT: "a field by the tilt",
-    BY_HEADING: "a field by the heading",
-    QUICK: "a quick course in time on the sensor",
+    "world_course": "an outside field that varies with time and place",
+    "gyro_course": "a gyro bias that varies with time",
+    "by_direction": "a field that depends on attitude",
+    "by_change": "magnetometer axes with different delays",
+    "field_by_rate": "a field that depends on the turn rates",
+    "by_rate_squared": "a gyro error that depends on the squared rates",
+    "gyro_matrix": "gyro misalignment, scale and axes not at right angles",
+    "by_force": "a gyro error that depends on acceleration and tilt",
+    "bending": "a mount that bends under load",
+    BY_RATE: "a field that depends on the turn rates",
+    BY_TILT: "a field that depends on tilt",
+    BY_HEADING: "a field that depends on heading",
+    QUICK: "a quickly varying field on the sensor",
 }
-#: what has a course in time, by its frame
-_COURSES = {"sensor": "on the sensor", "world": "of the field outside", "gyro": "of the gyro"}
+#: what varies with time, by its frame
+_COURSES = {
+    "sensor": "a field on the sensor that varies with time",
+    "world": "an outside field that varies with time",
+    "gyro": "a gyro error that varies with time",
+}
 #: of 95 % of a normal size
 _WITHIN = 1.96
 
@@ -82,7 +86,7 @@ def told_sizes(
         return left
     if left.detected:
         known = dict.fromkeys(_words(all_sets, best, key) for key in answer.unknown)
-        what = ", ".join(known) or "a source of one direction, quicker than a course in time"
+        what = ", ".join(known) or "a source of one direction, too quick to be followed in time"
         why = f"beyond what such recordings ordinarily leave: {what}"
         sizes = left_sizes(all_sets, best, why, answer.unknown)
         return replace(left, ordinary=sizes)
@@ -151,11 +155,11 @@ def _words(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
     one, effect = all_sets.component(key), key.split(maxsplit=1)[0]
     factors = {factor for name in library_members(all_sets, best) for factor in factor_keys(name)}
     if key in factors or not best.names.isdisjoint(factor_keys(key)):
-        return f"what {effect} stands in for"
+        return f"a cause that {effect} resembles"
     if one.row is not None:
-        return f"one of the steps of a source that changes ({effect})"
+        return f"a step of a source that switches ({effect})"
     words = _WORDS.get(key) or _WORDS.get(key.removeprefix("free "))
-    return words or f"a course in time {_COURSES[one.frame]}"
+    return words or _COURSES[one.frame]
 
 
 def _untold(all_sets: Hypotheses, key: str) -> str:

@@ -99,15 +99,15 @@ def doubts(told: Sequence[Finding]) -> tuple[str, ...]:
         held = one.heldout
         if held is not None and held.nll_gain_per_sample <= max(held.placebo_gain, 0.0):
             out.append(
-                f"{one.effect}: other readings than it was fitted to are foretold no better by it "
-                "than by its own copies at other times: doubt it"
+                f"{one.effect}: it predicts readings that it was not fitted to no better than its "
+                "time-shifted copies do: doubt it"
             )
         elif one.priors is not None and not one.priors.stays:
             least = min(one.priors.assumed, key=lambda each: min(each.half_nats, each.double_nats))
-            nats, how = min((least.half_nats, "half"), (least.double_nats, "twice"))
+            nats, how = min((least.half_nats, "halved"), (least.double_nats, "doubled"))
             out.append(
-                f"{one.effect} owes its name to what is assumed: with {how} of {least.what} it has "
-                f"{nats:.0f} nats of odds, {one.priors.asked:.0f} are asked"
+                f"{one.effect} depends on a prior: with {least.what} {how} its evidence is "
+                f"{nats:.0f} nats, {one.priors.asked:.0f} are required"
             )
     return tuple(out)
 
@@ -130,13 +130,13 @@ def nearest(answer: Answer, all_sets: Hypotheses) -> tuple[str, ...]:
     most = max(nats for one in found.assumed for nats in (one.half_nats, one.double_nats))
     name = all_sets.component(key).effect
     return (
-        f"nearest to a name is {name}: {found.log_odds:+.1f} nats of odds where {asked:.0f} are "
-        f"asked, {most:+.1f} at most with half or twice of what was assumed",
+        f"nearest to being found is {name}: {found.log_odds:+.1f} nats where {asked:.0f} are "
+        f"required; at most {most:+.1f} with each prior halved or doubled",
     )
 
 
-NAME, COURSE = "how often a name is there", "how often an unknown course is there"
-ORDINARY, NOISE = "what recordings ordinarily leave", "steps of the noise from octave to octave"
+NAME, COURSE = "the prior odds of an effect", "the prior odds of an unknown cause"
+ORDINARY, NOISE = "the ordinary residual sizes", "the noise steps between octaves"
 
 
 def on_priors(all_sets: Hypotheses, best: Hypothesis, rival: Hypothesis, asked: float) -> OnPriors:
@@ -216,7 +216,7 @@ def notes(
     how = (*asked.notes, *problem.notes, *((HARDLY_TURNED,) if at_rest(start) else ()))
     if problem.unread_s:
         when = ", ".join(f"{begin:.1f}-{end:.1f}" for begin, end in problem.unread_s)
-        how = (*how, f"readings at {when} s were left out: something was moved there")
+        how = (*how, f"readings at {when} s were left out: something was being moved there")
     if found.all_sets.too_wide and found.answer.unknown:
         how = (*how, TOO_MANY)
     return (*how, *said, *asked.lesser, *seen)
