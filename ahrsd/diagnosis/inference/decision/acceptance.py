@@ -22,40 +22,40 @@ from ahrsd.diagnosis.inference.components.alternatives import (
 )
 from ahrsd.diagnosis.inference.components.effect_components import LAG
 from ahrsd.diagnosis.inference.decision.members import (
-    added_by,
     coefficients,
+    contribution_of,
     is_ordinary,
     library_members,
 )
-from ahrsd.diagnosis.inference.decision.unexplained import is_along
+from ahrsd.diagnosis.inference.decision.unexplained import acts_along
 from ahrsd.diagnosis.inference.likelihood.candidates import beside
 from ahrsd.diagnosis.inference.search.model_search import (
     Hypotheses,
     Hypothesis,
     Space,
-    at_its_moments,
-    come_and_gone,
+    sets_with_merged_steps,
+    step_alternatives,
 )
 from ahrsd.diagnosis.where_and_when.locate import single_source
 
 
-def accepted(
+def accept_members(
     all_sets: Hypotheses, space: Space, best: Hypothesis
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
     """The likeliest set with members that are told, and what is likeliest without each."""
-    best = _with_one_part(all_sets, space, best)
-    best = _with_heading(all_sets, space, best)
-    best = _come_and_gone(all_sets, space, best)
-    best, rivals = _borne_out(all_sets, space, best)
-    likelier = _of_likeliest_kind(all_sets, space, best)
+    best = _try_single_remainder_part(all_sets, space, best)
+    best = _try_field_by_heading(all_sets, space, best)
+    best = _merge_steps(all_sets, space, best)
+    best, rivals = _drop_unsupported(all_sets, space, best)
+    likelier = _choose_step_kinds(all_sets, space, best)
     if likelier is not best:
-        best, rivals = _borne_out(all_sets, space, likelier)
-    best, rivals = _beside_others(all_sets, space, best, rivals)
-    best, rivals = _held_to_form(all_sets, space, best, rivals)
-    return _of_one_source(all_sets, space, best, rivals)
+        best, rivals = _drop_unsupported(all_sets, space, likelier)
+    best, rivals = _test_against_alternatives(all_sets, space, best, rivals)
+    best, rivals = _test_constant_coefficients(all_sets, space, best, rivals)
+    return _drop_parts_of_unknown_source(all_sets, space, best, rivals)
 
 
-def _borne_out(
+def _drop_unsupported(
     all_sets: Hypotheses, space: Space, best: Hypothesis
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
     """The set without members that are not sure, and what is likeliest without each other one.
@@ -65,25 +65,29 @@ def _borne_out(
     while True:
         own = [key for key in sorted(best.names) if key not in all_sets.remainder]
         own = [key for key in own if best.names.isdisjoint(form_keys(key))]
-        asked = {key: asked_odds(all_sets, best, key) for key in own}
-        without = {key: all_sets.without(best.names, key) for key in own}
-        near = {key: all_sets.compared(without[key], best, best.score - asked[key]) for key in own}
+        asked = {key: required_odds(all_sets, best, key) for key in own}
+        without = {key: all_sets.without_member(best.names, key) for key in own}
+        near = {
+            key: all_sets.judge_above(without[key], best, best.score - asked[key]) for key in own
+        }
         rivals = {key: one for key, one in near.items() if one is not None}
         if all(best.score - one.score >= asked[key] for key, one in rivals.items()):
-            rivals = {key: _without(all_sets, space, best, key) for key in own}
+            rivals = {key: _best_without(all_sets, space, best, key) for key in own}
         odds = {key: best.score - rival.score for key, rival in rivals.items()}
-        unsure = [key for key in odds if odds[key] < asked[key] or _is_form(all_sets, best, key)]
+        unsure = [
+            key for key in odds if odds[key] < asked[key] or _is_mostly_form(all_sets, best, key)
+        ]
         if not unsure:
-            fewer = _without_one_moment(all_sets, best, asked)
+            fewer = _drop_cancelling_pair(all_sets, best, asked)
             if fewer is best:
                 return best, rivals
             best = fewer
             continue
         key = min(unsure, key=lambda one: odds[one])
-        best = _without(all_sets, space, best, key)
+        best = _best_without(all_sets, space, best, key)
 
 
-def _come_and_gone(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+def _merge_steps(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
     """The set with one vector that comes and goes where further steps are not worth being told.
 
     Each step more has to be worth what a name has to.
@@ -91,9 +95,9 @@ def _come_and_gone(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypo
     asked = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.NAME_ODDS
     while True:
         likeliest = best
-        for names in come_and_gone(all_sets, space, best.names):
+        for names in sets_with_merged_steps(all_sets, space, best.names):
             least = likeliest.score - asked * (len(likeliest.names) - len(names))
-            found = all_sets.compared(names, best, least)
+            found = all_sets.judge_above(names, best, least)
             if found is not None and found.score > least:
                 likeliest = found
         if likeliest is best:
@@ -101,7 +105,7 @@ def _come_and_gone(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypo
         best = likeliest
 
 
-def _of_likeliest_kind(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+def _choose_step_kinds(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
     """The set with each step that has a form of the kind that is likeliest at its moments.
 
     Beside an ordinary remainder nothing is exchanged: its laws are not exact.
@@ -110,17 +114,17 @@ def _of_likeliest_kind(all_sets: Hypotheses, space: Space, best: Hypothesis) -> 
         return best
     while True:
         tried = [
-            all_sets.with_(best.names - {key}, other)
+            all_sets.with_member(best.names - {key}, other)
             for key in library_members(all_sets, best)
-            for other in at_its_moments(all_sets, space, key)
+            for other in step_alternatives(all_sets, space, key)
         ]
-        likelier = all_sets.likeliest(best, tried)
+        likelier = all_sets.most_probable(best, tried)
         if likelier is best:
             return best
         best = likelier
 
 
-def _is_form(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
+def _is_mostly_form(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
     """Whether of a member mostly what it leaves of its form is there: it is no name of anything.
 
     Its coefficients are within their deviations, or its own columns, however large, hold less than
@@ -137,14 +141,14 @@ def _is_form(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
     own = columns.mag if columns.on_mag else columns.gyro
     if own is None:
         return False
-    added = [added_by(all_sets, best, one)[0] for one in (key, all_sets.forms[key])]
+    added = [contribution_of(all_sets, best, one)[0] for one in (key, all_sets.forms[key])]
     both = np.sum(added, axis=0).ravel()
     flat = np.asarray(own).reshape(len(both), -1)
     held = flat @ np.linalg.lstsq(flat, both)[0]
     return bool(held @ held < priors.OWN_PART * (both @ both))
 
 
-def _without_one_moment(
+def _drop_cancelling_pair(
     all_sets: Hypotheses, best: Hypothesis, asked: Mapping[str, float]
 ) -> Hypothesis:
     """The set without names of one moment that are not worth together what each has to be.
@@ -158,13 +162,13 @@ def _without_one_moment(
         if np.min(apart_s) > priors.APPROACH_S:
             continue
         least = best.score - asked[first] - asked[last]
-        fewer = all_sets.compared(best.names - {first, last}, best, least)
+        fewer = all_sets.judge_above(best.names - {first, last}, best, least)
         if fewer is not None and fewer.score > least:
             return fewer
     return best
 
 
-def _with_one_part(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+def _try_single_remainder_part(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
     """The set with a part of what recordings leave in place of all of them, where that is likelier.
 
     What has but one of them, and that far beyond the others, leaves nothing ordinary.
@@ -175,10 +179,10 @@ def _with_one_part(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypo
     found = lone_parts(all_sets.component(key) for key in all_sets.remainder)
     all_sets.made.add(found)
     bare = best.names - rest
-    return all_sets.likeliest(best, [bare | {one.key} for one in found])
+    return all_sets.most_probable(best, [bare | {one.key} for one in found])
 
 
-def _with_heading(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+def _try_field_by_heading(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
     """The set with a field by heading, where that is likelier and nothing else is unknown.
 
     Of rooms it is not asked: where one walks in a circle, the heading is the place.
@@ -188,10 +192,10 @@ def _with_heading(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypot
         return best
     heading = by_heading(all_sets.made.context)
     all_sets.made.add([heading])
-    return all_sets.likeliest(best, [best.names | {heading.key}])
+    return all_sets.most_probable(best, [best.names | {heading.key}])
 
 
-def _beside_others(
+def _test_against_alternatives(
     all_sets: Hypotheses, space: Space, best: Hypothesis, rivals: dict[str, Hypothesis]
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
     """The names that hold beside sources of other laws; the set as it was where all do.
@@ -206,16 +210,16 @@ def _beside_others(
     wide, rest = best, frozenset(all_sets.remainder)
     for one in (*others, *parts):
         more = wide.names | {one.key}
-        wide = all_sets.likeliest(wide, [more - rest] if one in parts else [more, more - rest])
+        wide = all_sets.most_probable(wide, [more - rest] if one in parts else [more, more - rest])
     if wide is best:
         return best, rivals
-    held, others_rivals = _borne_out(all_sets, space, wide)
+    held, others_rivals = _drop_unsupported(all_sets, space, wide)
     if set(library_members(all_sets, held)) >= set(library_members(all_sets, best)):
         return best, rivals
     return held, others_rivals
 
 
-def _held_to_form(
+def _test_constant_coefficients(
     all_sets: Hypotheses, space: Space, best: Hypothesis, rivals: dict[str, Hypothesis]
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
     """With a free factor for each name that stands in for something: its coefficient varies.
@@ -232,11 +236,11 @@ def _held_to_form(
             wanders = one.row is not None and one.row.quick and "covariate" in one.setting
             if wanders or not taken.isdisjoint(form_keys(key)):
                 continue
-            forms = varying(one, added_by(all_sets, best, key)[0], made.context)
+            forms = varying(one, contribution_of(all_sets, best, key)[0], made.context)
             made.add(forms)
             for form in forms:
                 least = max(best.score + asked, found.score)
-                free = all_sets.compared(best.names | {form.key}, best, least)
+                free = all_sets.judge_above(best.names | {form.key}, best, least)
                 if free is None or free.score <= least:
                     continue
                 if float(np.exp(all_sets.psi_of(free)[form.key][0])) > priors.VARIES:
@@ -244,10 +248,10 @@ def _held_to_form(
         if found is best:
             return best, rivals
         taken |= found.names - best.names
-        best, rivals = _borne_out(all_sets, space, found)
+        best, rivals = _drop_unsupported(all_sets, space, found)
 
 
-def _of_one_source(
+def _drop_parts_of_unknown_source(
     all_sets: Hypotheses, space: Space, best: Hypothesis, rivals: dict[str, Hypothesis]
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
     """The set without names that act along the one direction in which something unknown acts.
@@ -260,20 +264,22 @@ def _of_one_source(
     members = [key for key in odds if key != LAG and all_sets.component(key).columns.on_mag]
     named = [key for key in members if all_sets.component(key).row is not None]
     unknown = [key for key in set(members) - set(named) if not is_ordinary(all_sets, best, key)]
-    added = {key: added_by(all_sets, best, key)[0] for key in (*named, *unknown)}
+    added = {key: contribution_of(all_sets, best, key)[0] for key in (*named, *unknown)}
     for key in sorted(unknown, key=lambda one: -odds[one]):
         direction, share = single_source(added[key], np.ones(len(added[key])))
         if share < priors.MAINLY_ONE:
             continue
-        alike = [one for one in named if is_along(direction, added[one])]
+        alike = [one for one in named if acts_along(direction, added[one])]
         parts = alike if len(alike) > 1 else [one for one in alike if odds[one] < odds[key]]
         if parts:
             fewer = all_sets.judge(best.names - set(parts), best)
-            return _of_one_source(all_sets, space, *_borne_out(all_sets, space, fewer))
+            return _drop_parts_of_unknown_source(
+                all_sets, space, *_drop_unsupported(all_sets, space, fewer)
+            )
     return best, rivals
 
 
-def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
+def required_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     """Log odds from which on a member is told.
 
     Beside something unknown a name has to be the larger part: a source that no law here has leaves
@@ -296,12 +302,12 @@ def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     if not unknown:
         return asked
     if "covariate" in one.setting:
-        return asked + _at_other_times(all_sets, best, key)
+        return asked + _shifted_copy_nats(all_sets, best, key)
     nats = best.score - all_sets.judge(best.names - frozenset(unknown), best).score
     return max(asked, priors.BESIDE_UNKNOWN * nats)
 
 
-def _at_other_times(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
+def _shifted_copy_nats(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     """Nats that a member would be worth once more at the best of other times, 0 at least.
 
     Beside the member itself: what comes again and again is like itself at other times.
@@ -312,9 +318,9 @@ def _at_other_times(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     return max(0.0, *scan.worth([copy.key for copy in copies]).values())
 
 
-def _without(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> Hypothesis:
+def _best_without(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> Hypothesis:
     """The likeliest set without a member: with nothing or a course in its place."""
-    fewer = all_sets.without(best.names, key)
+    fewer = all_sets.without_member(best.names, key)
     courses = [] if all_sets.component(key).effect is None else space.courses
     tried = [fewer | {course} for course in courses if course not in fewer]
-    return all_sets.likeliest(all_sets.judge(fewer, best), tried, near=best)
+    return all_sets.most_probable(all_sets.judge(fewer, best), tried, near=best)

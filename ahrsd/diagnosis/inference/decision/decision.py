@@ -16,10 +16,14 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Finding, Unexplained
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.components.ordinary_remainder import GYRO_MATRIX, TURNS
-from ahrsd.diagnosis.inference.decision.acceptance import accepted
-from ahrsd.diagnosis.inference.decision.findings import as_finding, drift_finding, turn_finding
+from ahrsd.diagnosis.inference.decision.acceptance import accept_members
+from ahrsd.diagnosis.inference.decision.findings import (
+    drift_finding,
+    finding_and_term,
+    misalignment_finding,
+)
 from ahrsd.diagnosis.inference.decision.members import coefficients, is_ordinary
-from ahrsd.diagnosis.inference.decision.unexplained import changing_source, left_beyond_ordinary
+from ahrsd.diagnosis.inference.decision.unexplained import changing_source, largest_unexplained
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.model import Term
 
@@ -43,36 +47,38 @@ class Answer:
     log_odds: float
 
 
-def decided(
+def decide(
     all_sets: Hypotheses, space: Space, best: Hypothesis, library: Mapping[str, Effect]
 ) -> Answer:
     """The answer of a search."""
-    best, rivals = accepted(all_sets, space, best)
+    best, rivals = accept_members(all_sets, space, best)
     odds = {key: best.score - rival.score for key, rival in rivals.items()}
-    switching = _switching(all_sets, best)
+    switching = _repeated_step_kinds(all_sets, best)
     found, terms, keys = [], [], []
     for key in sorted(odds, key=lambda one: -odds[one]):
         effect = all_sets.component(key).effect
         if effect is None or effect in switching or is_ordinary(all_sets, best, key):
             continue
-        finding, term = as_finding(all_sets, space, best, key, odds[key], library)
+        finding, term = finding_and_term(all_sets, space, best, key, odds[key], library)
         found.append(finding)
         terms.append(term)
         keys.append(key)
-    drifts = _drifts(all_sets, space, best, library)
+    drifts = _drift_effects(all_sets, space, best, library)
     for key, row in drifts.items():
         finding, term = drift_finding(all_sets, space, best, key, odds[key], row, library)
         found.append(finding)
         terms.append(term)
         keys.append(key)
-    if (turned := _beyond_ordinary_turn(all_sets, best, library)) is not None:
+    if (turned := _misalignment_effect(all_sets, best, library)) is not None:
         straight = all_sets.judge(best.names - {GYRO_MATRIX}, best)
         rivals = {**rivals, GYRO_MATRIX: straight}
-        finding, term = turn_finding(all_sets, best, best.score - straight.score, turned, library)
+        finding, term = misalignment_finding(
+            all_sets, best, best.score - straight.score, turned, library
+        )
         found.append(finding)
         terms.append(term)
         keys.append(GYRO_MATRIX)
-    unknown, left = left_beyond_ordinary(
+    unknown, left = largest_unexplained(
         all_sets, space, best, {k: v for k, v in odds.items() if k not in drifts}
     )
     if switching and not left.detected:
@@ -82,7 +88,7 @@ def decided(
     return Answer(best, tuple(keys), unknown, rivals, *told)
 
 
-def _drifts(
+def _drift_effects(
     all_sets: Hypotheses, space: Space, best: Hypothesis, library: Mapping[str, Effect]
 ) -> dict[str, Effect]:
     """Free courses that are as slow as the library's drift of their frame, whatever their form."""
@@ -99,7 +105,7 @@ def _drifts(
     return out
 
 
-def _beyond_ordinary_turn(
+def _misalignment_effect(
     all_sets: Hypotheses, best: Hypothesis, library: Mapping[str, Effect]
 ) -> Effect | None:
     """The library's turn between the sensors, where it is beyond what recordings ordinarily have.
@@ -115,7 +121,7 @@ def _beyond_ordinary_turn(
     return rows[0] if surely > priors.CROOKED * priors.ORDINARY_MISALIGNMENT_RAD else None
 
 
-def _switching(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
+def _repeated_step_kinds(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
     """Kinds of steps of which there are so many that they are one source that changes, most first.
 
     Those that are ordinary count as well.

@@ -17,54 +17,60 @@ from ahrsd.diagnosis.inference.components.effect_components import (
     holds,
 )
 from ahrsd.diagnosis.inference.components.ordinary_remainder import GYRO_MATRIX, TURNS
-from ahrsd.diagnosis.inference.decision.members import added_by, coefficients, cost_if_left_out
-from ahrsd.diagnosis.inference.decision.which_delay import delay_unit, which_delay
+from ahrsd.diagnosis.inference.decision.members import (
+    coefficients,
+    contribution_of,
+    cost_if_left_out,
+)
+from ahrsd.diagnosis.inference.decision.which_delay import delay_probabilities, delay_unit
 from ahrsd.diagnosis.inference.likelihood.candidates import beside
 from ahrsd.diagnosis.inference.search.model_search import (
     Hypotheses,
     Hypothesis,
     Space,
-    at_its_moments,
+    step_alternatives,
 )
-from ahrsd.diagnosis.inference.search.near_settings import changed, opened
+from ahrsd.diagnosis.inference.search.near_settings import perturbed_settings, with_setting_slopes
 from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.where_and_when.address import where_of
 from ahrsd.samples import Array
 
 
-def as_finding(
+def finding_and_term(
     all_sets: Hypotheses, space: Space, best: Hypothesis, key: str, odds: float,
     library: Mapping[str, Effect],
 ) -> tuple[Finding, Term]:  # fmt: skip
     """A member as a finding and as a term of the repaired model."""
     one = all_sets.component(key)
     value, deviation = coefficients(all_sets, best, key)
-    deviation = np.maximum(deviation, _left_open(all_sets, best, key, value))
+    deviation = np.maximum(deviation, _deviation_over_setting(all_sets, best, key, value))
     effect = library[one.effect or key]
     if key == LAG:
-        shares = which_delay(all_sets, best, value, deviation, library)
+        shares = delay_probabilities(all_sets, best, value, deviation, library)
         effect = library[next(iter(shares))]
         unit = effect.delay / delay_unit(all_sets, effect)
         value, deviation = value * unit, deviation * abs(unit)
     else:
-        shares = _shares(all_sets, space, best, key)
+        shares = _effect_probabilities(all_sets, space, best, key)
     setting = {k: v for k, v in one.setting.items() if k != "searched"}
     if effect.filters:  # its form is that of the filter itself
         setting["time_constant_s"] = float(value[0])
-    where = _where(all_sets, best, key, effect.frame or effect.family)
-    found = _found(effect, shares, where, value, deviation, setting, odds, library)
+    where = _locate(all_sets, best, key, effect.frame or effect.family)
+    found = _build_finding(effect, shares, where, value, deviation, setting, odds, library)
     found = replace(found, cost_if_left_out=cost_if_left_out(all_sets, best, key))
     return found, Term(effect.identifier, value, deviation, setting)
 
 
-def _left_open(all_sets: Hypotheses, best: Hypothesis, key: str, value: Array) -> Array:
+def _deviation_over_setting(
+    all_sets: Hypotheses, best: Hypothesis, key: str, value: Array
+) -> Array:
     """(q,) deviations of a member's coefficients whatever its setting is nearby.
 
     What has a form of its own, as the way of a hand, has no setting that is sharper.
     """
     one, made = all_sets.component(key), all_sets.made
-    near = {} if key in all_sets.forms else changed(one, made.context)
-    whole = opened(one, made.context, value, near)
+    near = {} if key in all_sets.forms else perturbed_settings(one, made.context)
+    whole = with_setting_slopes(one, made.context, value, near)
     if whole is None:
         return np.zeros(len(value))
     fewer = all_sets.judge(best.names - {key}, best)
@@ -72,7 +78,7 @@ def _left_open(all_sets: Hypotheses, best: Hypothesis, key: str, value: Array) -
     return beside(made, fewer.keys, at).likeliest(whole)[1][: len(value)]
 
 
-def _found(
+def _build_finding(
     effect: Effect, shares: Mapping[str, float], where: Where, value: Array, deviation: Array,
     setting: Setting, odds: float, library: Mapping[str, Effect],
 ) -> Finding:  # fmt: skip
@@ -100,14 +106,16 @@ def _found(
     )
 
 
-def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> dict[str, float]:
+def _effect_probabilities(
+    all_sets: Hypotheses, space: Space, best: Hypothesis, key: str
+) -> dict[str, float]:
     """Probabilities of the names that could be what a member is, in its place."""
     own = all_sets.component(key)
     fewer = all_sets.judge(best.names - {key})
     named = {all_sets.component(k).effect for k in fewer.names}
     asked = [k for name, keys in space.effects.items() if name not in named for k in keys]
-    asked = [k for k in asked if all_sets.is_asked(fewer.names, k)]
-    scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
+    asked = [k for k in asked if all_sets.is_compatible(fewer.names, k)]
+    scan = beside(all_sets.made, fewer.keys, best.fit_at_lower_noise(fewer))
     worth = scan.worth([*dict.fromkeys([*asked, key])])
     by_name: dict[str, float] = {}
     for k, nats in worth.items():
@@ -117,19 +125,21 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
     mine = own.effect or key
     by_name[mine] = max(by_name[mine], worth[key] + own.prior)
     rival = max((k for k in worth if k != key), key=lambda k: worth[k], default=key)
-    closer = at_its_moments(all_sets, space, key)
+    closer = step_alternatives(all_sets, space, key)
     if own.row is None or by_name[all_sets.component(rival).effect or rival] > by_name[mine]:
         closer = [*closer, rival]
     if closer:  # the scan knows sizes, noise and forms but roughly: each as a set of its own
         off = best.score - fewer.score - by_name[mine]
         by_name = {name: nats + off for name, nats in by_name.items()}
         for k in dict.fromkeys(closer):
-            instead = all_sets.judge(all_sets.with_(fewer.names, k), best)
+            instead = all_sets.judge(all_sets.with_member(fewer.names, k), best)
             apart = instead.score - best.score
             if all_sets.is_real(best.names):  # of laws that are not exact twelve nats say three
                 apart *= priors.NAME_ODDS / priors.ODDS_REAL
             by_name[all_sets.component(k).effect or k] = by_name[mine] + apart
-    if all_sets.is_real(best.names):  # what is not exchanged there is no likelier (`exchanged`)
+    if all_sets.is_real(
+        best.names
+    ):  # what is not exchanged there is no likelier (`exchange_effects`)
         by_name = {name: min(nats, by_name[mine]) for name, nats in by_name.items()}
     for name, keys in space.effects.items():
         wider = all_sets.component(keys[0])
@@ -140,10 +150,10 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
-def _where(all_sets: Hypotheses, best: Hypothesis, key: str, frame: str) -> Where:
+def _locate(all_sets: Hypotheses, best: Hypothesis, key: str, frame: str) -> Where:
     """When, on which axes and in which regime a member acts, told in a frame."""
     one, track = all_sets.component(key), all_sets.made.context.track
-    return where_of(track, added_by(all_sets, best, key)[0], one.setting, frame)
+    return where_of(track, contribution_of(all_sets, best, key)[0], one.setting, frame)
 
 
 def drift_finding(
@@ -163,16 +173,16 @@ def drift_finding(
     value, deviation = coefficients(all_sets, best, key)
     drift, unsure = nearest @ value, np.sqrt(np.square(nearest) @ np.square(deviation))
     kept = {k: v for k, v in setting.items() if k != "searched"}
-    shares = _shares(all_sets, space, best, key)
+    shares = _effect_probabilities(all_sets, space, best, key)
     whole = shares.pop(key) + shares.pop(effect.identifier, 0.0)  # its own form is one of any
     shares = {effect.identifier: whole, **shares}
-    where = _where(all_sets, best, key, effect.frame or effect.family)
-    found = _found(effect, shares, where, drift, unsure, kept, odds, library)
+    where = _locate(all_sets, best, key, effect.frame or effect.family)
+    found = _build_finding(effect, shares, where, drift, unsure, kept, odds, library)
     found = replace(found, cost_if_left_out=cost_if_left_out(all_sets, best, key))
     return found, Term(effect.identifier, drift, unsure, kept)
 
 
-def turn_finding(
+def misalignment_finding(
     all_sets: Hypotheses, best: Hypothesis, odds: float, effect: Effect,
     library: Mapping[str, Effect],
 ) -> tuple[Finding, Term]:  # fmt: skip
@@ -181,8 +191,8 @@ def turn_finding(
     A gyro that is turned by minus the angle reads as a magnetometer that is turned by it.
     """
     turn, unsure = (part[TURNS] for part in coefficients(all_sets, best, GYRO_MATRIX))
-    where = _where(all_sets, best, GYRO_MATRIX, effect.frame or effect.family)
+    where = _locate(all_sets, best, GYRO_MATRIX, effect.frame or effect.family)
     shares = {effect.identifier: 1.0}
-    found = _found(effect, shares, where, -turn, unsure, {}, odds, library)
+    found = _build_finding(effect, shares, where, -turn, unsure, {}, odds, library)
     found = replace(found, cost_if_left_out=cost_if_left_out(all_sets, best, GYRO_MATRIX))
     return found, Term(effect.identifier, -turn, unsure, {})

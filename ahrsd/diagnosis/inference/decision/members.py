@@ -30,7 +30,7 @@ def coefficients(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Arra
     raise KeyError(key)
 
 
-def added_by(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, str]:
+def contribution_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, str]:
     """(N, 3) what a member adds to the readings, and its unit: gauss, or rad/s of the gyro's."""
     one, track = all_sets.component(key), all_sets.made.context.track
     value, _ = coefficients(all_sets, best, key)
@@ -53,7 +53,7 @@ def size_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     return float(np.exp(psi[0])) * float(getattr(one.law, "unit", 1.0))
 
 
-def names_of(all_sets: Hypotheses, best: Hypothesis) -> Sequence[str]:
+def effects_of(all_sets: Hypotheses, best: Hypothesis) -> Sequence[str]:
     """Effects in a set, sorted."""
     return sorted(one for key in best.names if (one := all_sets.component(key).effect))
 
@@ -69,13 +69,13 @@ def is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
     if key == LAG or not all_sets.is_real(best.names):
         return False
     one = all_sets.component(key)
-    if one.jumps and _is_place(all_sets, key):
+    if one.jumps and _is_place_change(all_sets, key):
         return True
     course = priors.ORDINARY_COURSE.get(one.frame, 0.0)
     return size_of(all_sets, best, key) < (course if one.row is None else one.row.ordinary)
 
 
-def _is_place(all_sets: Hypotheses, key: str) -> bool:
+def _is_place_change(all_sets: Hypotheses, key: str) -> bool:
     """Whether a step of the field is where the sensor is lifted off a place or put down on it."""
     one, recorded = all_sets.component(key), all_sets.made.point.problem.recorded
     spells = still_spells(recorded.time_s, recorded.gyro_b_rad_s)
@@ -95,7 +95,7 @@ def cost_if_left_out(all_sets: Hypotheses, best: Hypothesis, key: str) -> Cost:
     """What the calibration would be off by in the set without a member."""
     made = all_sets.made
     middle, here = prior_of(made.point.problem.track).mean, made.point.filtered.model
-    fewer = all_sets.judge(all_sets.without(best.names, key), best)
+    fewer = all_sets.judge(all_sets.without_member(best.names, key), best)
     left_out, known = (
         model_of(coefficients(all_sets, one, CALIBRATION)[0] + middle, here)
         for one in (fewer, best)

@@ -22,7 +22,7 @@ from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.samples import Array
 
 
-def which_delay(
+def delay_probabilities(
     all_sets: Hypotheses, best: Hypothesis, lag_s: Array, deviation_s: Array,
     library: Mapping[str, Effect],
 ) -> dict[str, float]:  # fmt: skip
@@ -38,7 +38,7 @@ def which_delay(
     half_s = _half_step_s(all_sets)
     for row in library.values() if tau > 0.0 else ():
         if row.filters:
-            whole = _nats_of_filter(all_sets, best, tau)
+            whole = _filter_log_odds(all_sets, best, tau)
             nats[row.identifier] = whole if whole > priors.ODDS_REAL else min(whole, 0.0)
         elif row.of_step and half_s is not None:
             miss, usual = (tau - half_s) / unsure, tau / priors.ORDINARY_LAG_S
@@ -49,7 +49,7 @@ def which_delay(
     return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
-def _nats_of_filter(all_sets: Hypotheses, best: Hypothesis, tau: float) -> float:
+def _filter_log_odds(all_sets: Hypotheses, best: Hypothesis, tau: float) -> float:
     """What the readings say for all of a delay being a filter's against none of it; -inf of a part.
 
     Where the readings hardly show a filter's form, next to nothing.  Nor where they have more of it

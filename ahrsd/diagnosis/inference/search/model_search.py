@@ -22,13 +22,13 @@ from ahrsd.diagnosis.inference.likelihood.evidence import At, reached
 from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, Linearised, by_key
 from ahrsd.samples import Array
 
-BEAM, ASKED, MOST_MOVES = 2, 4, 8
+BEAM_WIDTH, MOST_CANDIDATES, MOST_MOVES = 2, 4, 8
 #: rounds in which settings are sought of what may be added, and on of what is there
-FINER, SHARPEST = 3, 7
+CANDIDATE_ROUNDS, MEMBER_ROUNDS = 3, 7
 #: steps in a round to what an effect has from before the recording
-REMEMBERED = 3
+MEMORY_STEPS = 3
 #: moments at which steps are proposed, and how far apart, of the recording's length
-MOMENTS, APART = 4, 0.02
+MOST_PEAKS, PEAK_SEPARATION = 4, 0.02
 
 Names = frozenset[str]
 
@@ -42,7 +42,7 @@ class Hypothesis:
     at: At
     score: float
 
-    def at_of(self, other: Hypothesis) -> At:
+    def fit_at_lower_noise(self, other: Hypothesis) -> At:
         """Another hypothesis in the quieter noise of the two: what one lacks is no noise."""
         quiet = np.minimum(self.at.log_noise, other.at.log_noise)
         return replace(other.at, log_noise=quiet)
@@ -67,7 +67,7 @@ class Hypotheses:
     start_noise: Array
     start_psi: Mapping[str, Array]
     forms: dict[str, str] = field(default_factory=dict)
-    holding: Mapping[str, str] = field(default_factory=dict)
+    projected: Mapping[str, str] = field(default_factory=dict)
     judged: dict[Names, Hypothesis] = field(default_factory=dict)
     real: bool = False
     unknown_nats: float = 0.0
@@ -80,23 +80,23 @@ class Hypotheses:
     def judge(self, names: Iterable[str], near: Hypothesis | None = None) -> Hypothesis:
         """The set with these members beside the calibration."""
         members = frozenset(names)
-        found = self._climbed(members, self._keys(members), near, -np.inf)
+        found = self._maximise(members, self._component_keys(members), near, -np.inf)
         if found is None:
             raise ValueError("a set that is asked for has a score")
         return found
 
-    def compared(
+    def judge_above(
         self, names: Iterable[str], near: Hypothesis | None, asked: float
     ) -> Hypothesis | None:
         """The same; None where its score will surely not be so large, or the set is too wide."""
         members = frozenset(names)
-        keys = self._keys(members)
+        keys = self._component_keys(members)
         if sum(self.component(key).width for key in keys) > priors.WIDEST:
             self.too_wide += 1
             return None
-        return self._climbed(members, keys, near, asked)
+        return self._maximise(members, keys, near, asked)
 
-    def _keys(self, members: Names) -> tuple[str, ...]:
+    def _component_keys(self, members: Names) -> tuple[str, ...]:
         """What a set is made of: the calibration, its members, what they leave of their forms."""
         ordered = sorted(members)
         return (
@@ -105,7 +105,7 @@ class Hypotheses:
             *sorted(self.forms[key] for key in ordered if key in self.forms),
         )
 
-    def _climbed(
+    def _maximise(
         self, members: Names, keys: tuple[str, ...], near: Hypothesis | None, asked: float
     ) -> Hypothesis | None:
         """A set at its likeliest; None where its score will surely not be so large.
@@ -128,17 +128,17 @@ class Hypotheses:
             if not fewer and np.max(noise) > noise[-1] + priors.LOUD:
                 noise = np.minimum(noise, noise[-1])
             odds = sum(self.component(key).prior for key in sorted(members))
-            odds += self._again(members) + self._of_class(members)
+            odds += self._repeat_log_odds(members) + self._class_log_prior(members)
             forms = set(keys) - members - {CALIBRATION}
             small = [k for k, key in enumerate(keys) if key in forms and key not in known]
             at = reached(products, laws, (noise, start), asked - odds, small=small)
             if at is None:
                 return None
-            odds += self._believed(keys, at)
+            odds += self._least_value_log_odds(keys, at)
             self.judged[members] = Hypothesis(members, keys, at, at.nats + odds)
         return self.judged[members]
 
-    def likeliest(
+    def most_probable(
         self, best: Hypothesis, tried: Iterable[Names], near: Hypothesis | None = None
     ) -> Hypothesis:
         """The likeliest of a hypothesis and others, which are climbed to from near it, or another.
@@ -147,24 +147,24 @@ class Hypotheses:
         """
         near = near or best
         for names in tried:
-            found = self.compared(names, near, best.score)
+            found = self.judge_above(names, near, best.score)
             if found is not None and found.score > best.score:
                 best = found
         return best
 
-    def without(self, members: Names, key: str) -> Names:
+    def without_member(self, members: Names, key: str) -> Names:
         """The set without a member: without the delay what contains one is whole."""
-        whole = {other: key for key, other in self.holding.items()} if key == LAG else {}
+        whole = {other: key for key, other in self.projected.items()} if key == LAG else {}
         return frozenset(whole.get(one, one) for one in members - {key})
 
-    def with_(self, members: Names, key: str) -> Names:
+    def with_member(self, members: Names, key: str) -> Names:
         """The set with one more member: beside the delay what contains one is without it."""
-        beside = self.holding if key == LAG else {}
+        beside = self.projected if key == LAG else {}
         return frozenset(beside.get(one, one) for one in members | {key})
 
-    def is_asked(self, members: Names, key: str) -> bool:
+    def is_compatible(self, members: Names, key: str) -> bool:
         """Whether a candidate may be asked beside a set: whole where no delay is in it."""
-        return key not in self.holding if LAG in members else not self.component(key).beside
+        return key not in self.projected if LAG in members else not self.component(key).beside
 
     def is_real(self, members: Names) -> bool:
         """Whether a set leaves what real recordings do."""
@@ -179,7 +179,7 @@ class Hypotheses:
             begin += width
         return out
 
-    def _again(self, members: Names) -> float:
+    def _repeat_log_odds(self, members: Names) -> float:
         """What was put on is taken off: a further step of one kind is no rare thing."""
         rows = [
             row.identifier
@@ -189,7 +189,7 @@ class Hypotheses:
         more = len(rows) - len(set(rows))
         return more * float(np.log(priors.AGAIN / priors.EFFECT))
 
-    def _believed(self, keys: Sequence[str], at: At) -> float:
+    def _least_value_log_odds(self, keys: Sequence[str], at: At) -> float:
         """What it costs that a name's coefficient has a least value: its law has none below.
 
         The probability that it is above, by the readings, over that by its law before them.
@@ -208,7 +208,7 @@ class Hypotheses:
             nats += float(np.sum(above))
         return nats
 
-    def _of_class(self, members: Names) -> float:
+    def _class_log_prior(self, members: Names) -> float:
         real = self.is_real(members)
         return float(np.log(priors.REAL if real else 1.0 - priors.REAL))
 
@@ -226,22 +226,22 @@ class Space:
 
     effects: dict[str, list[str]]
     courses: Sequence[str]
-    finer: Callable[[Component, int], list[Component]]
-    remembered: Callable[[Beside, Component, int], list[Component]]
-    form: Callable[[Component], Component | None]
+    refine_setting: Callable[[Component, int], list[Component]]
+    refine_memory: Callable[[Beside, Component, int], list[Component]]
+    form_of: Callable[[Component], Component | None]
     steps_at: Callable[[float], list[Component]]
-    while_there: Callable[[Component, Component], list[Component]]
+    interval_components: Callable[[Component, Component], list[Component]]
     sources: list[str] = field(default_factory=list)
 
 
-def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> list[Hypothesis]:
+def beam_search(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> list[Hypothesis]:
     """The likeliest sets, best first.
 
     Sets with the ordinary remainder and without are moved in turn, each kind with a beam of its
     own: where a simulation has two effects, the remainder is likelier than either of them alone.
     """
     first = [all_sets.judge(one) for one in starts]
-    beams = {real: _best(all_sets, first, real=real) for real in (False, True)}
+    beams = {real: _best_sets(all_sets, first, real=real) for real in (False, True)}
     done: set[Names] = set()
     for k in range(2 * MOST_MOVES):
         beam = beams[bool(k % 2)]
@@ -250,18 +250,18 @@ def searched(all_sets: Hypotheses, space: Space, starts: Iterable[Names]) -> lis
             continue
         here = todo[0]
         done.add(here.names)
-        for names in moves(all_sets, space, here):
+        for names in neighbouring_sets(all_sets, space, here):
             real = all_sets.is_real(names)
-            asked_for = beams[real][-1].score if len(beams[real]) == BEAM else -np.inf
-            found = all_sets.compared(names, here, asked_for)
+            asked_for = beams[real][-1].score if len(beams[real]) == BEAM_WIDTH else -np.inf
+            found = all_sets.judge_above(names, here, asked_for)
             if found is not None:
-                beams[real] = _best(all_sets, [*beams[real], found], real=real)
+                beams[real] = _best_sets(all_sets, [*beams[real], found], real=real)
     ranked = sorted((*beams[False], *beams[True]), key=lambda one: -one.score)
-    best = exchanged(all_sets, space, ranked[0])
-    return [sharpened(all_sets, space, best), *ranked[1:]]
+    best = exchange_effects(all_sets, space, ranked[0])
+    return [refine_settings(all_sets, space, best), *ranked[1:]]
 
 
-def exchanged(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+def exchange_effects(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
     """The likeliest of a set and those with another name in place of one, while one is likelier.
 
     A name is added beside noise that has swallowed the others; what it is, is told in its own.
@@ -274,18 +274,18 @@ def exchanged(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
         names = [key for key in sorted(best.names) if all_sets.component(key).row is not None]
         bases = [best.names - {key} for key in names if key != LAG]
         found = [
-            all_sets.with_(base, key)
+            all_sets.with_member(base, key)
             for base in bases
-            for key in asked(all_sets, space, base, best)
+            for key in rank_candidates(all_sets, space, base, best)
         ]
-        likelier = all_sets.likeliest(best, found)
+        likelier = all_sets.most_probable(best, found)
         if likelier is best:
             break
         best = likelier
     return best
 
 
-def at_its_moments(all_sets: Hypotheses, space: Space, key: str) -> list[str]:
+def step_alternatives(all_sets: Hypotheses, space: Space, key: str) -> list[str]:
     """Steps of other kinds at the very moments of one that has a form, each with its own.
 
     A scan asks without forms: by it the two may be hundreds of nats apart that differ by one.
@@ -294,18 +294,18 @@ def at_its_moments(all_sets: Hypotheses, space: Space, key: str) -> list[str]:
     if key not in all_sets.forms or not own.jumps or not own.moments_s:
         return []
     if len(own.moments_s) == 1:
-        _put_among(all_sets, space, space.steps_at(own.moments_s[0]))
+        _add_candidates(all_sets, space, space.steps_at(own.moments_s[0]))
     listed = [all_sets.component(k) for keys in space.effects.values() for k in keys]
     others = [one for one in listed if one.jumps and one.effect != own.effect]
     others = [one for one in others if len(one.moments_s) == len(own.moments_s)]
     return [
-        formed(all_sets, space, one.key)
+        register_candidate(all_sets, space, one.key)
         for one in others
         if np.allclose(one.moments_s, own.moments_s, rtol=0.0, atol=priors.SAME_MOMENT_S)
     ]
 
 
-def sharpened(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+def refine_settings(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
     """The set with onsets and scales of its names sought on where each is likelier.
 
     Of what has a thousand nats a time constant that is off by a tenth leaves a hundred, and a free
@@ -318,58 +318,65 @@ def sharpened(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesi
         tried = []
         for rest in dict.fromkeys((best.names, best.names - set(space.courses))):
             fewer = all_sets.judge(rest - {key}, best)
-            scan = beside(all_sets.made, fewer.keys, best.at_of(fewer))
-            new = sought(all_sets, space, scan, key, range(FINER, SHARPEST))
+            scan = beside(all_sets.made, fewer.keys, best.fit_at_lower_noise(fewer))
+            new = refine_candidate(
+                all_sets, space, scan, key, range(CANDIDATE_ROUNDS, MEMBER_ROUNDS)
+            )
             tried.append(rest - {key} | {new})
-        best = all_sets.likeliest(best, tried)
+        best = all_sets.most_probable(best, tried)
     return best
 
 
-def _best(all_sets: Hypotheses, found: Iterable[Hypothesis], *, real: bool) -> list[Hypothesis]:
+def _best_sets(
+    all_sets: Hypotheses, found: Iterable[Hypothesis], *, real: bool
+) -> list[Hypothesis]:
     unique = {one.names: one for one in found if all_sets.is_real(one.names) == real}
-    return sorted(unique.values(), key=lambda one: -one.score)[:BEAM]
+    return sorted(unique.values(), key=lambda one: -one.score)[:BEAM_WIDTH]
 
 
-def moves(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
+def neighbouring_sets(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[Names]:
     """Sets that are one step away: a course or an effect more, one less, one for another."""
     names = here.names
     _propose_steps(all_sets, space, here)
     own = [key for key in sorted(names) if key not in all_sets.remainder]
-    out = [all_sets.without(names, key) for key in own]
+    out = [all_sets.without_member(names, key) for key in own]
     courses = [key for key in space.courses if key not in names]
     out += [names | {key} for key in courses]
     rest, sources = frozenset(all_sets.remainder), frozenset(space.sources)
     if not all_sets.is_real(names):
         out += [names - sources | {key} for key in space.sources if key not in names]
     out.append(names - rest if rest <= names else (names - sources) | rest)
-    out += come_and_gone(all_sets, space, names)
+    out += sets_with_merged_steps(all_sets, space, names)
     bare = names - set(space.courses)
     for base in dict.fromkeys((names, bare)):
-        ranked = asked(all_sets, space, base, here)
-        out += [all_sets.with_(base, key) for key in ranked]
+        ranked = rank_candidates(all_sets, space, base, here)
+        out += [all_sets.with_member(base, key) for key in ranked]
     return list(dict.fromkeys(out))
 
 
-def come_and_gone(all_sets: Hypotheses, space: Space, names: Names) -> list[Names]:
+def sets_with_merged_steps(all_sets: Hypotheses, space: Space, names: Names) -> list[Names]:
     """Sets with one vector that comes and goes in place of two steps of a sensor.
 
     With it alone at its moments as well: what other steps there took is the vector's way.
     """
-    steps = [key for key in names if _steps_of(all_sets, key)]
+    steps = [key for key in names if _step_sensor(all_sets, key)]
     steps = [key for key in steps if len(all_sets.component(key).moments_s) == 1]
     steps.sort(key=lambda key: (all_sets.component(key).moments_s, key))
     out = []
     for first, last in itertools.combinations(steps, 2):
         begins, ends = all_sets.component(first), all_sets.component(last)
         apart_s = ends.moments_s[0] - begins.moments_s[0]
-        if _steps_of(all_sets, first) != _steps_of(all_sets, last) or apart_s < priors.TRANSITION_S:
+        if (
+            _step_sensor(all_sets, first) != _step_sensor(all_sets, last)
+            or apart_s < priors.TRANSITION_S
+        ):
             continue
-        found = space.while_there(begins, ends)
+        found = space.interval_components(begins, ends)
         all_sets.made.add(found)
         at_s = (*begins.moments_s, *ends.moments_s)
         near = {key for key in steps if _begins_near(all_sets.component(key), at_s)}
         for gone in dict.fromkeys((frozenset({first, last}), frozenset(near))):
-            out += [names - gone | {formed(all_sets, space, one.key)} for one in found]
+            out += [names - gone | {register_candidate(all_sets, space, one.key)} for one in found]
     return out
 
 
@@ -381,11 +388,11 @@ def _begins_near(one: Component, moments_s: Sequence[float]) -> bool:
 def _propose_steps(all_sets: Hypotheses, space: Space, here: Hypothesis) -> None:
     """Put steps at the moments at which a set is most surprised among the candidates."""
     made = all_sets.made
-    for time_s in surprises(made.left_by(here.keys, here.at), made.context.track.time_s):
-        _put_among(all_sets, space, space.steps_at(time_s))
+    for time_s in residual_peak_times(made.left_by(here.keys, here.at), made.context.track.time_s):
+        _add_candidates(all_sets, space, space.steps_at(time_s))
 
 
-def _put_among(all_sets: Hypotheses, space: Space, found: Sequence[Component]) -> None:
+def _add_candidates(all_sets: Hypotheses, space: Space, found: Sequence[Component]) -> None:
     """Put components among the candidates, but for those that are known."""
     new = [one for one in found if one.key not in all_sets.made.seen]
     all_sets.made.add(new)
@@ -393,7 +400,7 @@ def _put_among(all_sets: Hypotheses, space: Space, found: Sequence[Component]) -
         space.effects.setdefault(one.effect or one.key, []).append(one.key)
 
 
-def surprises(residual: Array, time_s: Array) -> list[float]:
+def residual_peak_times(residual: Array, time_s: Array) -> list[float]:
     """Moments of the largest squares of a residual (N, 3) without colour, apart from each other.
 
     None so near to the beginning or the end that a step there is no more than some wild readings.
@@ -401,21 +408,21 @@ def surprises(residual: Array, time_s: Array) -> list[float]:
     power = np.sum(residual**2, axis=1)
     power = power + np.roll(power, -1)  # the row of a jump, and the next
     found: list[float] = []
-    near = APART * float(time_s[-1] - time_s[0])
-    for row in np.argsort(-power)[: 20 * MOMENTS]:
+    near = PEAK_SEPARATION * float(time_s[-1] - time_s[0])
+    for row in np.argsort(-power)[: 20 * MOST_PEAKS]:
         at = float(time_s[row])
         inside = min(at - time_s[0], time_s[-1] - at) > priors.TRANSITION_S
         if inside and all(abs(at - other) > near for other in found):
             found.append(at)
-        if len(found) == MOMENTS:
+        if len(found) == MOST_PEAKS:
             break
     return found
 
 
-def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> list[str]:
+def rank_candidates(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> list[str]:
     """The likeliest setting of each of the likeliest effects, beside a base in here's noise."""
     model = all_sets.judge(base, here)
-    at = here.at_of(model)
+    at = here.fit_at_lower_noise(model)
     had = {all_sets.component(key).effect for key in base}
     again = {
         row.identifier
@@ -426,10 +433,10 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
         key for name, keys in space.effects.items() if name not in had or name in again
         for key in keys if key not in base
     ]  # fmt: skip
-    changing = _changing(all_sets, base)
-    candidates = [key for key in candidates if _steps_of(all_sets, key) not in changing]
-    candidates = [key for key in candidates if not _beside_its_like(all_sets, base, key)]
-    candidates = [key for key in candidates if all_sets.is_asked(base, key)]
+    changing = _changing_sensors(all_sets, base)
+    candidates = [key for key in candidates if _step_sensor(all_sets, key) not in changing]
+    candidates = [key for key in candidates if not _is_near_same_effect(all_sets, base, key)]
+    candidates = [key for key in candidates if all_sets.is_compatible(base, key)]
     if not candidates:
         return []
     scan = beside(all_sets.made, model.keys, at)
@@ -440,25 +447,25 @@ def asked(all_sets: Hypotheses, space: Space, base: Names, here: Hypothesis) -> 
         total = nats + one.prior
         if total > best.get(one.effect or key, (-np.inf, ""))[0]:
             best[one.effect or key] = (total, key)
-    ranked = sorted(best.values(), reverse=True)[:ASKED]
-    return [sought(all_sets, space, scan, key) for total, key in ranked if total > 0.0]
+    ranked = sorted(best.values(), reverse=True)[:MOST_CANDIDATES]
+    return [refine_candidate(all_sets, space, scan, key) for total, key in ranked if total > 0.0]
 
 
-def _changing(all_sets: Hypotheses, base: Names) -> set[str]:
+def _changing_sensors(all_sets: Hypotheses, base: Names) -> set[str]:
     """Sensors with so many steps of one kind that they are one source that changes, unknown.
 
     Further steps, of whatever kind, would be parts of it, and each brings a form of its own.
     """
-    steps = [key for key in base if _steps_of(all_sets, key)]
+    steps = [key for key in base if _step_sensor(all_sets, key)]
     kinds = [all_sets.component(key).effect for key in steps]
     return {
-        _steps_of(all_sets, key)
+        _step_sensor(all_sets, key)
         for key, kind in zip(steps, kinds, strict=True)
         if kinds.count(kind) >= priors.CHANGES
     }
 
 
-def _steps_of(all_sets: Hypotheses, key: str) -> str:
+def _step_sensor(all_sets: Hypotheses, key: str) -> str:
     """The sensor of which a candidate is a step; empty where it is none."""
     one = all_sets.component(key)
     if one.row is None or not one.row.recurs:
@@ -466,7 +473,7 @@ def _steps_of(all_sets: Hypotheses, key: str) -> str:
     return "magnetometer" if one.columns.on_mag else "gyro"
 
 
-def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
+def _is_near_same_effect(all_sets: Hypotheses, base: Names, key: str) -> bool:
     """Whether a set has the same effect so near in time that the two are one."""
     one = all_sets.component(key)
     others = [all_sets.component(other) for other in base]
@@ -478,17 +485,23 @@ def _beside_its_like(all_sets: Hypotheses, base: Names, key: str) -> bool:
     )
 
 
-def sought(
-    all_sets: Hypotheses, space: Space, scan: Beside, key: str, rounds: Iterable[int] = range(FINER)
+def refine_candidate(
+    all_sets: Hypotheses,
+    space: Space,
+    scan: Beside,
+    key: str,
+    rounds: Iterable[int] = range(CANDIDATE_ROUNDS),
 ) -> str:
     """The candidate with onset, scale and what it remembers sought more and more finely."""
     made, row = all_sets.made, all_sets.component(key).row
     remembers = row is not None and row.remembers > 0.0
     scan = scan.in_quiet() if remembers else scan
     worth = scan.worth([key])[key] + all_sets.component(key).prior
-    for round_, again in itertools.product(rounds, range(1 + REMEMBERED * remembers)):
+    for round_, again in itertools.product(rounds, range(1 + MEMORY_STEPS * remembers)):
         one = all_sets.component(key)
-        near = space.remembered(scan, one, round_) if again else space.finer(one, round_)
+        near = (
+            space.refine_memory(scan, one, round_) if again else space.refine_setting(one, round_)
+        )
         if not near:
             continue
         made.add(near)
@@ -497,12 +510,12 @@ def sought(
         first = max(total, key=lambda one: total[one])
         if total[first] > worth:
             key, worth = first, total[first]
-    return formed(all_sets, space, key)
+    return register_candidate(all_sets, space, key)
 
 
-def formed(all_sets: Hypotheses, space: Space, key: str) -> str:
+def register_candidate(all_sets: Hypotheses, space: Space, key: str) -> str:
     """A candidate, known to the sets with what it leaves of its form."""
-    form = space.form(all_sets.component(key))
+    form = space.form_of(all_sets.component(key))
     if form is not None and key not in all_sets.forms:
         all_sets.made.add([form])
         all_sets.forms[key] = form.key

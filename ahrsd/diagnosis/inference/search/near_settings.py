@@ -25,7 +25,7 @@ from ahrsd.samples import Array
 _ONSET, _SCALE, _TURN_DEG, _LATE_S, _MEMORY = 1 / 2000, 0.02, 1.0, 0.02, 0.01
 
 
-def changed(one: Component, context: Context) -> dict[str, Setting]:
+def perturbed_settings(one: Component, context: Context) -> dict[str, Setting]:
     """The setting with each of its numbers changed a little."""
     setting, out = one.setting, dict[str, Setting]()
     for name in MOMENTS:
@@ -47,7 +47,7 @@ def changed(one: Component, context: Context) -> dict[str, Setting]:
     return out
 
 
-def opened(
+def with_setting_slopes(
     one: Component, context: Context, value: Array, nearby: Mapping[str, Setting]
 ) -> Component | None:
     """A component of the library with its slopes at these coefficients behind its own columns.

@@ -14,31 +14,33 @@ import numpy as np
 from ahrsd.diagnosis.effects.effect import Setting
 from ahrsd.diagnosis.inference.components.component import Component
 from ahrsd.diagnosis.inference.likelihood.candidates import Beside
-from ahrsd.diagnosis.inference.search.near_settings import changed, opened
+from ahrsd.diagnosis.inference.search.near_settings import perturbed_settings, with_setting_slopes
 from ahrsd.samples import Array
 
 #: digits to which it is sought, of what may be remembered
 _DIGITS = 3
 
 
-def remembered(scan: Beside, one: Component, round_: int) -> list[Setting]:
+def memory_settings(scan: Beside, one: Component, round_: int) -> list[Setting]:
     """Settings of an effect with another memory, nearer by the round; none where it has none."""
     row = one.row
     if row is None or not row.remembers:
         return []
     most, memory = row.remembers, np.array(one.setting.get("memory", (0.0, 0.0, 0.0)))
     moved = memory + np.vstack([np.eye(3), -np.eye(3)]) * most / 2**round_
-    found = np.clip(np.vstack([moved, memory + _step(scan, one, memory)]), -most, most)
+    found = np.clip(np.vstack([moved, memory + _memory_step(scan, one, memory)]), -most, most)
     found = np.round(found / most, _DIGITS) * most
     kept = {tuple(each) for each in found.tolist()} - {tuple(memory.tolist())}
     return [{**one.setting, "memory": each} for each in sorted(kept)]
 
 
-def _step(scan: Beside, one: Component, memory: Array) -> Array:
+def _memory_step(scan: Beside, one: Component, memory: Array) -> Array:
     """(3,) to the likeliest memory as it is seen from here."""
     context = scan.made.context
-    nearby = {k: each for k, each in changed(one, context).items() if k.startswith("memory")}
-    whole = opened(one, context, scan.likeliest(one)[0], nearby)
+    nearby = {
+        k: each for k, each in perturbed_settings(one, context).items() if k.startswith("memory")
+    }
+    whole = with_setting_slopes(one, context, scan.likeliest(one)[0], nearby)
     if whole is None:
         return np.zeros(3)
     parts = np.array([each["memory"] for each in nearby.values()]) - memory

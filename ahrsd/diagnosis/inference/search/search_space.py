@@ -27,70 +27,70 @@ from ahrsd.diagnosis.inference.search.model_search import (
     Hypothesis,
     Names,
     Space,
-    searched,
+    beam_search,
 )
-from ahrsd.diagnosis.inference.search.remembered import remembered
-from ahrsd.diagnosis.inference.search.switching_sources import switching
+from ahrsd.diagnosis.inference.search.remembered import memory_settings
+from ahrsd.diagnosis.inference.search.switching_sources import find_switching_sources
 
-COURSES = ("free sensor", "free world", "free gyro")
+FREE_PROCESSES = ("free sensor", "free world", "free gyro")
 #: columns that are made before the first of them pass the filter
-_TOGETHER = 500
+_BATCH_COLUMNS = 500
 
 
-def best_at(
+def search_at_point(
     rich: Judged, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
 ) -> tuple[Hypotheses, Space, Hypothesis]:
     """The likeliest set at a richest model, searched from what is known and from nothing."""
     base = rich.base
-    all_sets, space = space_at(rich, library, named)
+    all_sets, space = build_search_space(rich, library, named)
     made = all_sets.made
     real = frozenset(base.remainder)
-    known = all_sets.without(frozenset(one.key for one in named), LAG)
+    known = all_sets.without_member(frozenset(one.key for one in named), LAG)
     lag = frozenset([LAG]) & made.seen.keys()
-    starts: list[Names] = [frozenset(), lag, real | lag, real | lag | {COURSES[0]}]
+    starts: list[Names] = [frozenset(), lag, real | lag, real | lag | {FREE_PROCESSES[0]}]
     if known:
         here = known | real if was_real else known
-        starts = [here, known, here | {COURSES[0]}, here | set(COURSES[:2]) - real]
+        starts = [here, known, here | {FREE_PROCESSES[0]}, here | set(FREE_PROCESSES[:2]) - real]
     if not (known and was_real):
-        _offered(all_sets, space, all_sets.judge(()))
-    found = searched(all_sets, space, starts)
+        _add_switching_sources(all_sets, space, all_sets.judge(()))
+    found = beam_search(all_sets, space, starts)
     if not all_sets.is_real(found[0].names):
-        new = [found[0].names | {key} for key in _offered(all_sets, space, found[0])]
+        new = [found[0].names | {key} for key in _add_switching_sources(all_sets, space, found[0])]
         if new:
-            found = searched(all_sets, space, [found[0].names, *new])
+            found = beam_search(all_sets, space, [found[0].names, *new])
     return all_sets, space, found[0]
 
 
-def _offered(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[str]:
+def _add_switching_sources(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[str]:
     """Keys of sources that switch, as a set leaves them, put among what may be in one."""
-    new = switching(all_sets, here)
+    new = find_switching_sources(all_sets, here)
     all_sets.made.add(new)
     space.sources.extend(one.key for one in new if one.key not in space.sources)
     return [one.key for one in new]
 
 
-def _by_hundreds(
+def _batches(
     parts: Iterable[tuple[str, list[Component]]],
 ) -> Iterator[list[tuple[str, list[Component]]]]:
     """Effects together that have some hundred columns: few batches, and few columns at a time."""
     some: list[tuple[str, list[Component]]] = []
     for one in parts:
         some.append(one)
-        if sum(each.width for _, found in some for each in found) >= _TOGETHER:
+        if sum(each.width for _, found in some for each in found) >= _BATCH_COLUMNS:
             yield some
             some = []
     if some:
         yield some
 
 
-def _passed(
+def _filter_library(
     made: Linearised, library: Mapping[str, Effect]
 ) -> tuple[dict[str, list[str]], list[Component]]:
     """Keys of the library's components by effect, all passed; and those that hold the delay."""
     delay = made.seen[LAG].component if LAG in made.seen else None
     whole: list[Component] = []
     effects: dict[str, list[str]] = {}
-    for some in _by_hundreds(library_components(made.context, library)):
+    for some in _batches(library_components(made.context, library)):
         passed = []
         for name, parts in some:
             held = [] if delay is None or not holds(parts[0], delay) else parts
@@ -105,13 +105,13 @@ def _passed(
     return effects, whole
 
 
-def space_at(
+def build_search_space(
     rich: Judged, library: Mapping[str, Effect], named: Sequence[Component]
 ) -> tuple[Hypotheses, Space]:
     """The sets at a richest model, none judged yet, and what they may be made of."""
     base = rich.base
     made, context = base.made.copied(), base.made.context
-    effects, whole = _passed(made, library)
+    effects, whole = _filter_library(made, library)
     forms = {}
     for one in named:
         listed = effects.setdefault(one.effect or one.key, [])
@@ -139,7 +139,7 @@ def space_at(
         return made_of(one, neighbours(one.setting, length_s, round_))
 
     def closer(scan: Beside, one: Component, round_: int) -> list[Component]:
-        return made_of(one, remembered(scan, one, round_))
+        return made_of(one, memory_settings(scan, one, round_))
 
     def left_of(one: Component) -> Component | None:
         return form_of(one, context, library)
@@ -155,5 +155,5 @@ def space_at(
     def come_and_gone(begins: Component, ends: Component) -> list[Component]:
         return while_there(begins, ends, context, library, priors.SOUGHT_SETTINGS**2)
 
-    space = Space(effects, COURSES, finer, closer, left_of, steps_at, come_and_gone)
+    space = Space(effects, FREE_PROCESSES, finer, closer, left_of, steps_at, come_and_gone)
     return all_sets, space

@@ -42,11 +42,11 @@ FRAMES: tuple[Frame, ...] = ("sensor", "world")
 #: rounds in which size and states are found of each other
 _ROUNDS = 8
 #: half waves with which ends are sought, and steps to each side
-_FEW, _AWAY = 3, 2
+_END_WAVES, _END_STEPS = 3, 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SpellLaw:
+class IntervalLaw:
     """psi: logarithms of the size, in `unit`, and of the corner, in half waves a second.
 
     order (q,): half waves a second of each coefficient, 0 of a mean
@@ -94,43 +94,45 @@ class SpellLaw:
         return sum(nats for nats, _ in each), np.concatenate([slope for _, slope in each])
 
 
-def switching(all_sets: Hypotheses, here: Hypothesis) -> list[Component]:
+def find_switching_sources(all_sets: Hypotheses, here: Hypothesis) -> list[Component]:
     """What a set leaves as sources that switch, in each frame; none where nothing does."""
     made = all_sets.made
     left = made.left_by(here.keys, here.at) / made.point.loud.amplitude[:, None]
     left = np.where(made.point.filtered.used[:, None], left, 0.0)
     rows = max(1, round(priors.SPELL_PIECE_S * made.point.problem.rate_hz))
-    spells, log_odds = _spells(left, made.point.filtered.used, rows, made.point.problem.rate_hz)
+    spells, log_odds = _find_intervals(
+        left, made.point.filtered.used, rows, made.point.problem.rate_hz
+    )
     # of what is often alike noise of a colour would leave nothing
     quiet = replace(here.at, log_noise=np.full(len(here.at.log_noise), here.at.log_noise[-1]))
     found: list[Component] = []
     if spells:
-        spells = _closest(all_sets, here, quiet, spells, rows)
+        spells = _refine_interval_ends(all_sets, here, quiet, spells, rows)
         log_odds -= 2 * len(spells) * float(np.log(rows))  # ends are sought to a row, not a piece
-        found += [_coming(made.context, frame, spells, log_odds) for frame in FRAMES]
+        found += [_interval_component(made.context, frame, spells, log_odds) for frame in FRAMES]
     left = made.left_by(here.keys, quiet) / made.point.loud.amplitude[:, None]
     left = np.where(made.point.filtered.used[:, None], left, 0.0)
-    moments = changes(left, 2 * rows)
+    moments = change_points(left, 2 * rows)
     if priors.CHANGES <= len(moments) <= priors.MOST_WAVES:
-        found += [_levels(made.context, frame, moments) for frame in FRAMES]
+        found += [_level_component(made.context, frame, moments) for frame in FRAMES]
     return found
 
 
-def _spells(
+def _find_intervals(
     left: Array, used: NDArray[np.bool], rows: int, rate_hz: float
 ) -> tuple[list[tuple[int, int]], float]:
     """Rows from and to which a source is on, of a residual of unit variance, and their odds."""
     starts = np.arange(0, len(left), rows)
     sums = np.add.reduceat(left, starts)
     count = np.add.reduceat(used.astype(float), starts)
-    on, log_odds = likeliest_states(np.sum(sums**2, axis=1), count, rows / rate_hz)
+    on, log_odds = most_probable_states(np.sum(sums**2, axis=1), count, rows / rate_hz)
     if np.mean(on) > priors.MOST_ON:
         return [], 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]]))).reshape(-1, 2)
     return [(int(a) * rows, min(int(b) * rows, len(left))) for a, b in edges], log_odds
 
 
-def _closest(
+def _refine_interval_ends(
     all_sets: Hypotheses, here: Hypothesis, at: At, spells: list[tuple[int, int]], rows: int
 ) -> list[tuple[int, int]]:
     """Spells with their ends where the readings are likeliest.
@@ -144,11 +146,11 @@ def _closest(
             tried: dict[str, tuple[int, tuple[int, int]]] = {}
             new = []
             for number, spell in enumerate(spells):
-                for away in range(-_AWAY, _AWAY + 1):
+                for away in range(-_END_STEPS, _END_STEPS + 1):
                     a, b = (spell[k] + away * step * (k == end) for k in (0, 1))
                     if not 0 <= a < b - 1 < count:
                         continue
-                    one = _coming(made.context, "sensor", [(a, b)], 0.0, _FEW)
+                    one = _interval_component(made.context, "sensor", [(a, b)], 0.0, _END_WAVES)
                     tried[one.key] = number, (a, b)
                     new.append(one)
             trial = made.copied()  # what was tried ends with its round
@@ -159,10 +161,10 @@ def _closest(
                 number, spell = tried[key]
                 if nats > best.get(number, -np.inf):
                     best[number], spells[number] = nats, spell
-    return _joined(spells)
+    return _merge_overlapping(spells)
 
 
-def _joined(spells: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+def _merge_overlapping(spells: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     """In their order, and those that overlap as one."""
     out: list[tuple[int, int]] = []
     for a, b in sorted(spells):
@@ -173,7 +175,7 @@ def _joined(spells: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     return out
 
 
-def changes(left: Array, rows: int) -> list[int]:
+def change_points(left: Array, rows: int) -> list[int]:
     """Rows at which the mean of a residual of unit variance (N, 3) jumps.
 
     rows: before and behind, of which means are held against each other
@@ -193,7 +195,7 @@ def changes(left: Array, rows: int) -> list[int]:
     return sorted(found)
 
 
-def _levels(context: Context, frame: Frame, moments: Sequence[int]) -> Component:
+def _level_component(context: Context, frame: Frame, moments: Sequence[int]) -> Component:
     """One field from each moment (a row) to the next, along each axis of a frame."""
     time_s = context.track.time_s
     edges = np.array([time_s[0], *time_s[list(moments)], time_s[-1]])
@@ -202,13 +204,15 @@ def _levels(context: Context, frame: Frame, moments: Sequence[int]) -> Component
     unit = priors.COURSE_UNIT[frame]
     law = Sized(np.full(columns.width, unit), low, high)
     lasting = float(time_s[-1] - time_s[0])
-    odds = float(np.log(priors.COURSE * _share(frame))) - lasting / priors.BETWEEN_S
+    odds = float(np.log(priors.COURSE * _frame_probability(frame))) - lasting / priors.BETWEEN_S
     odds += len(moments) * float(np.log(lasting / len(time_s) / priors.BETWEEN_S))
     key = f"{frame} that changes {len(moments)} times from {edges[1]:.3f} s on"
     return Component(key, frame, columns, law, odds, setting={"edges_s": tuple(edges.tolist())})
 
 
-def likeliest_states(square: Array, count: Array, piece_s: float) -> tuple[NDArray[np.bool], float]:
+def most_probable_states(
+    square: Array, count: Array, piece_s: float
+) -> tuple[NDArray[np.bool], float]:
     """Which pieces of time a source is on in, and the log probability of such a chain.
 
     square (n,): of the sum of a piece's rows, each of three numbers of unit variance
@@ -245,7 +249,7 @@ def _viterbi(worth: Array, move: Array) -> NDArray[np.bool]:
     return states.astype(bool)
 
 
-def _coming(
+def _interval_component(
     context: Context,
     frame: Frame,
     spells: Sequence[tuple[int, int]],
@@ -264,16 +268,16 @@ def _coming(
     order = [
         np.arange(count) / (step_s * (b - a)) for (a, b), count in zip(spells, counts, strict=True)
     ]
-    waves = partial(_waves, len(time_s), tuple(spells), counts)
+    waves = partial(_interval_cosines, len(time_s), tuple(spells), counts)
     columns = in_frame(context, frame, waves, sum(counts))
-    law = SpellLaw(np.repeat(np.concatenate(order), 3), priors.COURSE_UNIT[frame])
+    law = IntervalLaw(np.repeat(np.concatenate(order), 3), priors.COURSE_UNIT[frame])
     spans = tuple((float(time_s[a]), float(time_s[b - 1])) for a, b in spells)
     key = f"{frame} that is there from and to {spans} s"
-    odds = float(np.log(priors.COURSE * _share(frame))) + log_odds
+    odds = float(np.log(priors.COURSE * _frame_probability(frame))) + log_odds
     return Component(key, frame, columns, law, odds, setting={"spans_s": spans})
 
 
-def _waves(rows: int, spells: Sequence[tuple[int, int]], counts: Sequence[int]) -> Array:
+def _interval_cosines(rows: int, spells: Sequence[tuple[int, int]], counts: Sequence[int]) -> Array:
     """(rows, sum of counts) half waves in each spell, from its mean on."""
     out = np.zeros((rows, sum(counts)))
     first = 0
@@ -284,6 +288,6 @@ def _waves(rows: int, spells: Sequence[tuple[int, int]], counts: Sequence[int]) 
     return out
 
 
-def _share(frame: Frame) -> float:
+def _frame_probability(frame: Frame) -> float:
     """How often a source that switches is of a frame."""
     return priors.SWITCHES_OUTSIDE if frame == "world" else 1.0 - priors.SWITCHES_OUTSIDE
