@@ -27,42 +27,42 @@ _ONSET, _SCALE, _TURN_DEG, _LATE_S, _MEMORY = 1 / 2000, 0.02, 1.0, 0.02, 0.01
 
 def perturbed_settings(one: Component, context: Context) -> dict[str, Setting]:
     """The setting with each of its numbers changed a little."""
-    setting, out = one.setting, dict[str, Setting]()
+    setting, perturbed = one.setting, dict[str, Setting]()
     for name in MOMENTS:
         if setting.get(name) is not None:
             at_s = float(setting[name]) + _ONSET * context.track.duration_s
-            out[name] = {**setting, name: at_s}
+            perturbed[name] = {**setting, name: at_s}
     for name in SCALES:
         if name in setting:
-            out[name] = {**setting, name: float(setting[name]) * (1.0 + _SCALE)}
+            perturbed[name] = {**setting, name: float(setting[name]) * (1.0 + _SCALE)}
     for name in ANGLES:
         if name in setting:
-            out[name] = {**setting, name: float(setting[name]) + _TURN_DEG}
+            perturbed[name] = {**setting, name: float(setting[name]) + _TURN_DEG}
     if "late_s" in setting:
-        out["late_s"] = {**setting, "late_s": float(setting["late_s"]) + _LATE_S}
+        perturbed["late_s"] = {**setting, "late_s": float(setting["late_s"]) + _LATE_S}
     if one.row is not None and one.row.remembers:
         memory = np.array(setting.get("memory", (0.0, 0.0, 0.0)))
         for axis, part in enumerate(_MEMORY * one.row.remembers * np.eye(3)):
-            out[f"memory {axis}"] = {**setting, "memory": tuple((memory + part).tolist())}
-    return out
+            perturbed[f"memory {axis}"] = {**setting, "memory": tuple((memory + part).tolist())}
+    return perturbed
 
 
 def with_setting_slopes(
-    one: Component, context: Context, value: Array, nearby: Mapping[str, Setting]
+    one: Component, context: Context, value: Array, perturbed: Mapping[str, Setting]
 ) -> Component | None:
     """A component of the library with its slopes at these coefficients behind its own columns.
 
     Coefficients of slopes are in changes of `nearby`; None where it has nothing to change.
     """
-    if one.row is None or not nearby:
+    if one.row is None or not perturbed:
         return None
-    found = [one.row.columns(context, setting) for setting in nearby.values()]
+    there = [one.row.columns(context, setting) for setting in perturbed.values()]
     here = one.row.columns(context, one.setting)
-    mag = _with_slopes(one.columns.mag, here.mag, [each.mag for each in found], value)
-    gyro = _with_slopes(one.columns.gyro, here.gyro, [each.gyro for each in found], value)
+    mag = _with_slopes(one.columns.mag, here.mag, [each.mag for each in there], value)
+    gyro = _with_slopes(one.columns.gyro, here.gyro, [each.gyro for each in there], value)
     largest = one.law.log_variance(one.law.high)
-    law = Fixed(np.concatenate([np.exp(largest), np.full(len(nearby), priors.SETTING_OFF**2)]))
-    key = f"{one.key}, open in {', '.join(nearby)} at {np.array2string(value, precision=6)}"
+    law = Fixed(np.concatenate([np.exp(largest), np.full(len(perturbed), priors.SETTING_OFF**2)]))
+    key = f"{one.key}, open in {', '.join(perturbed)} at {np.array2string(value, precision=6)}"
     return replace(one, key=key, columns=Columns(mag, gyro), law=law)
 
 

@@ -27,21 +27,23 @@ def memory_settings(scan: Beside, one: Component, round_: int) -> list[Setting]:
     if row is None or not row.remembers:
         return []
     most, memory = row.remembers, np.array(one.setting.get("memory", (0.0, 0.0, 0.0)))
-    moved = memory + np.vstack([np.eye(3), -np.eye(3)]) * most / 2**round_
-    found = np.clip(np.vstack([moved, memory + _memory_step(scan, one, memory)]), -most, most)
-    found = np.round(found / most, _DIGITS) * most
-    kept = {tuple(each) for each in found.tolist()} - {tuple(memory.tolist())}
+    axis_steps = memory + np.vstack([np.eye(3), -np.eye(3)]) * most / 2**round_
+    proposals = np.clip(
+        np.vstack([axis_steps, memory + _memory_step(scan, one, memory)]), -most, most
+    )
+    proposals = np.round(proposals / most, _DIGITS) * most
+    kept = {tuple(each) for each in proposals.tolist()} - {tuple(memory.tolist())}
     return [{**one.setting, "memory": each} for each in sorted(kept)]
 
 
 def _memory_step(scan: Beside, one: Component, memory: Array) -> Array:
     """(3,) to the likeliest memory as it is seen from here."""
     context = scan.made.context
-    nearby = {
+    perturbed = {
         k: each for k, each in perturbed_settings(one, context).items() if k.startswith("memory")
     }
-    whole = with_setting_slopes(one, context, scan.likeliest(one)[0], nearby)
-    if whole is None:
+    with_slopes = with_setting_slopes(one, context, scan.likeliest(one)[0], perturbed)
+    if with_slopes is None:
         return np.zeros(3)
-    parts = np.array([each["memory"] for each in nearby.values()]) - memory
-    return np.asarray(scan.likeliest(whole)[0][-len(nearby) :] @ parts)
+    parts = np.array([each["memory"] for each in perturbed.values()]) - memory
+    return np.asarray(scan.likeliest(with_slopes)[0][-len(perturbed) :] @ parts)

@@ -38,49 +38,52 @@ _BATCH_COLUMNS = 500
 
 
 def search_at_point(
-    rich: Judged, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
+    fitted: Judged, library: Mapping[str, Effect], effects: Sequence[Component], was_real: bool
 ) -> tuple[Hypotheses, Space, Hypothesis]:
     """The likeliest set at a richest model, searched from what is known and from nothing."""
-    base = rich.base
-    all_sets, space = build_search_space(rich, library, named)
+    base = fitted.base
+    all_sets, space = build_search_space(fitted, library, effects)
     made = all_sets.made
     real = frozenset(base.remainder)
-    known = all_sets.without_member(frozenset(one.key for one in named), LAG)
+    known = all_sets.without_member(frozenset(one.key for one in effects), LAG)
     lag = frozenset([LAG]) & made.seen.keys()
     starts: list[Names] = [frozenset(), lag, real | lag, real | lag | {FREE_PROCESSES[0]}]
     if known:
-        here = known | real if was_real else known
-        starts = [here, known, here | {FREE_PROCESSES[0]}, here | set(FREE_PROCESSES[:2]) - real]
+        start = known | real if was_real else known
+        starts = [start, known, start | {FREE_PROCESSES[0]}, start | set(FREE_PROCESSES[:2]) - real]
     if not (known and was_real):
         _add_switching_sources(all_sets, space, all_sets.judge(()))
-    found = beam_search(all_sets, space, starts)
-    if not all_sets.is_real(found[0].names):
-        new = [found[0].names | {key} for key in _add_switching_sources(all_sets, space, found[0])]
-        if new:
-            found = beam_search(all_sets, space, [found[0].names, *new])
-    return all_sets, space, found[0]
+    hypotheses = beam_search(all_sets, space, starts)
+    if not all_sets.is_real(hypotheses[0].names):
+        extended = [
+            hypotheses[0].names | {key}
+            for key in _add_switching_sources(all_sets, space, hypotheses[0])
+        ]
+        if extended:
+            hypotheses = beam_search(all_sets, space, [hypotheses[0].names, *extended])
+    return all_sets, space, hypotheses[0]
 
 
-def _add_switching_sources(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[str]:
+def _add_switching_sources(all_sets: Hypotheses, space: Space, hypothesis: Hypothesis) -> list[str]:
     """Keys of sources that switch, as a set leaves them, put among what may be in one."""
-    new = find_switching_sources(all_sets, here)
-    all_sets.made.add(new)
-    space.sources.extend(one.key for one in new if one.key not in space.sources)
-    return [one.key for one in new]
+    sources = find_switching_sources(all_sets, hypothesis)
+    all_sets.made.add(sources)
+    space.sources.extend(one.key for one in sources if one.key not in space.sources)
+    return [one.key for one in sources]
 
 
 def _batches(
     parts: Iterable[tuple[str, list[Component]]],
 ) -> Iterator[list[tuple[str, list[Component]]]]:
     """Effects together that have some hundred columns: few batches, and few columns at a time."""
-    some: list[tuple[str, list[Component]]] = []
+    batch: list[tuple[str, list[Component]]] = []
     for one in parts:
-        some.append(one)
-        if sum(each.width for _, found in some for each in found) >= _BATCH_COLUMNS:
-            yield some
-            some = []
-    if some:
-        yield some
+        batch.append(one)
+        if sum(each.width for _, found in batch for each in found) >= _BATCH_COLUMNS:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
 
 
 def _filter_library(
@@ -88,32 +91,32 @@ def _filter_library(
 ) -> tuple[dict[str, list[str]], list[Component]]:
     """Keys of the library's components by effect, all passed; and those that hold the delay."""
     delay = made.seen[LAG].component if LAG in made.seen else None
-    whole: list[Component] = []
+    containing_delay: list[Component] = []
     effects: dict[str, list[str]] = {}
-    for some in _batches(library_components(made.context, library)):
-        passed = []
-        for name, parts in some:
+    for batch in _batches(library_components(made.context, library)):
+        components = []
+        for identifier, parts in batch:
             held = [] if delay is None or not holds(parts[0], delay) else parts
             beside = [] if delay is None else [beyond(one, delay) for one in held]
-            effects[name] = [one.key for one in (*parts, *beside)]
-            passed += [*parts, *beside]
-            whole += held
-        made.add(passed)
-        made.keep_lightly([one for _, parts in some for one in parts])
+            effects[identifier] = [one.key for one in (*parts, *beside)]
+            components += [*parts, *beside]
+            containing_delay += held
+        made.add(components)
+        made.keep_lightly([one for _, parts in batch for one in parts])
     if delay is not None:
         effects[delay.effect or LAG] = [LAG]
-    return effects, whole
+    return effects, containing_delay
 
 
 def build_search_space(
-    rich: Judged, library: Mapping[str, Effect], named: Sequence[Component]
+    fitted: Judged, library: Mapping[str, Effect], accepted: Sequence[Component]
 ) -> tuple[Hypotheses, Space]:
     """The sets at a richest model, none judged yet, and what they may be made of."""
-    base = rich.base
+    base = fitted.base
     made, context = base.made.copied(), base.made.context
-    effects, whole = _filter_library(made, library)
+    effects, containing_delay = _filter_library(made, library)
     forms = {}
-    for one in named:
+    for one in accepted:
         listed = effects.setdefault(one.effect or one.key, [])
         if one.key not in listed:
             listed.append(one.key)
@@ -123,37 +126,45 @@ def build_search_space(
             forms[one.key] = form.key
     if LAG_FORM in made.seen:
         forms[LAG] = LAG_FORM
-    psi = psi_by_key(made, base.whole, rich.at)
-    holding = {one.key: beside_key(one.key) for one in whole}
-    all_sets = Hypotheses(made, base.remainder, rich.at.log_noise, psi, forms, holding)
+    psi = psi_by_key(made, base.whole, fitted.at)
+    projected = {one.key: beside_key(one.key) for one in containing_delay}
+    all_sets = Hypotheses(made, base.remainder, fitted.at.log_noise, psi, forms, projected)
     all_sets.unknown_nats = 0.0 if made.point.directed is None else made.point.directed.nats
     length_s = context.track.duration_s
 
-    def made_of(one: Component, settings: Iterable[Setting]) -> list[Component]:
+    def refined(one: Component, settings: Iterable[Setting]) -> list[Component]:
         if one.row is None or one.key == LAG:
             return []
         row, tried = one.row, max(priors.SOUGHT_SETTINGS, len(effects[one.row.identifier]))
         return [component(context, row, one, tried).lightly(context) for one in settings]
 
-    def finer(one: Component, round_: int) -> list[Component]:
-        return made_of(one, neighbours(one.setting, length_s, round_))
+    def refine_setting(one: Component, round_: int) -> list[Component]:
+        return refined(one, neighbours(one.setting, length_s, round_))
 
-    def closer(scan: Beside, one: Component, round_: int) -> list[Component]:
-        return made_of(one, memory_settings(scan, one, round_))
+    def refine_memory(scan: Beside, one: Component, round_: int) -> list[Component]:
+        return refined(one, memory_settings(scan, one, round_))
 
-    def left_of(one: Component) -> Component | None:
+    def form_of_component(one: Component) -> Component | None:
         return form_of(one, context, library)
 
     def steps_at(time_s: float) -> list[Component]:
         setting = {"onset_s": round(time_s, 3)}
-        jumping = [row for row in library.values() if row.jumps]
+        step_effects = [row for row in library.values() if row.jumps]
         return [
             component(context, row, setting, priors.PROPOSED_ONSETS).lightly(context)
-            for row in jumping
+            for row in step_effects
         ]
 
-    def come_and_gone(begins: Component, ends: Component) -> list[Component]:
+    def components_between(begins: Component, ends: Component) -> list[Component]:
         return while_there(begins, ends, context, library, priors.SOUGHT_SETTINGS**2)
 
-    space = Space(effects, FREE_PROCESSES, finer, closer, left_of, steps_at, come_and_gone)
+    space = Space(
+        effects,
+        FREE_PROCESSES,
+        refine_setting,
+        refine_memory,
+        form_of_component,
+        steps_at,
+        components_between,
+    )
     return all_sets, space

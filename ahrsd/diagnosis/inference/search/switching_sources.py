@@ -87,127 +87,141 @@ class IntervalLaw:
 
     def log_prior(self, psi: Array) -> tuple[float, Array]:
         """Log density of psi and its gradient (k,)."""
-        each = [
+        terms = [
             log_density(value, 0.0, 0.0, low, high)
             for value, low, high in zip(psi, self.low, self.high, strict=True)
         ]
-        return sum(nats for nats, _ in each), np.concatenate([slope for _, slope in each])
+        return sum(nats for nats, _ in terms), np.concatenate([slope for _, slope in terms])
 
 
-def find_switching_sources(all_sets: Hypotheses, here: Hypothesis) -> list[Component]:
+def find_switching_sources(all_sets: Hypotheses, hypothesis: Hypothesis) -> list[Component]:
     """What a set leaves as sources that switch, in each frame; none where nothing does."""
     made = all_sets.made
-    left = made.left_by(here.keys, here.at) / made.point.loud.amplitude[:, None]
-    left = np.where(made.point.filtered.used[:, None], left, 0.0)
+    residual = made.left_by(hypothesis.keys, hypothesis.at) / made.point.loud.amplitude[:, None]
+    residual = np.where(made.point.filtered.used[:, None], residual, 0.0)
     rows = max(1, round(priors.SPELL_PIECE_S * made.point.problem.rate_hz))
-    spells, log_odds = _find_intervals(
-        left, made.point.filtered.used, rows, made.point.problem.rate_hz
+    intervals, log_odds = _find_intervals(
+        residual, made.point.filtered.used, rows, made.point.problem.rate_hz
     )
     # of what is often alike noise of a colour would leave nothing
-    quiet = replace(here.at, log_noise=np.full(len(here.at.log_noise), here.at.log_noise[-1]))
-    found: list[Component] = []
-    if spells:
-        spells = _refine_interval_ends(all_sets, here, quiet, spells, rows)
-        log_odds -= 2 * len(spells) * float(np.log(rows))  # ends are sought to a row, not a piece
-        found += [_interval_component(made.context, frame, spells, log_odds) for frame in FRAMES]
-    left = made.left_by(here.keys, quiet) / made.point.loud.amplitude[:, None]
-    left = np.where(made.point.filtered.used[:, None], left, 0.0)
-    moments = change_points(left, 2 * rows)
+    sensor_noise = replace(
+        hypothesis.at, log_noise=np.full(len(hypothesis.at.log_noise), hypothesis.at.log_noise[-1])
+    )
+    components: list[Component] = []
+    if intervals:
+        intervals = _refine_interval_ends(all_sets, hypothesis, sensor_noise, intervals, rows)
+        log_odds -= (
+            2 * len(intervals) * float(np.log(rows))
+        )  # ends are sought to a row, not a piece
+        components += [
+            _interval_component(made.context, frame, intervals, log_odds) for frame in FRAMES
+        ]
+    residual = made.left_by(hypothesis.keys, sensor_noise) / made.point.loud.amplitude[:, None]
+    residual = np.where(made.point.filtered.used[:, None], residual, 0.0)
+    moments = change_points(residual, 2 * rows)
     if priors.CHANGES <= len(moments) <= priors.MOST_WAVES:
-        found += [_level_component(made.context, frame, moments) for frame in FRAMES]
-    return found
+        components += [_level_component(made.context, frame, moments) for frame in FRAMES]
+    return components
 
 
 def _find_intervals(
-    left: Array, used: NDArray[np.bool], rows: int, rate_hz: float
+    residual: Array, used: NDArray[np.bool], rows: int, rate_hz: float
 ) -> tuple[list[tuple[int, int]], float]:
     """Rows from and to which a source is on, of a residual of unit variance, and their odds."""
-    starts = np.arange(0, len(left), rows)
-    sums = np.add.reduceat(left, starts)
+    starts = np.arange(0, len(residual), rows)
+    sums = np.add.reduceat(residual, starts)
     count = np.add.reduceat(used.astype(float), starts)
     on, log_odds = most_probable_states(np.sum(sums**2, axis=1), count, rows / rate_hz)
     if np.mean(on) > priors.MOST_ON:
         return [], 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]]))).reshape(-1, 2)
-    return [(int(a) * rows, min(int(b) * rows, len(left))) for a, b in edges], log_odds
+    return [(int(a) * rows, min(int(b) * rows, len(residual))) for a, b in edges], log_odds
 
 
 def _refine_interval_ends(
-    all_sets: Hypotheses, here: Hypothesis, at: At, spells: list[tuple[int, int]], rows: int
+    all_sets: Hypotheses,
+    hypothesis: Hypothesis,
+    at: At,
+    intervals: list[tuple[int, int]],
+    rows: int,
 ) -> list[tuple[int, int]]:
     """Spells with their ends where the readings are likeliest.
 
     A filter follows what stays, and swings back behind it: a residual has other ends.
     """
     made, count = all_sets.made, len(all_sets.made.context.track)
-    scan = beside(made, here.keys, at)
+    scan = beside(made, hypothesis.keys, at)
     for step in (rows, rows, max(1, rows // 2), 1):
         for end in (1, 0):
-            tried: dict[str, tuple[int, tuple[int, int]]] = {}
-            new = []
-            for number, spell in enumerate(spells):
-                for away in range(-_END_STEPS, _END_STEPS + 1):
-                    a, b = (spell[k] + away * step * (k == end) for k in (0, 1))
+            interval_by_key: dict[str, tuple[int, tuple[int, int]]] = {}
+            candidates = []
+            for number, interval in enumerate(intervals):
+                for offset in range(-_END_STEPS, _END_STEPS + 1):
+                    a, b = (interval[k] + offset * step * (k == end) for k in (0, 1))
                     if not 0 <= a < b - 1 < count:
                         continue
                     one = _interval_component(made.context, "sensor", [(a, b)], 0.0, _END_WAVES)
-                    tried[one.key] = number, (a, b)
-                    new.append(one)
+                    interval_by_key[one.key] = number, (a, b)
+                    candidates.append(one)
             trial = made.copied()  # what was tried ends with its round
-            trial.add(new)
-            worth = replace(scan, made=trial).worth(list(tried))
+            trial.add(candidates)
+            worth = replace(scan, made=trial).worth(list(interval_by_key))
             best: dict[int, float] = {}
             for key, nats in worth.items():
-                number, spell = tried[key]
+                number, interval = interval_by_key[key]
                 if nats > best.get(number, -np.inf):
-                    best[number], spells[number] = nats, spell
-    return _merge_overlapping(spells)
+                    best[number], intervals[number] = nats, interval
+    return _merge_overlapping(intervals)
 
 
-def _merge_overlapping(spells: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+def _merge_overlapping(intervals: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     """In their order, and those that overlap as one."""
-    out: list[tuple[int, int]] = []
-    for a, b in sorted(spells):
-        if out and a <= out[-1][1]:
-            out[-1] = out[-1][0], max(b, out[-1][1])
+    merged: list[tuple[int, int]] = []
+    for a, b in sorted(intervals):
+        if merged and a <= merged[-1][1]:
+            merged[-1] = merged[-1][0], max(b, merged[-1][1])
         else:
-            out.append((a, b))
-    return out
+            merged.append((a, b))
+    return merged
 
 
-def change_points(left: Array, rows: int) -> list[int]:
+def change_points(residual: Array, rows: int) -> list[int]:
     """Rows at which the mean of a residual of unit variance (N, 3) jumps.
 
     rows: before and behind, of which means are held against each other
     """
-    total = np.vstack([np.zeros(3), np.cumsum(left, axis=0)])
-    at = np.arange(rows, len(left) - rows + 1)
-    jump = (total[at + rows] - 2.0 * total[at] + total[at - rows]) / rows
+    cumulative = np.vstack([np.zeros(3), np.cumsum(residual, axis=0)])
+    candidates = np.arange(rows, len(residual) - rows + 1)
+    jump = (
+        cumulative[candidates + rows] - 2.0 * cumulative[candidates] + cumulative[candidates - rows]
+    ) / rows
     square = 0.5 * rows * np.sum(jump**2, axis=1)
-    found: list[int] = []
+    points: list[int] = []
     for k in np.argsort(-square):
         if square[k] < priors.JUMPS:
             break
-        if all(abs(int(at[k]) - one) >= rows for one in found):
-            found.append(int(at[k]))
-        if len(found) > priors.MOST_WAVES:
+        if all(abs(int(candidates[k]) - one) >= rows for one in points):
+            points.append(int(candidates[k]))
+        if len(points) > priors.MOST_WAVES:
             break
-    return sorted(found)
+    return sorted(points)
 
 
-def _level_component(context: Context, frame: Frame, moments: Sequence[int]) -> Component:
+def _level_component(context: Context, frame: Frame, change_rows: Sequence[int]) -> Component:
     """One field from each moment (a row) to the next, along each axis of a frame."""
     time_s = context.track.time_s
-    edges = np.array([time_s[0], *time_s[list(moments)], time_s[-1]])
+    edges = np.array([time_s[0], *time_s[list(change_rows)], time_s[-1]])
     columns = frame_columns(context, frame, segments_between(time_s, edges))
     low, high = (np.array([np.log(one)]) for one in priors.COURSE_SIZES)
     unit = priors.COURSE_UNIT[frame]
     law = Sized(np.full(columns.width, unit), low, high)
-    lasting = float(time_s[-1] - time_s[0])
-    odds = float(np.log(priors.COURSE * _frame_probability(frame))) - lasting / priors.BETWEEN_S
-    odds += len(moments) * float(np.log(lasting / len(time_s) / priors.BETWEEN_S))
-    key = f"{frame} that changes {len(moments)} times from {edges[1]:.3f} s on"
-    return Component(key, frame, columns, law, odds, setting={"edges_s": tuple(edges.tolist())})
+    duration_s = float(time_s[-1] - time_s[0])
+    log_odds = (
+        float(np.log(priors.COURSE * _frame_probability(frame))) - duration_s / priors.BETWEEN_S
+    )
+    log_odds += len(change_rows) * float(np.log(duration_s / len(time_s) / priors.BETWEEN_S))
+    key = f"{frame} that changes {len(change_rows)} times from {edges[1]:.3f} s on"
+    return Component(key, frame, columns, law, log_odds, setting={"edges_s": tuple(edges.tolist())})
 
 
 def most_probable_states(
@@ -220,41 +234,45 @@ def most_probable_states(
     A piece that is on has a mean of its own, of one variance for all.
     """
     stay_on, stay_off = np.exp(-piece_s / priors.SPELL_S), np.exp(-piece_s / priors.BETWEEN_S)
-    move = np.log([[stay_off, 1.0 - stay_off], [1.0 - stay_on, stay_on]])
+    log_transition = np.log([[stay_off, 1.0 - stay_off], [1.0 - stay_on, stay_on]])
     variance = float(np.quantile(square / np.maximum(count, 1.0) ** 2, 0.99)) / 3.0
     on = np.zeros(len(square), dtype=bool)
     for _ in range(_ROUNDS):
         scale = 1.0 + count * variance
-        worth = 0.5 * square * variance / scale - 1.5 * np.log(scale)
-        before, on = on, _viterbi(worth, move)
-        if not on.any() or np.array_equal(before, on):
+        log_factors = 0.5 * square * variance / scale - 1.5 * np.log(scale)
+        previous, on = on, _viterbi(log_factors, log_transition)
+        if not on.any() or np.array_equal(previous, on):
             break
-        seen = square[on] / np.maximum(count[on], 1.0) ** 2 - 3.0 / np.maximum(count[on], 1.0)
-        variance = max(float(np.mean(seen)) / 3.0, 1e-12)
+        mean_square = square[on] / np.maximum(count[on], 1.0) ** 2 - 3.0 / np.maximum(
+            count[on], 1.0
+        )
+        variance = max(float(np.mean(mean_square)) / 3.0, 1e-12)
     states = on.astype(int)
-    return on, float(np.sum(move[states[:-1], states[1:]])) + float(move[0, states[0]])
+    return on, float(np.sum(log_transition[states[:-1], states[1:]])) + float(
+        log_transition[0, states[0]]
+    )
 
 
-def _viterbi(worth: Array, move: Array) -> NDArray[np.bool]:
+def _viterbi(log_factors: Array, log_transition: Array) -> NDArray[np.bool]:
     """The likeliest states of a chain that begins off; worth (n,): of being on, nats."""
-    score, back = np.array([0.0, -np.inf]), np.zeros((len(worth), 2), dtype=np.intp)
-    for k, nats in enumerate(worth):
-        through = score[:, None] + move
-        back[k] = np.argmax(through, axis=0)
-        score = np.max(through, axis=0) + np.array([0.0, nats])
-    states = np.zeros(len(worth), dtype=np.intp)
+    score, predecessor = np.array([0.0, -np.inf]), np.zeros((len(log_factors), 2), dtype=np.intp)
+    for k, nats in enumerate(log_factors):
+        candidates = score[:, None] + log_transition
+        predecessor[k] = np.argmax(candidates, axis=0)
+        score = np.max(candidates, axis=0) + np.array([0.0, nats])
+    states = np.zeros(len(log_factors), dtype=np.intp)
     state = int(np.argmax(score))
-    for k in range(len(worth) - 1, -1, -1):
-        states[k], state = state, int(back[k, state])
+    for k in range(len(log_factors) - 1, -1, -1):
+        states[k], state = state, int(predecessor[k, state])
     return states.astype(bool)
 
 
 def _interval_component(
     context: Context,
     frame: Frame,
-    spells: Sequence[tuple[int, int]],
+    intervals: Sequence[tuple[int, int]],
     log_odds: float,
-    most: int = priors.MOST_WAVES,
+    most_waves: int = priors.MOST_WAVES,
 ) -> Component:
     """A free course in each spell, rows from and to, along each axis of a frame.
 
@@ -262,30 +280,35 @@ def _interval_component(
     """
     time_s = context.track.time_s
     step_s = float(time_s[-1] - time_s[0]) / (len(time_s) - 1)
-    lasting = step_s * sum(b - a for a, b in spells)
-    shortest_s = max(priors.SPELL_PIECE_S, lasting / priors.MOST_WAVES)
-    counts = [int(np.clip(round(step_s * (b - a) / shortest_s), 1, most)) for a, b in spells]
-    order = [
-        np.arange(count) / (step_s * (b - a)) for (a, b), count in zip(spells, counts, strict=True)
+    total_s = step_s * sum(b - a for a, b in intervals)
+    shortest_s = max(priors.SPELL_PIECE_S, total_s / priors.MOST_WAVES)
+    counts = [
+        int(np.clip(round(step_s * (b - a) / shortest_s), 1, most_waves)) for a, b in intervals
     ]
-    waves = partial(_interval_cosines, len(time_s), tuple(spells), counts)
-    columns = in_frame(context, frame, waves, sum(counts))
-    law = IntervalLaw(np.repeat(np.concatenate(order), 3), priors.COURSE_UNIT[frame])
-    spans = tuple((float(time_s[a]), float(time_s[b - 1])) for a, b in spells)
+    frequencies = [
+        np.arange(count) / (step_s * (b - a))
+        for (a, b), count in zip(intervals, counts, strict=True)
+    ]
+    time_functions = partial(_interval_cosines, len(time_s), tuple(intervals), counts)
+    columns = in_frame(context, frame, time_functions, sum(counts))
+    law = IntervalLaw(np.repeat(np.concatenate(frequencies), 3), priors.COURSE_UNIT[frame])
+    spans = tuple((float(time_s[a]), float(time_s[b - 1])) for a, b in intervals)
     key = f"{frame} that is there from and to {spans} s"
-    odds = float(np.log(priors.COURSE * _frame_probability(frame))) + log_odds
-    return Component(key, frame, columns, law, odds, setting={"spans_s": spans})
+    log_prior = float(np.log(priors.COURSE * _frame_probability(frame))) + log_odds
+    return Component(key, frame, columns, law, log_prior, setting={"spans_s": spans})
 
 
-def _interval_cosines(rows: int, spells: Sequence[tuple[int, int]], counts: Sequence[int]) -> Array:
+def _interval_cosines(
+    rows: int, intervals: Sequence[tuple[int, int]], counts: Sequence[int]
+) -> Array:
     """(rows, sum of counts) half waves in each spell, from its mean on."""
-    out = np.zeros((rows, sum(counts)))
+    cosines = np.zeros((rows, sum(counts)))
     first = 0
-    for (a, b), count in zip(spells, counts, strict=True):
+    for (a, b), count in zip(intervals, counts, strict=True):
         phase = np.pi * (np.arange(b - a)[:, None] + 0.5) / (b - a)
-        out[a:b, first : first + count] = np.cos(phase * np.arange(count))
+        cosines[a:b, first : first + count] = np.cos(phase * np.arange(count))
         first += count
-    return out
+    return cosines
 
 
 def _frame_probability(frame: Frame) -> float:
