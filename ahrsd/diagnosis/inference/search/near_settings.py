@@ -1,10 +1,10 @@
-"""What is linear in an effect's setting, near where it is: onset, scale, lateness, memory.
+"""The slopes of an effect's columns in its setting: onset, scale, angle, lateness, memory.
 
     columns(s + d) w = columns(s) w + sum_i d_i (d columns / d s_i) w
 
-A setting is chosen and not averaged over, and coefficients are known to what it leaves open as
-well: those of a course that begins earlier are smaller.  With the slopes beside it as columns of
-their own each coefficient has the deviation that it has whatever the setting is nearby.
+A setting is chosen and not averaged over, but its uncertainty is a part of the coefficients': if a
+cause begins earlier, its coefficients are smaller.  With the slopes as further columns, each
+coefficient has the deviation that is marginal over the settings nearby.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from ahrsd.diagnosis.inference.components.component import MOMENTS, Component, F
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
-#: changes of which slopes are made: part of the recording, part of a scale, degrees, s, part of
-#: what may be remembered
+#: changes of a setting for its slopes: of an onset as a share of the recording, of a scale as a
+#: share of it, of an angle in degrees, of a lateness in s, of a memory as a share of the largest
 _ONSET, _SCALE, _TURN_DEG, _LATE_S, _MEMORY = 1 / 2000, 0.02, 1.0, 0.02, 0.01
 
 
 def perturbed_settings(one: Component, context: Context) -> dict[str, Setting]:
-    """The setting with each of its numbers changed a little."""
+    """The setting with each of its numbers changed a little, by what is changed."""
     setting, perturbed = one.setting, dict[str, Setting]()
     for name in MOMENTS:
         if setting.get(name) is not None:
@@ -50,9 +50,10 @@ def perturbed_settings(one: Component, context: Context) -> dict[str, Setting]:
 def with_setting_slopes(
     one: Component, context: Context, value: Array, perturbed: Mapping[str, Setting]
 ) -> Component | None:
-    """A component of the library with its slopes at these coefficients behind its own columns.
+    """An effect with its slopes at these coefficients as further columns, behind its own.
 
-    Coefficients of slopes are in changes of `nearby`; None where it has nothing to change.
+    Coefficients of slopes are in units of the changes in `perturbed`.  None if that is empty or the
+    component is not in the library.
     """
     if one.row is None or not perturbed:
         return None
@@ -69,7 +70,7 @@ def with_setting_slopes(
 def _with_slopes(
     own: Array | None, here: Array | None, there: list[Array | None], value: Array
 ) -> Array | None:
-    """(N, 3, p + k) columns of one sensor and what they change by."""
+    """(N, 3, p + k) columns of one sensor and their slopes."""
     if own is None or here is None:
         return None
     slopes = [(each - here) @ value for each in there if each is not None]

@@ -1,10 +1,10 @@
-"""What iron has from before the recording, along each axis, sought beside a model.
+"""The memory that iron has from before the recording, along each axis, fitted given a model.
 
-The middle of a play operator, or what is behind by when the recording begins (setting `memory`), is
-no coefficient: it is in the columns.  Near where it is sought its change is linear, and the
-likeliest change beside the coefficients is one step; where it is not (a play that has met its end)
-each axis is moved by itself.  All of it in the sensor's own noise: what is not yet explained is
-noise still.
+The middle of a play operator, or the lag of a slow magnetisation when the recording begins (setting
+`memory`), is not a coefficient: it is in the columns.  Near its present value their change is
+linear, and one step leads to the memory of the largest posterior.  Where it is not linear (a play
+that has reached its end) each axis is changed separately.  All of it is done at the sensor's own
+noise: at a higher noise level, what is not yet explained still counts as noise.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from ahrsd.diagnosis.inference.likelihood.candidates import Beside
 from ahrsd.diagnosis.inference.search.near_settings import perturbed_settings, with_setting_slopes
 from ahrsd.samples import Array
 
-#: digits to which it is sought, of what may be remembered
+#: digits to which the memory is rounded, relative to the largest one
 _DIGITS = 3
 
 
 def memory_settings(scan: Beside, one: Component, round_: int) -> list[Setting]:
-    """Settings of an effect with another memory, nearer by the round; none where it has none."""
+    """Settings of an effect with another memory, nearer in each round; none if it has no memory."""
     row = one.row
     if row is None or not row.remembers:
         return []
@@ -37,7 +37,7 @@ def memory_settings(scan: Beside, one: Component, round_: int) -> list[Setting]:
 
 
 def _memory_step(scan: Beside, one: Component, memory: Array) -> Array:
-    """(3,) to the likeliest memory as it is seen from here."""
+    """(3,) the linear step to the most probable memory."""
     context = scan.made.context
     perturbed = {
         k: each for k, each in perturbed_settings(one, context).items() if k.startswith("memory")

@@ -1,4 +1,4 @@
-"""What a search at one point may choose from: the library's settings there, courses, forms."""
+"""What a search at one point may choose from: the library's settings, free processes, forms."""
 
 from __future__ import annotations
 
@@ -33,14 +33,17 @@ from ahrsd.diagnosis.inference.search.remembered import memory_settings
 from ahrsd.diagnosis.inference.search.switching_sources import find_switching_sources
 
 FREE_PROCESSES = ("free sensor", "free world", "free gyro")
-#: columns that are made before the first of them pass the filter
+#: columns that are computed before they pass the filter as a batch
 _BATCH_COLUMNS = 500
 
 
 def search_at_point(
     fitted: Judged, library: Mapping[str, Effect], effects: Sequence[Component], was_real: bool
 ) -> tuple[Hypotheses, Space, Hypothesis]:
-    """The likeliest set at a richest model, searched from what is known and from nothing."""
+    """The most probable set at a richest model, searched from known effects and from nothing.
+
+    was_real: whether the set in which the effects were found had the ordinary remainder
+    """
     base = fitted.base
     all_sets, space = build_search_space(fitted, library, effects)
     made = all_sets.made
@@ -65,7 +68,7 @@ def search_at_point(
 
 
 def _add_switching_sources(all_sets: Hypotheses, space: Space, hypothesis: Hypothesis) -> list[str]:
-    """Keys of sources that switch, as a set leaves them, put among what may be in one."""
+    """Keys of the switching sources in a set's residual, which are added to the space."""
     sources = find_switching_sources(all_sets, hypothesis)
     all_sets.made.add(sources)
     space.sources.extend(one.key for one in sources if one.key not in space.sources)
@@ -75,11 +78,11 @@ def _add_switching_sources(all_sets: Hypotheses, space: Space, hypothesis: Hypot
 def _batches(
     parts: Iterable[tuple[str, list[Component]]],
 ) -> Iterator[list[tuple[str, list[Component]]]]:
-    """Effects together that have some hundred columns: few batches, and few columns at a time."""
+    """Effects in batches of some hundred columns, which limits both batches and memory."""
     batch: list[tuple[str, list[Component]]] = []
     for one in parts:
         batch.append(one)
-        if sum(each.width for _, found in batch for each in found) >= _BATCH_COLUMNS:
+        if sum(each.width for _, components in batch for each in components) >= _BATCH_COLUMNS:
             yield batch
             batch = []
     if batch:
@@ -89,18 +92,21 @@ def _batches(
 def _filter_library(
     made: Linearised, library: Mapping[str, Effect]
 ) -> tuple[dict[str, list[str]], list[Component]]:
-    """Keys of the library's components by effect, all passed; and those that hold the delay."""
+    """Keys of the library's components by effect, all passed through the filter.
+
+    Also the components that contain the delay; each is there with the delay projected out as well.
+    """
     delay = made.seen[LAG].component if LAG in made.seen else None
     containing_delay: list[Component] = []
     effects: dict[str, list[str]] = {}
     for batch in _batches(library_components(made.context, library)):
         components = []
         for identifier, parts in batch:
-            held = [] if delay is None or not holds(parts[0], delay) else parts
-            beside = [] if delay is None else [beyond(one, delay) for one in held]
-            effects[identifier] = [one.key for one in (*parts, *beside)]
-            components += [*parts, *beside]
-            containing_delay += held
+            containing = [] if delay is None or not holds(parts[0], delay) else parts
+            projected = [] if delay is None else [beyond(one, delay) for one in containing]
+            effects[identifier] = [one.key for one in (*parts, *projected)]
+            components += [*parts, *projected]
+            containing_delay += containing
         made.add(components)
         made.keep_lightly([one for _, parts in batch for one in parts])
     if delay is not None:
@@ -111,15 +117,15 @@ def _filter_library(
 def build_search_space(
     fitted: Judged, library: Mapping[str, Effect], accepted: Sequence[Component]
 ) -> tuple[Hypotheses, Space]:
-    """The sets at a richest model, none judged yet, and what they may be made of."""
+    """The sets at a richest model, none fitted yet, and what they may be made of."""
     base = fitted.base
     made, context = base.made.copied(), base.made.context
     effects, containing_delay = _filter_library(made, library)
     forms = {}
     for one in accepted:
-        listed = effects.setdefault(one.effect or one.key, [])
-        if one.key not in listed:
-            listed.append(one.key)
+        keys = effects.setdefault(one.effect or one.key, [])
+        if one.key not in keys:
+            keys.append(one.key)
         form = form_of(one, context, library)
         if form is not None:
             made.add([form])

@@ -1,18 +1,17 @@
-"""Sources that switch: one that comes and goes, and one that goes from level to level.
+"""Sources that switch: one that comes and goes, and one with a level that changes.
 
-Of the first there is nothing for most of the time, and for spells a field of its own.
+A source that switches on, hits, rings or passes, once or often, shows as bursts of seconds.  A
+Gaussian process in time over the whole recording is no model of that, and noise of any colour,
+whose level is constant in time, absorbs its evidence.  Here a two-state Markov chain says when the
+source is on.  The source is zero while it is off, and a free function of time while it is on:
 
-What switches now and then, hits, rings or passes, once or often, shows as bursts of seconds.  A
-course in time over the whole recording is no law of that, and beside noise of any colour, which is
-as loud all of the time, no evidence of it is left.  Here the time is a chain of two states, and
-while it is on the source is a free course:
-
-    x(t) = sum_k w_k cos(pi k (t - t0) / T) in a spell from t0 to t0 + T,  k from 0 on
+    x(t) = sum_k w_k cos(pi k (t - t0) / T) in an interval from t0 to t0 + T,  k = 0, 1, ...
     var w_k = size^2 / (1 + (k / T corner)^2)
 
-The other has levels of one size between moments at which it changes, which come at any time.
+The second kind has levels of one size between change points, which come at any time.
 
-States and moments are found in the residual of a set, and paid with their probability.
+States and change points are found in the residual of a set; their log probability is a part of the
+prior odds.
 """
 
 from __future__ import annotations
@@ -37,11 +36,11 @@ from ahrsd.diagnosis.where_and_when.locate import (
 )
 from ahrsd.samples import Array
 
-#: frames in which such a source is asked
+#: frames of such sources
 FRAMES: tuple[Frame, ...] = ("sensor", "world")
-#: rounds in which size and states are found of each other
+#: alternations between the size and the states of the chain
 _ROUNDS = 8
-#: half waves with which ends are sought, and steps to each side
+#: half waves of the trial components that refine an end, and steps tried to each side
 _END_WAVES, _END_STEPS = 3, 2
 
 
@@ -49,7 +48,7 @@ _END_WAVES, _END_STEPS = 3, 2
 class IntervalLaw:
     """psi: logarithms of the size, in `unit`, and of the corner, in half waves a second.
 
-    order (q,): half waves a second of each coefficient, 0 of a mean
+    order (q,): half waves a second of each coefficient, 0 for a mean
     """
 
     order: Array
@@ -95,7 +94,7 @@ class IntervalLaw:
 
 
 def find_switching_sources(all_sets: Hypotheses, hypothesis: Hypothesis) -> list[Component]:
-    """What a set leaves as sources that switch, in each frame; none where nothing does."""
+    """Components for the switching sources in a set's residual, in each frame; may be empty."""
     made = all_sets.made
     residual = made.left_by(hypothesis.keys, hypothesis.at) / made.point.loud.amplitude[:, None]
     residual = np.where(made.point.filtered.used[:, None], residual, 0.0)
@@ -103,31 +102,33 @@ def find_switching_sources(all_sets: Hypotheses, hypothesis: Hypothesis) -> list
     intervals, log_odds = _find_intervals(
         residual, made.point.filtered.used, rows, made.point.problem.rate_hz
     )
-    # of what is often alike noise of a colour would leave nothing
+    # coloured noise would absorb a source that often has the same form: use the sensor's noise
     sensor_noise = replace(
         hypothesis.at, log_noise=np.full(len(hypothesis.at.log_noise), hypothesis.at.log_noise[-1])
     )
     components: list[Component] = []
     if intervals:
         intervals = _refine_interval_ends(all_sets, hypothesis, sensor_noise, intervals, rows)
-        log_odds -= (
-            2 * len(intervals) * float(np.log(rows))
-        )  # ends are sought to a row, not a piece
+        # the ends are fitted to a row, not to a piece
+        log_odds -= 2 * len(intervals) * float(np.log(rows))
         components += [
             _interval_component(made.context, frame, intervals, log_odds) for frame in FRAMES
         ]
     residual = made.left_by(hypothesis.keys, sensor_noise) / made.point.loud.amplitude[:, None]
     residual = np.where(made.point.filtered.used[:, None], residual, 0.0)
-    moments = change_points(residual, 2 * rows)
-    if priors.CHANGES <= len(moments) <= priors.MOST_WAVES:
-        components += [_level_component(made.context, frame, moments) for frame in FRAMES]
+    change_rows = change_points(residual, 2 * rows)
+    if priors.CHANGES <= len(change_rows) <= priors.MOST_WAVES:
+        components += [_level_component(made.context, frame, change_rows) for frame in FRAMES]
     return components
 
 
 def _find_intervals(
     residual: Array, used: NDArray[np.bool], rows: int, rate_hz: float
 ) -> tuple[list[tuple[int, int]], float]:
-    """Rows from and to which a source is on, of a residual of unit variance, and their odds."""
+    """Intervals (first row, row behind the last) in which a source is on, and their log odds.
+
+    residual: (N, 3) of unit variance
+    """
     starts = np.arange(0, len(residual), rows)
     sums = np.add.reduceat(residual, starts)
     count = np.add.reduceat(used.astype(float), starts)
@@ -145,9 +146,9 @@ def _refine_interval_ends(
     intervals: list[tuple[int, int]],
     rows: int,
 ) -> list[tuple[int, int]]:
-    """Spells with their ends where the readings are likeliest.
+    """The intervals with their ends at the largest evidence.
 
-    A filter follows what stays, and swings back behind it: a residual has other ends.
+    A filter follows a constant field, and swings back behind it: the residual has other ends.
     """
     made, count = all_sets.made, len(all_sets.made.context.track)
     scan = beside(made, hypothesis.keys, at)
@@ -163,7 +164,7 @@ def _refine_interval_ends(
                     one = _interval_component(made.context, "sensor", [(a, b)], 0.0, _END_WAVES)
                     interval_by_key[one.key] = number, (a, b)
                     candidates.append(one)
-            trial = made.copied()  # what was tried ends with its round
+            trial = made.copied()  # the trial components of a round are not kept
             trial.add(candidates)
             worth = replace(scan, made=trial).worth(list(interval_by_key))
             best: dict[int, float] = {}
@@ -175,7 +176,7 @@ def _refine_interval_ends(
 
 
 def _merge_overlapping(intervals: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """In their order, and those that overlap as one."""
+    """Sorted intervals; those that overlap are merged."""
     merged: list[tuple[int, int]] = []
     for a, b in sorted(intervals):
         if merged and a <= merged[-1][1]:
@@ -186,29 +187,27 @@ def _merge_overlapping(intervals: Sequence[tuple[int, int]]) -> list[tuple[int, 
 
 
 def change_points(residual: Array, rows: int) -> list[int]:
-    """Rows at which the mean of a residual of unit variance (N, 3) jumps.
+    """Rows at which the mean of a residual (N, 3) of unit variance jumps.
 
-    rows: before and behind, of which means are held against each other
+    rows: number of rows before and behind whose means are compared
     """
     cumulative = np.vstack([np.zeros(3), np.cumsum(residual, axis=0)])
-    candidates = np.arange(rows, len(residual) - rows + 1)
-    jump = (
-        cumulative[candidates + rows] - 2.0 * cumulative[candidates] + cumulative[candidates - rows]
-    ) / rows
+    middle = np.arange(rows, len(residual) - rows + 1)
+    jump = (cumulative[middle + rows] - 2.0 * cumulative[middle] + cumulative[middle - rows]) / rows
     square = 0.5 * rows * np.sum(jump**2, axis=1)
     points: list[int] = []
     for k in np.argsort(-square):
         if square[k] < priors.JUMPS:
             break
-        if all(abs(int(candidates[k]) - one) >= rows for one in points):
-            points.append(int(candidates[k]))
+        if all(abs(int(middle[k]) - one) >= rows for one in points):
+            points.append(int(middle[k]))
         if len(points) > priors.MOST_WAVES:
             break
     return sorted(points)
 
 
 def _level_component(context: Context, frame: Frame, change_rows: Sequence[int]) -> Component:
-    """One field from each moment (a row) to the next, along each axis of a frame."""
+    """A constant field between consecutive change points (rows), along each axis of a frame."""
     time_s = context.track.time_s
     edges = np.array([time_s[0], *time_s[list(change_rows)], time_s[-1]])
     columns = frame_columns(context, frame, segments_between(time_s, edges))
@@ -227,11 +226,11 @@ def _level_component(context: Context, frame: Frame, change_rows: Sequence[int])
 def most_probable_states(
     square: Array, count: Array, piece_s: float
 ) -> tuple[NDArray[np.bool], float]:
-    """Which pieces of time a source is on in, and the log probability of such a chain.
+    """The pieces of time in which a source is on, and the log probability of that chain.
 
-    square (n,): of the sum of a piece's rows, each of three numbers of unit variance
-    count (n,): rows of each
-    A piece that is on has a mean of its own, of one variance for all.
+    square (n,): squared norm of the sum of a piece's rows, each of three numbers of unit variance
+    count (n,): rows of each piece
+    A piece that is on has a mean of its own; all these means have one variance.
     """
     stay_on, stay_off = np.exp(-piece_s / priors.SPELL_S), np.exp(-piece_s / priors.BETWEEN_S)
     log_transition = np.log([[stay_off, 1.0 - stay_off], [1.0 - stay_on, stay_on]])
@@ -254,12 +253,15 @@ def most_probable_states(
 
 
 def _viterbi(log_factors: Array, log_transition: Array) -> NDArray[np.bool]:
-    """The likeliest states of a chain that begins off; worth (n,): of being on, nats."""
+    """The most probable states of a chain that starts off.
+
+    log_factors (n,): evidence that each piece is on, nats;  log_transition (2, 2): from, to
+    """
     score, predecessor = np.array([0.0, -np.inf]), np.zeros((len(log_factors), 2), dtype=np.intp)
     for k, nats in enumerate(log_factors):
-        candidates = score[:, None] + log_transition
-        predecessor[k] = np.argmax(candidates, axis=0)
-        score = np.max(candidates, axis=0) + np.array([0.0, nats])
+        transitions = score[:, None] + log_transition
+        predecessor[k] = np.argmax(transitions, axis=0)
+        score = np.max(transitions, axis=0) + np.array([0.0, nats])
     states = np.zeros(len(log_factors), dtype=np.intp)
     state = int(np.argmax(score))
     for k in range(len(log_factors) - 1, -1, -1):
@@ -274,9 +276,9 @@ def _interval_component(
     log_odds: float,
     most_waves: int = priors.MOST_WAVES,
 ) -> Component:
-    """A free course in each spell, rows from and to, along each axis of a frame.
+    """A free function of time in each interval (first row, row behind the last), on each axis.
 
-    most: half waves of one
+    most_waves: of one interval
     """
     time_s = context.track.time_s
     step_s = float(time_s[-1] - time_s[0]) / (len(time_s) - 1)
@@ -301,7 +303,7 @@ def _interval_component(
 def _interval_cosines(
     rows: int, intervals: Sequence[tuple[int, int]], counts: Sequence[int]
 ) -> Array:
-    """(rows, sum of counts) half waves in each spell, from its mean on."""
+    """(rows, sum of counts) half waves in each interval, beginning with its mean."""
     cosines = np.zeros((rows, sum(counts)))
     first = 0
     for (a, b), count in zip(intervals, counts, strict=True):
@@ -312,5 +314,5 @@ def _interval_cosines(
 
 
 def _frame_probability(frame: Frame) -> float:
-    """How often a source that switches is of a frame."""
+    """Prior probability of the frame of a switching source."""
     return priors.SWITCHES_OUTSIDE if frame == "world" else 1.0 - priors.SWITCHES_OUTSIDE
