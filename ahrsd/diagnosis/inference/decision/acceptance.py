@@ -47,9 +47,9 @@ def accept_members(
     best = _try_field_by_heading(all_sets, space, best)
     best = _merge_steps(all_sets, space, best)
     best, rivals = _drop_unsupported(all_sets, space, best)
-    likelier = _choose_step_kinds(all_sets, space, best)
-    if likelier is not best:
-        best, rivals = _drop_unsupported(all_sets, space, likelier)
+    improved = _choose_step_kinds(all_sets, space, best)
+    if improved is not best:
+        best, rivals = _drop_unsupported(all_sets, space, improved)
     best, rivals = _test_against_alternatives(all_sets, space, best, rivals)
     best, rivals = _test_constant_coefficients(all_sets, space, best, rivals)
     return _drop_parts_of_unknown_source(all_sets, space, best, rivals)
@@ -120,10 +120,10 @@ def _choose_step_kinds(all_sets: Hypotheses, space: Space, best: Hypothesis) -> 
             for key in library_members(all_sets, best)
             for other in step_alternatives(all_sets, space, key)
         ]
-        likelier = all_sets.most_probable(best, alternatives)
-        if likelier is best:
+        improved = all_sets.most_probable(best, alternatives)
+        if improved is best:
             return best
-        best = likelier
+        best = improved
 
 
 def _is_mostly_form(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
@@ -158,9 +158,9 @@ def _drop_cancelling_pair(
     Steps of the field and of the iron at one time cancel: without one of them the other's
     contribution is no longer compensated, so each of them looks certain.
     """
-    moments = {key: all_sets.component(key).moments_s for key in required}
-    for first, last in itertools.combinations(sorted(key for key in required if moments[key]), 2):
-        separation_s = np.abs(np.subtract.outer(moments[first], moments[last]))
+    times_s = {key: all_sets.component(key).moments_s for key in required}
+    for first, last in itertools.combinations(sorted(key for key in required if times_s[key]), 2):
+        separation_s = np.abs(np.subtract.outer(times_s[first], times_s[last]))
         if np.min(separation_s) > priors.APPROACH_S:
             continue
         least = best.score - required[first] - required[last]
@@ -229,19 +229,22 @@ def _test_constant_coefficients(
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
     """Add a free factor to each effect whose coefficient varies: it stands in for another source.
 
-    Each factor is added once: one that is then dropped for lack of support is not tried again.
+    Each effect is given one factor at most.  If that is dropped for lack of support, no factor of
+    the effect is tried again.
     """
     tried_factors = set[str]()
     while True:
         required = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.FORM_ODDS
         extended, made = best, all_sets.made
         for key in library_members(all_sets, best):
-            one = all_sets.component(key)
+            effect = all_sets.component(key)
             # the phase of a quick cause is the integral of its column, and drifts with its errors
-            phase_from_column = one.row is not None and one.row.quick and "covariate" in one.setting
+            phase_from_column = (
+                effect.row is not None and effect.row.quick and "covariate" in effect.setting
+            )
             if phase_from_column or not tried_factors.isdisjoint(form_keys(key)):
                 continue
-            factors = varying(one, contribution_of(all_sets, best, key)[0], made.context)
+            factors = varying(effect, contribution_of(all_sets, best, key)[0], made.context)
             made.add(factors)
             for factor in factors:
                 least = max(best.score + required, extended.score)

@@ -85,8 +85,8 @@ def decide(
     )
     if repeated_kinds and not unexplained.detected:
         unknown, unexplained = changing_source(all_sets, best, repeated_kinds[0], odds)
-    surest = max([*odds.values(), unexplained.evidence_nats], default=0.0)
-    results = tuple(findings), tuple(terms), unexplained, surest
+    largest_nats = max([*odds.values(), unexplained.evidence_nats], default=0.0)
+    results = tuple(findings), tuple(terms), unexplained, largest_nats
     return Answer(best, tuple(keys), unknown, rivals, *results)
 
 

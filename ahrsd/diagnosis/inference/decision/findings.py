@@ -68,9 +68,9 @@ def _deviation_over_setting(
 
     A member with a form component, such as a step that a hand makes, has no sharper setting.
     """
-    one, made = all_sets.component(key), all_sets.made
-    perturbed = {} if key in all_sets.forms else perturbed_settings(one, made.context)
-    with_slopes = with_setting_slopes(one, made.context, value, perturbed)
+    member, made = all_sets.component(key), all_sets.made
+    perturbed = {} if key in all_sets.forms else perturbed_settings(member, made.context)
+    with_slopes = with_setting_slopes(member, made.context, value, perturbed)
     if with_slopes is None:
         return np.zeros(len(value))
     reduced = all_sets.judge(best.names - {key}, best)
@@ -121,9 +121,11 @@ def _effect_probabilities(
     worth = scan.worth([*dict.fromkeys([*candidates, key])])
     log_odds: dict[str, float] = {}
     for k, nats in worth.items():
-        one = all_sets.component(k)
-        effect = one.effect or k
-        log_odds[effect] = float(np.logaddexp(log_odds.get(effect, -np.inf), nats + one.prior))
+        component = all_sets.component(k)
+        effect = component.effect or k
+        log_odds[effect] = float(
+            np.logaddexp(log_odds.get(effect, -np.inf), nats + component.prior)
+        )
     own = member.effect or key
     log_odds[own] = max(log_odds[own], worth[key] + member.prior)
     rival = max((k for k in worth if k != key), key=lambda k: worth[k], default=key)
@@ -153,8 +155,8 @@ def _effect_probabilities(
 
 def _locate(all_sets: Hypotheses, best: Hypothesis, key: str, frame: str) -> Where:
     """When, on which axes and in which regime a member acts, described in a frame."""
-    one, track = all_sets.component(key), all_sets.made.context.track
-    return where_of(track, contribution_of(all_sets, best, key)[0], one.setting, frame)
+    member, track = all_sets.component(key), all_sets.made.context.track
+    return where_of(track, contribution_of(all_sets, best, key)[0], member.setting, frame)
 
 
 def drift_finding(

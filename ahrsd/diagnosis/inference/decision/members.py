@@ -32,11 +32,11 @@ def coefficients(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Arra
 
 def contribution_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, str]:
     """(N, 3) what a member adds to the readings, and its unit: gauss, or rad/s for a gyro."""
-    one, track = all_sets.component(key), all_sets.made.context.track
+    component, track = all_sets.component(key), all_sets.made.context.track
     value, _ = coefficients(all_sets, best, key)
-    matrix = one.columns.mag if one.columns.on_mag else one.columns.gyro
+    matrix = component.columns.mag if component.columns.on_mag else component.columns.gyro
     contribution = np.zeros((len(track), 3)) if matrix is None else np.asarray(matrix @ value)
-    return contribution, "gauss" if one.columns.on_mag else "rad/s"
+    return contribution, "gauss" if component.columns.on_mag else "rad/s"
 
 
 def size_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
@@ -45,12 +45,12 @@ def size_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     Of an effect: the largest coefficient less two deviations.  Where the motion hardly shows a
     coefficient, a large value of it means nothing.
     """
-    one = all_sets.component(key)
-    if one.effect is not None and isinstance(one.law, Sized):
+    component = all_sets.component(key)
+    if component.effect is not None and isinstance(component.law, Sized):
         value, deviation = coefficients(all_sets, best, key)
-        return float(np.max(np.maximum(np.abs(value) - 2.0 * deviation, 0.0) / one.law.scale))
+        return float(np.max(np.maximum(np.abs(value) - 2.0 * deviation, 0.0) / component.law.scale))
     psi = all_sets.psi_of(best)[key]
-    return float(np.exp(psi[0])) * float(getattr(one.law, "unit", 1.0))
+    return float(np.exp(psi[0])) * float(getattr(component.law, "unit", 1.0))
 
 
 def effects_of(all_sets: Hypotheses, best: Hypothesis) -> Sequence[str]:
@@ -68,20 +68,22 @@ def is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
     """Whether a member is no larger than what real recordings ordinarily have of its kind."""
     if key == LAG or not all_sets.is_real(best.names):
         return False
-    one = all_sets.component(key)
-    if one.jumps and _is_place_change(all_sets, key):
+    component = all_sets.component(key)
+    if component.jumps and _is_place_change(all_sets, key):
         return True
-    ordinary_size = priors.ORDINARY_COURSE.get(one.frame, 0.0)
-    return size_of(all_sets, best, key) < (ordinary_size if one.row is None else one.row.ordinary)
+    ordinary_size = priors.ORDINARY_COURSE.get(component.frame, 0.0)
+    return size_of(all_sets, best, key) < (
+        ordinary_size if component.row is None else component.row.ordinary
+    )
 
 
 def _is_place_change(all_sets: Hypotheses, key: str) -> bool:
     """Whether a step of the field is the sensor lifted off a place or put down on one."""
-    one, recorded = all_sets.component(key), all_sets.made.point.problem.recorded
+    component, recorded = all_sets.component(key), all_sets.made.point.problem.recorded
     intervals = still_spells(recorded.time_s, recorded.gyro_b_rad_s)
-    if not intervals or one.frame != "world":
+    if not intervals or component.frame != "world":
         return False
-    separation_s = np.abs(np.ravel(intervals)[:, None] - one.moments_s)
+    separation_s = np.abs(np.ravel(intervals)[:, None] - component.moments_s)
     return bool(np.min(separation_s) < 2.0 * priors.TRANSITION_S)
 
 

@@ -40,7 +40,7 @@ def largest_unexplained(
         if key in space.courses:
             return (key,), _describe_free_process(all_sets, best, key, odds[key])
         scaled_effects = [
-            name for name in library_members(all_sets, best) if key in form_keys(name)
+            effect for effect in library_members(all_sets, best) if key in form_keys(effect)
         ]
         return (key, *scaled_effects), _describe_members(
             all_sets, best, (key, *scaled_effects), odds[key]
@@ -62,13 +62,13 @@ def changing_source(
 ) -> tuple[tuple[str, ...], Unexplained]:
     """A source that goes in steps: its levels between the changes, along its direction."""
     keys = [key for key in sorted(best.names) if all_sets.component(key).effect == kind]
-    moments = sorted(
+    events = sorted(
         (time_s, sign, key)
         for key in keys
         for time_s, sign in zip(all_sets.component(key).moments_s, (1.0, -1.0), strict=False)
     )
-    changes = np.array([sign * coefficients(all_sets, best, key)[0] for _, sign, key in moments])
-    onsets = [time_s for time_s, _, _ in moments]
+    changes = np.array([sign * coefficients(all_sets, best, key)[0] for _, sign, key in events])
+    onsets = [time_s for time_s, _, _ in events]
     time_s = all_sets.made.context.track.time_s
     at = np.linspace(time_s[0], time_s[-1], _TIMES)
     levels = np.vstack([np.zeros(3), np.cumsum(changes, axis=0)])
@@ -123,7 +123,7 @@ def _describe_free_process(
     all_sets: Hypotheses, best: Hypothesis, key: str, odds: float
 ) -> Unexplained:
     """A free process in time: its frame, its direction and its values."""
-    one, time_s = all_sets.component(key), all_sets.made.context.track.time_s
+    component, time_s = all_sets.component(key), all_sets.made.context.track.time_s
     modes, mode_deviation = (part.reshape(-1, 3) for part in coefficients(all_sets, best, key))
     edges = np.linspace(time_s[0], time_s[-1], _TIMES + 1)
     at = (edges[1:] + edges[:-1]) / 2
@@ -134,20 +134,20 @@ def _describe_free_process(
     deviation = np.sqrt(np.mean(cosines**2 @ mode_deviation**2, axis=1))
     intervals = departures(edges, values, deviation)
     spans = intervals or [(float(time_s[0]), float(time_s[-1]))]
-    return _describe_values(at, values, one.frame, odds, tuple(spans))
+    return _describe_values(at, values, component.frame, odds, tuple(spans))
 
 
 def _describe_members(
     all_sets: Hypotheses, best: Hypothesis, keys: Sequence[str], odds: float
 ) -> Unexplained:
     """What members explain together, whatever their law, as a function of time in their frame."""
-    one, context = all_sets.component(keys[0]), all_sets.made.context
+    component, context = all_sets.component(keys[0]), all_sets.made.context
     contribution = sum(contribution_of(all_sets, best, key)[0] for key in keys)
     in_frame = np.einsum(
-        "nia,ni->na", unit_columns(context, cast("Frame", one.frame)), contribution
+        "nia,ni->na", unit_columns(context, cast("Frame", component.frame)), contribution
     )
     time_s = context.track.time_s
-    spans = one.setting.get("spans_s", ())
+    spans = component.setting.get("spans_s", ())
     within = [np.linspace(a, b, max(_LEAST_TIMES, _TIMES // len(spans))) for a, b in spans]
     at = np.unique(np.concatenate([np.linspace(time_s[0], time_s[-1], _TIMES), *within]))
 
@@ -155,12 +155,12 @@ def _describe_members(
         return np.column_stack([np.interp(times_s, time_s, column) for column in in_frame.T])
 
     spans = spans or ((float(time_s[0]), float(time_s[-1])),)
-    if "edges_s" in one.setting:  # the intervals in which its level is not the usual one
-        edges = np.array(one.setting["edges_s"])
+    if "edges_s" in component.setting:  # the intervals in which its level is not the usual one
+        edges = np.array(component.setting["edges_s"])
         levels = interpolated((edges[1:] + edges[:-1]) / 2)
         deviation = float(np.max(coefficients(all_sets, best, keys[0])[1]))
         spans = tuple(departures(edges, levels, np.full(len(levels), deviation)))
-    return _describe_values(at, interpolated(at), one.frame, odds, spans)
+    return _describe_values(at, interpolated(at), component.frame, odds, spans)
 
 
 def _describe_values(

@@ -48,7 +48,7 @@ def delay_probabilities(
             nats_of_half += float(np.log(priors.ORDINARY_LAG_S / sigma_s))
             nats[row.identifier] = nats_of_half + float(np.log(priors.HALF_STEP))
     total = np.logaddexp.reduce(list(nats.values()))
-    probabilities = {name: float(np.exp(one - total)) for name, one in nats.items()}
+    probabilities = {identifier: float(np.exp(one - total)) for identifier, one in nats.items()}
     return dict(sorted(probabilities.items(), key=lambda item: -item[1]))
 
 

@@ -54,8 +54,8 @@ class Hypothesis:
 
         What only one of the two models explains does not count as noise then.
         """
-        quiet = np.minimum(self.at.log_noise, other.at.log_noise)
-        return replace(other.at, log_noise=quiet)
+        lower_noise = np.minimum(self.at.log_noise, other.at.log_noise)
+        return replace(other.at, log_noise=lower_noise)
 
 
 @dataclass(eq=False)
@@ -221,13 +221,13 @@ class Hypotheses:
         nats, values = 0.0, by_key(self.made, keys, at)
         deviations, begin = by_key(self.made, keys, replace(at, mean=at.deviation)), 0
         for key in keys:
-            one = self.component(key)
-            psi = at.psi[begin : begin + len(one.law.start)]
+            component = self.component(key)
+            psi = at.psi[begin : begin + len(component.law.start)]
             begin += len(psi)
-            if one.row is None or key == LAG:
+            if component.row is None or key == LAG:
                 continue
-            least = np.array([parameter.least for parameter in one.row.parameters])
-            prior_deviation = np.exp(0.5 * one.law.log_variance(psi))
+            least = np.array([parameter.least for parameter in component.row.parameters])
+            prior_deviation = np.exp(0.5 * component.law.log_variance(psi))
             above = log_ndtr((values[key] - least) / deviations[key]) - log_ndtr(
                 -least / prior_deviation
             )
@@ -309,10 +309,10 @@ def exchange_effects(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hy
             for base in bases
             for key in rank_candidates(all_sets, space, base, best)
         ]
-        likelier = all_sets.most_probable(best, exchanged)
-        if likelier is best:
+        improved = all_sets.most_probable(best, exchanged)
+        if improved is best:
             break
-        best = likelier
+        best = improved
     return best
 
 
@@ -321,18 +321,18 @@ def step_alternatives(all_sets: Hypotheses, space: Space, key: str) -> list[str]
 
     A scan has no forms: it may put two kinds hundreds of nats apart whose sets differ by one.
     """
-    own = all_sets.component(key)
-    if key not in all_sets.forms or not own.jumps or not own.moments_s:
+    step = all_sets.component(key)
+    if key not in all_sets.forms or not step.jumps or not step.moments_s:
         return []
-    if len(own.moments_s) == 1:
-        _add_candidates(all_sets, space, space.steps_at(own.moments_s[0]))
+    if len(step.moments_s) == 1:
+        _add_candidates(all_sets, space, space.steps_at(step.moments_s[0]))
     candidates = [all_sets.component(k) for keys in space.effects.values() for k in keys]
-    others = [one for one in candidates if one.jumps and one.effect != own.effect]
-    others = [one for one in others if len(one.moments_s) == len(own.moments_s)]
+    others = [one for one in candidates if one.jumps and one.effect != step.effect]
+    others = [one for one in others if len(one.moments_s) == len(step.moments_s)]
     return [
         register_candidate(all_sets, space, one.key)
         for one in others
-        if np.allclose(one.moments_s, own.moments_s, rtol=0.0, atol=priors.SAME_MOMENT_S)
+        if np.allclose(one.moments_s, step.moments_s, rtol=0.0, atol=priors.SAME_MOMENT_S)
     ]
 
 
@@ -416,9 +416,11 @@ def sets_with_merged_steps(all_sets: Hypotheses, space: Space, members: Names) -
     return out
 
 
-def _begins_near(one: Component, moments_s: Sequence[float]) -> bool:
+def _begins_near(component: Component, moments_s: Sequence[float]) -> bool:
     """Whether a component begins within `APPROACH_S` of one of these times."""
-    return any(abs(one.moments_s[0] - moment_s) <= priors.APPROACH_S for moment_s in moments_s)
+    return any(
+        abs(component.moments_s[0] - moment_s) <= priors.APPROACH_S for moment_s in moments_s
+    )
 
 
 def _propose_steps(all_sets: Hypotheses, space: Space, current: Hypothesis) -> None:
@@ -489,10 +491,10 @@ def rank_candidates(
     worth = scan.worth(candidates)
     best: dict[str, tuple[float, str]] = {}
     for key, nats in worth.items():
-        one = all_sets.component(key)
-        log_odds = nats + one.prior
-        if log_odds > best.get(one.effect or key, (-np.inf, ""))[0]:
-            best[one.effect or key] = (log_odds, key)
+        component = all_sets.component(key)
+        log_odds = nats + component.prior
+        if log_odds > best.get(component.effect or key, (-np.inf, ""))[0]:
+            best[component.effect or key] = (log_odds, key)
     ranked = sorted(best.values(), reverse=True)[:MOST_CANDIDATES]
     return [
         refine_candidate(all_sets, space, scan, key) for log_odds, key in ranked if log_odds > 0.0
@@ -515,21 +517,21 @@ def _changing_sensors(all_sets: Hypotheses, base: Names) -> set[str]:
 
 def _step_sensor(all_sets: Hypotheses, key: str) -> str:
     """The sensor on which a candidate is a step; empty if it is no step."""
-    one = all_sets.component(key)
-    if one.row is None or not one.row.recurs:
+    component = all_sets.component(key)
+    if component.row is None or not component.row.recurs:
         return ""
-    return "magnetometer" if one.columns.on_mag else "gyro"
+    return "magnetometer" if component.columns.on_mag else "gyro"
 
 
 def _is_near_same_effect(all_sets: Hypotheses, base: Names, key: str) -> bool:
     """Whether a set has the same effect so near in time that the two are one."""
-    one = all_sets.component(key)
+    candidate = all_sets.component(key)
     others = [all_sets.component(other) for other in base]
     return any(
-        other.effect == one.effect and abs(there_s - here_s) < priors.TRANSITION_S
+        other.effect == candidate.effect and abs(there_s - here_s) < priors.TRANSITION_S
         for other in others
         for there_s in other.moments_s
-        for here_s in one.moments_s
+        for here_s in candidate.moments_s
     )
 
 

@@ -25,9 +25,9 @@ from ahrsd.samples import Array
 _ONSET, _SCALE, _TURN_DEG, _LATE_S, _MEMORY = 1 / 2000, 0.02, 1.0, 0.02, 0.01
 
 
-def perturbed_settings(one: Component, context: Context) -> dict[str, Setting]:
+def perturbed_settings(component: Component, context: Context) -> dict[str, Setting]:
     """The setting with each of its numbers changed a little, by what is changed."""
-    setting, perturbed = one.setting, dict[str, Setting]()
+    setting, perturbed = component.setting, dict[str, Setting]()
     for name in MOMENTS:
         if setting.get(name) is not None:
             at_s = float(setting[name]) + _ONSET * context.track.duration_s
@@ -40,38 +40,40 @@ def perturbed_settings(one: Component, context: Context) -> dict[str, Setting]:
             perturbed[name] = {**setting, name: float(setting[name]) + _TURN_DEG}
     if "late_s" in setting:
         perturbed["late_s"] = {**setting, "late_s": float(setting["late_s"]) + _LATE_S}
-    if one.row is not None and one.row.remembers:
+    if component.row is not None and component.row.remembers:
         memory = np.array(setting.get("memory", (0.0, 0.0, 0.0)))
-        for axis, part in enumerate(_MEMORY * one.row.remembers * np.eye(3)):
+        for axis, part in enumerate(_MEMORY * component.row.remembers * np.eye(3)):
             perturbed[f"memory {axis}"] = {**setting, "memory": tuple((memory + part).tolist())}
     return perturbed
 
 
 def with_setting_slopes(
-    one: Component, context: Context, value: Array, perturbed: Mapping[str, Setting]
+    component: Component, context: Context, value: Array, perturbed: Mapping[str, Setting]
 ) -> Component | None:
     """An effect with its slopes at these coefficients as further columns, behind its own.
 
     Coefficients of slopes are in units of the changes in `perturbed`.  None if that is empty or the
     component is not in the library.
     """
-    if one.row is None or not perturbed:
+    if component.row is None or not perturbed:
         return None
-    there = [one.row.columns(context, setting) for setting in perturbed.values()]
-    here = one.row.columns(context, one.setting)
-    mag = _with_slopes(one.columns.mag, here.mag, [each.mag for each in there], value)
-    gyro = _with_slopes(one.columns.gyro, here.gyro, [each.gyro for each in there], value)
-    largest = one.law.log_variance(one.law.high)
+    shifted = [component.row.columns(context, setting) for setting in perturbed.values()]
+    here = component.row.columns(context, component.setting)
+    mag = _with_slopes(component.columns.mag, here.mag, [each.mag for each in shifted], value)
+    gyro = _with_slopes(component.columns.gyro, here.gyro, [each.gyro for each in shifted], value)
+    largest = component.law.log_variance(component.law.high)
     law = Fixed(np.concatenate([np.exp(largest), np.full(len(perturbed), priors.SETTING_OFF**2)]))
-    key = f"{one.key}, open in {', '.join(perturbed)} at {np.array2string(value, precision=6)}"
-    return replace(one, key=key, columns=Columns(mag, gyro), law=law)
+    key = (
+        f"{component.key}, open in {', '.join(perturbed)} at {np.array2string(value, precision=6)}"
+    )
+    return replace(component, key=key, columns=Columns(mag, gyro), law=law)
 
 
 def _with_slopes(
-    own: Array | None, here: Array | None, there: list[Array | None], value: Array
+    own: Array | None, here: Array | None, shifted: list[Array | None], value: Array
 ) -> Array | None:
     """(N, 3, p + k) columns of one sensor and their slopes."""
     if own is None or here is None:
         return None
-    slopes = [(each - here) @ value for each in there if each is not None]
+    slopes = [(each - here) @ value for each in shifted if each is not None]
     return np.concatenate([own, np.stack(slopes, axis=2)], axis=2)

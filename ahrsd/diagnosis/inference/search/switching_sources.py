@@ -161,9 +161,11 @@ def _refine_interval_ends(
                     a, b = (interval[k] + offset * step * (k == end) for k in (0, 1))
                     if not 0 <= a < b - 1 < count:
                         continue
-                    one = _interval_component(made.context, "sensor", [(a, b)], 0.0, _END_WAVES)
-                    interval_by_key[one.key] = number, (a, b)
-                    candidates.append(one)
+                    component = _interval_component(
+                        made.context, "sensor", [(a, b)], 0.0, _END_WAVES
+                    )
+                    interval_by_key[component.key] = number, (a, b)
+                    candidates.append(component)
             trial = made.copied()  # the trial components of a round are not kept
             trial.add(candidates)
             worth = replace(scan, made=trial).worth(list(interval_by_key))
