@@ -36,7 +36,7 @@ from ahrsd.diagnosis.inference.search.model_search import (
     Hypothesis,
     Names,
     Space,
-    searched,
+    beam_search,
 )
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 from ahrsd.diagnosis.where_and_when.narrow_band import loudest_band, of_band
@@ -84,7 +84,7 @@ def quick(
         del fast, all_sets, space  # what was asked at the point before is as much again
         fast, all_sets, space, found = _searched(point, library, real=real)
     all_sets.unknown_nats = source_nats
-    answer = decision.decided(all_sets, space, found, library)
+    answer = decision.decide(all_sets, space, found, library)
     slower = None
     if answer.findings:
         slower = _without(point.problem, made.point.problem, fast, answer.best)
@@ -140,7 +140,7 @@ def _searched_in(
     space = Space(
         candidates, (), lambda *_: [], lambda *_: [], lambda _: None, lambda _: [], lambda *_: []
     )
-    return fast, all_sets, space, searched(all_sets, space, [frozenset(), *starts])[0]
+    return fast, all_sets, space, beam_search(all_sets, space, [frozenset(), *starts])[0]
 
 
 def _hum(fast: Linearised, best: Hypothesis) -> Unexplained:

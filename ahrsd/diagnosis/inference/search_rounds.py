@@ -20,7 +20,7 @@ from ahrsd.diagnosis.inference.likelihood.linearisation import (
     omit_readings,
 )
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space
-from ahrsd.diagnosis.inference.search.search_space import best_at
+from ahrsd.diagnosis.inference.search.search_space import search_at_point
 from ahrsd.samples import Array
 
 #: linearisations with a search each, at most
@@ -42,11 +42,11 @@ class Searched:
 
 def answered(found: richest_model.FittedPoint, library: Mapping[str, Effect]) -> Searched:
     """Searched at the richest model, and again at what was found, until that stays."""
-    all_sets, space, best = best_at(found, library, (), was_real=True)
-    answer = decision.decided(all_sets, space, best, library)
+    all_sets, space, best = search_at_point(found, library, (), was_real=True)
+    answer = decision.decide(all_sets, space, best, library)
     source = _source(all_sets, answer.best)
     for _ in range(ROUNDS - 1):
-        before = members.names_of(all_sets, answer.best)
+        before = members.effects_of(all_sets, answer.best)
         there = [all_sets.component(key) for key in sorted(answer.best.names)]
         named = [one for one in there if one.effect is not None and one.key != LAG]
         real = all_sets.is_real(answer.best.names)
@@ -59,10 +59,10 @@ def answered(found: richest_model.FittedPoint, library: Mapping[str, Effect]) ->
         point = replace(omit_readings(point, spans) if spans else point, directed=directed)
         del all_sets, space  # what was asked at the point before is as much again
         found = richest_model.converge(point, library, named)
-        all_sets, space, best = best_at(found, library, named, real)
-        answer = decision.decided(all_sets, space, best, library)
+        all_sets, space, best = search_at_point(found, library, named, real)
+        answer = decision.decide(all_sets, space, best, library)
         source = _source(all_sets, answer.best)
-        if members.names_of(all_sets, answer.best) == before and not (spans or other_noise):
+        if members.effects_of(all_sets, answer.best) == before and not (spans or other_noise):
             break
     return _while_moved(Searched(answer, all_sets, space, source), library)
 
@@ -99,8 +99,8 @@ def _while_moved(found: Searched, library: Mapping[str, Effect]) -> Searched:
     if not 0 < len(spans) < priors.CHANGES or max(np.ptp(spans, axis=1)) > 2 * priors.APPROACH_S:
         return found
     rich = richest_model.converge(omit_readings(all_sets.made.point, spans), library, ())
-    anew, space, best = best_at(rich, library, (), was_real=True)
-    answer = decision.decided(anew, space, best, library)
+    anew, space, best = search_at_point(rich, library, (), was_real=True)
+    answer = decision.decide(anew, space, best, library)
     steps = [one for key in answer.keys if (one := anew.component(key)).jumps]
     begun = [time_s for one in steps for time_s in one.moments_s]
     if any(a - near_s <= time_s <= b + near_s for time_s in begun for a, b in spans):

@@ -36,7 +36,7 @@ from ahrsd.diagnosis.inference.diagnose import begun, diagnose
 from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.likelihood.evidence import evaluate
-from ahrsd.diagnosis.inference.search.search_space import space_at
+from ahrsd.diagnosis.inference.search.search_space import build_search_space
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import RecordingError
 from ahrsd.offline.diagnose import load_track
@@ -93,7 +93,7 @@ def profiles(found: richest_model.FittedPoint) -> dict[str, list[list[float]]]:
 
 def sizes(found: richest_model.FittedPoint) -> dict[str, list[float]]:
     """Of each effect in its likeliest setting, and each course: size and nats that it gains."""
-    all_sets, space = space_at(found, EFFECTS, ())
+    all_sets, space = build_search_space(found, EFFECTS, ())
     base = all_sets.judge({*found.base.remainder, LAG})
     scan = candidate_scan(all_sets.made, base.keys, base.at)
     out = {}

@@ -34,7 +34,7 @@ from ahrsd.diagnosis.inference.answer.support import (
 from ahrsd.diagnosis.inference.answer.visibility import limits, seen_alone
 from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Space
-from ahrsd.diagnosis.inference.search.search_space import space_at
+from ahrsd.diagnosis.inference.search.search_space import build_search_space
 from ahrsd.diagnosis.track import Spec, Track
 
 CURRENT = np.array([5e-4, -7e-4, 3e-4])
@@ -53,7 +53,7 @@ def with_current(track: Track, *, field: bool) -> Track:
 def sets_of(track: Track) -> tuple[Hypotheses, Space]:
     problem, cold = problem_of(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
-    return space_at(richest_model.fit_richest_model(problem, fit.filtered, EFFECTS), EFFECTS, ())
+    return build_search_space(richest_model.fit_richest_model(problem, fit.filtered, EFFECTS), EFFECTS, ())
 
 
 @pytest.fixture(scope="module")
@@ -93,9 +93,9 @@ def test_a_set_with_too_many_coefficients_is_no_candidate_and_its_neighbours_are
     width = all_sets.component(course).width
     monkeypatch.setattr(priors, "WIDEST", width)  # beside the calibration there is less room
     before = all_sets.too_wide
-    assert all_sets.compared({course}, bare, -np.inf) is None
+    assert all_sets.judge_above({course}, bare, -np.inf) is None
     assert all_sets.too_wide == before + 1
-    assert all_sets.compared({key}, bare, -np.inf) is not None
+    assert all_sets.judge_above({key}, bare, -np.inf) is not None
     assert all_sets.judge({course}).names == {course}  # what is asked for by itself has a score
 
 
@@ -246,7 +246,7 @@ def test_a_source_that_is_in_no_set_fails_by_time_and_by_whiteness(track):
     pulse = ((t > 50.0) & (t < 75.0))[:, None] * np.array([4e-3, -3e-3, 2e-3])
     problem, cold = problem_of(replace(track, mag_b_gauss=track.mag_b_gauss + pulse), Spec())
     start = fit_null(problem.track, problem.spec, cold, walk=False)
-    all_sets, _ = space_at(
+    all_sets, _ = build_search_space(
         richest_model.fit_richest_model(problem, start.filtered, EFFECTS), EFFECTS, ()
     )
     quiet = all_sets.judge({"free sensor"})

@@ -14,12 +14,12 @@ from ahrsd.diagnosis.calibration_fit.problem import problem_of
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.inference.likelihood import richest_model
-from ahrsd.diagnosis.inference.search.search_space import space_at
+from ahrsd.diagnosis.inference.search.search_space import build_search_space
 from ahrsd.diagnosis.inference.search.switching_sources import (
-    SpellLaw,
-    changes,
-    likeliest_states,
-    switching,
+    IntervalLaw,
+    change_points,
+    find_switching_sources,
+    most_probable_states,
 )
 from ahrsd.diagnosis.track import Spec
 
@@ -36,7 +36,7 @@ def test_spells_are_on_and_paid_with_the_probability_of_their_chain():
     on = np.zeros(600, dtype=bool)
     on[100:110] = on[400:407] = True
     left += np.repeat(on, ROWS)[:, None] * [4.0, 0.0, -3.0]
-    found, log_odds = likeliest_states(squares(left), np.full(600, float(ROWS)), PIECE_S)
+    found, log_odds = most_probable_states(squares(left), np.full(600, float(ROWS)), PIECE_S)
     np.testing.assert_array_equal(found, on)
     stays_on, stays_off = np.exp(-PIECE_S / priors.SPELL_S), np.exp(-PIECE_S / priors.BETWEEN_S)
     chain = 581 * np.log(stays_off) + 15 * np.log(stays_on)
@@ -46,13 +46,13 @@ def test_spells_are_on_and_paid_with_the_probability_of_their_chain():
 
 def test_noise_is_never_on_and_never_changes():
     left = np.random.default_rng(2).standard_normal((3000, 3))
-    found, _ = likeliest_states(squares(left), np.full(600, float(ROWS)), PIECE_S)
+    found, _ = most_probable_states(squares(left), np.full(600, float(ROWS)), PIECE_S)
     assert not found.any()
-    assert changes(left, 10) == []
+    assert change_points(left, 10) == []
 
 
 def test_a_chain_of_noise_and_ever_less_is_off():
-    found, log_odds = likeliest_states(np.zeros(50), np.full(50, float(ROWS)), PIECE_S)
+    found, log_odds = most_probable_states(np.zeros(50), np.full(50, float(ROWS)), PIECE_S)
     assert not found.any()
     assert log_odds == pytest.approx(-50 * PIECE_S / priors.BETWEEN_S)
 
@@ -61,13 +61,13 @@ def test_levels_change_where_they_do():
     left = np.random.default_rng(3).standard_normal((2000, 3))
     for row, change in ((400, 6.0), (700, -6.0), (705, 0.0), (1500, 5.0)):
         left[row:, 1] += change
-    found = np.array(changes(left, 10))
+    found = np.array(change_points(left, 10))
     assert len(found) == 3
     assert np.abs(found - [400, 700, 1500]).max() <= 1
 
 
 def test_a_spell_s_slopes_are_those_of_differences():
-    law = SpellLaw(np.array([0.0, 0.5, 1.0, 3.0]), 1e-3)
+    law = IntervalLaw(np.array([0.0, 0.5, 1.0, 3.0]), 1e-3)
     psi = np.array([0.4, 0.7])
     assert law.log_variance(psi)[0] == pytest.approx(2 * np.log(1e-3) + 0.8)
     for k in range(2):
@@ -88,12 +88,12 @@ def test_spells_are_found_to_a_second_and_what_was_tried_is_not_kept():
     track = replace(track, mag_b_gauss=track.mag_b_gauss + lamp)
     problem, cold = problem_of(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
-    all_sets, _ = space_at(
+    all_sets, _ = build_search_space(
         richest_model.fit_richest_model(problem, fit.filtered, EFFECTS), EFFECTS, ()
     )
     nothing = all_sets.judge(())
     known = set(all_sets.made.seen)
-    comes = [one for one in switching(all_sets, nothing) if "spans_s" in one.setting]
+    comes = [one for one in find_switching_sources(all_sets, nothing) if "spans_s" in one.setting]
     assert [one.frame for one in comes] == ["sensor", "world"]
     assert all_sets.made.seen.keys() == known
     told = np.array(comes[0].setting["spans_s"]) - track.time_s[0]

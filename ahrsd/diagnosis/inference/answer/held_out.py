@@ -119,7 +119,7 @@ class HeldOut:
         """The best set without some members."""
         names = self.best.names
         for key in keys:
-            names = self.all_sets.without(names, key)
+            names = self.all_sets.without_member(names, key)
         return names
 
     def _rms_gauss(self, names: Names) -> float:

@@ -37,8 +37,8 @@ from ahrsd.diagnosis.inference.components.alternatives import (
 from ahrsd.diagnosis.inference.components.component import FixedLaw, ScaledLaw
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.decision.members import (
-    added_by,
     coefficients,
+    contribution_of,
     is_ordinary,
     library_members,
     size_of,
@@ -115,7 +115,7 @@ def left_sizes(
     parts = []
     besides = [key for key in keys if key not in all_sets.remainder]
     for key in (*all_sets.remainder, *besides, *untold):
-        added, unit = added_by(all_sets, best, key)
+        added, unit = contribution_of(all_sets, best, key)
         added = less_calibration(added, take) if unit == "gauss" else added
         whole[unit] += added
         size, frame = deviation(added), all_sets.component(key).frame

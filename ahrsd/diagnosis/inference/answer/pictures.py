@@ -10,7 +10,7 @@ from ahrsd.diagnosis.answer.diagnosis import Contribution, Drawn
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.inference.answer.visibility import Seen
 from ahrsd.diagnosis.inference.decision.decision import Answer
-from ahrsd.diagnosis.inference.decision.members import added_by, coefficients
+from ahrsd.diagnosis.inference.decision.members import coefficients, contribution_of
 from ahrsd.diagnosis.inference.likelihood.linearisation import step_to_maximum
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.diagnosis.inference.search_rounds import Searched
@@ -49,7 +49,7 @@ def contributions(all_sets: Hypotheses, answer: Answer) -> list[Contribution]:
     """What each term of an answer adds to the readings, in the terms' order."""
     time_s = all_sets.made.context.track.time_s
     return [
-        Contribution(term.identifier, time_s, *added_by(all_sets, answer.best, key))
+        Contribution(term.identifier, time_s, *contribution_of(all_sets, answer.best, key))
         for key, term in zip(answer.keys, answer.terms, strict=True)
     ]
 

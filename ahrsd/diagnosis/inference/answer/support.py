@@ -23,9 +23,9 @@ from ahrsd.diagnosis.inference.answer.held_out import HeldOut
 from ahrsd.diagnosis.inference.components.component import FixedLaw, Law, ScaledLaw
 from ahrsd.diagnosis.inference.components.effect_components import LAG, LAG_FORM
 from ahrsd.diagnosis.inference.components.gaussian_process import GaussianProcessLaw
-from ahrsd.diagnosis.inference.decision.acceptance import asked_odds
+from ahrsd.diagnosis.inference.decision.acceptance import required_odds
 from ahrsd.diagnosis.inference.decision.decision import Answer
-from ahrsd.diagnosis.inference.decision.unexplained import along_its_direction
+from ahrsd.diagnosis.inference.decision.unexplained import directed_noise_source
 from ahrsd.diagnosis.inference.likelihood import noise_model
 from ahrsd.diagnosis.inference.likelihood.evidence import evaluate
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
@@ -48,7 +48,9 @@ def supported(answer: Answer, held: HeldOut, first: int) -> tuple[Finding, ...]:
         replace(
             one,
             heldout=held.told((key,)),
-            priors=on_priors(all_sets, best, answer.rivals[key], asked_odds(all_sets, best, key)),
+            priors=on_priors(
+                all_sets, best, answer.rivals[key], required_odds(all_sets, best, key)
+            ),
             term=number,
         )
         for number, (key, one) in enumerate(
@@ -66,7 +68,7 @@ def what_is_left(answer: Answer, held: HeldOut) -> Unexplained:
     if keys[0] not in answer.rivals:
         return left
     all_sets, best = held.all_sets, answer.best
-    asked = asked_odds(all_sets, best, keys[0])
+    asked = required_odds(all_sets, best, keys[0])
     return replace(left, priors=on_priors(all_sets, best, answer.rivals[keys[0]], asked))
 
 
@@ -77,7 +79,7 @@ def left_at_both_rates(
     left = what_is_left(found.answer, held[0])
     if not left.detected:
         added = [one.added for one in named if one.unit == "gauss"]
-        left = along_its_direction(found.all_sets, found.answer.best, found.source, added)
+        left = directed_noise_source(found.all_sets, found.answer.best, found.source, added)
     return left if left.detected else what_is_left(quick, held[1])
 
 
@@ -125,7 +127,7 @@ def nearest(answer: Answer, all_sets: Hypotheses) -> tuple[str, ...]:
     if not more:
         return ()
     key = max(more, key=lambda one: more[one].score)
-    asked = asked_odds(all_sets, more[key], key)
+    asked = required_odds(all_sets, more[key], key)
     found = on_priors(all_sets, more[key], best, asked)
     most = max(nats for one in found.assumed for nats in (one.half_nats, one.double_nats))
     name = all_sets.component(key).effect

@@ -1,1 +1,1 @@
-"""What is told of the likeliest set: names, what is left, what is ordinary."""
+"""The decision on the most probable set: findings, what is unexplained, what is ordinary."""

@@ -1,8 +1,8 @@
-"""Which members of the likeliest set are told.
+"""Which members of the most probable set are accepted.
 
-Each has to be likelier than its absence, whatever takes its place (nothing, or a course in time of
-any frame), by odds that the losses ask for; and names have to hold beside sources of other laws,
-and with a coefficient that is constant.
+A member has to be more probable than its absence, whatever replaces it (nothing, or a free process
+in time in any frame), by odds that follow from the losses.  An effect has to remain as well when
+sources with other laws are in the model, and its coefficient has to be constant.
 """
 
 from __future__ import annotations
@@ -22,109 +22,115 @@ from ahrsd.diagnosis.inference.components.alternatives import (
 )
 from ahrsd.diagnosis.inference.components.effect_components import LAG
 from ahrsd.diagnosis.inference.decision.members import (
-    added_by,
     coefficients,
+    contribution_of,
     is_ordinary,
     library_members,
 )
-from ahrsd.diagnosis.inference.decision.unexplained import is_along
+from ahrsd.diagnosis.inference.decision.unexplained import acts_along
 from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.search.model_search import (
     Hypotheses,
     Hypothesis,
     Space,
-    at_its_moments,
-    come_and_gone,
+    sets_with_merged_steps,
+    step_alternatives,
 )
 from ahrsd.diagnosis.where_and_when.locate import single_source
 
 
-def accepted(
+def accept_members(
     all_sets: Hypotheses, space: Space, best: Hypothesis
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
-    """The likeliest set with members that are told, and what is likeliest without each."""
-    best = _with_one_part(all_sets, space, best)
-    best = _with_heading(all_sets, space, best)
-    best = _come_and_gone(all_sets, space, best)
-    best, rivals = _borne_out(all_sets, space, best)
-    likelier = _of_likeliest_kind(all_sets, space, best)
-    if likelier is not best:
-        best, rivals = _borne_out(all_sets, space, likelier)
-    best, rivals = _beside_others(all_sets, space, best, rivals)
-    best, rivals = _held_to_form(all_sets, space, best, rivals)
-    return _of_one_source(all_sets, space, best, rivals)
+    """The most probable set whose members are all accepted, and the best set without each."""
+    best = _try_single_remainder_part(all_sets, space, best)
+    best = _try_field_by_heading(all_sets, space, best)
+    best = _merge_steps(all_sets, space, best)
+    best, rivals = _drop_unsupported(all_sets, space, best)
+    improved = _choose_step_kinds(all_sets, space, best)
+    if improved is not best:
+        best, rivals = _drop_unsupported(all_sets, space, improved)
+    best, rivals = _test_against_alternatives(all_sets, space, best, rivals)
+    best, rivals = _test_constant_coefficients(all_sets, space, best, rivals)
+    return _drop_parts_of_unknown_source(all_sets, space, best, rivals)
 
 
-def _borne_out(
+def _drop_unsupported(
     all_sets: Hypotheses, space: Space, best: Hypothesis
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
-    """The set without members that are not sure, and what is likeliest without each other one.
+    """Remove members until the data support each one; with the best set without each.
 
-    A name with a free factor beside it is a part of that: it stays as long.
+    A free factor of an effect and the effect are one member: an effect is not tested while its
+    factor is in the set.
     """
     while True:
-        own = [key for key in sorted(best.names) if key not in all_sets.remainder]
-        own = [key for key in own if best.names.isdisjoint(factor_keys(key))]
-        asked = {key: asked_odds(all_sets, best, key) for key in own}
-        without = {key: all_sets.without(best.names, key) for key in own}
-        near = {key: all_sets.compared(without[key], best, best.score - asked[key]) for key in own}
-        rivals = {key: one for key, one in near.items() if one is not None}
-        if all(best.score - one.score >= asked[key] for key, one in rivals.items()):
-            rivals = {key: _without(all_sets, space, best, key) for key in own}
+        tested = [key for key in sorted(best.names) if key not in all_sets.remainder]
+        tested = [key for key in tested if best.names.isdisjoint(factor_keys(key))]
+        required = {key: required_odds(all_sets, best, key) for key in tested}
+        without = {key: all_sets.without_member(best.names, key) for key in tested}
+        reduced = {
+            key: all_sets.judge_above(without[key], best, best.score - required[key])
+            for key in tested
+        }
+        rivals = {key: one for key, one in reduced.items() if one is not None}
+        if all(best.score - one.score >= required[key] for key, one in rivals.items()):
+            rivals = {key: _best_without(all_sets, space, best, key) for key in tested}
         odds = {key: best.score - rival.score for key, rival in rivals.items()}
-        unsure = [key for key in odds if odds[key] < asked[key] or _is_form(all_sets, best, key)]
-        if not unsure:
-            fewer = _without_one_moment(all_sets, best, asked)
-            if fewer is best:
+        unsupported = [
+            key for key in odds if odds[key] < required[key] or _is_mostly_form(all_sets, best, key)
+        ]
+        if not unsupported:
+            without_pair = _drop_cancelling_pair(all_sets, best, required)
+            if without_pair is best:
                 return best, rivals
-            best = fewer
+            best = without_pair
             continue
-        key = min(unsure, key=lambda one: odds[one])
-        best = _without(all_sets, space, best, key)
+        key = min(unsupported, key=lambda one: odds[one])
+        best = _best_without(all_sets, space, best, key)
 
 
-def _come_and_gone(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
-    """The set with one vector that comes and goes where further steps are not worth being told.
+def _merge_steps(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+    """Replace two steps by one vector over an interval unless further steps are well supported.
 
-    Each step more has to be worth what a name has to.
+    Each step more has to be worth what an effect has to be.
     """
-    asked = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.NAME_ODDS
+    required = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.NAME_ODDS
     while True:
-        likeliest = best
-        for names in come_and_gone(all_sets, space, best.names):
-            least = likeliest.score - asked * (len(likeliest.names) - len(names))
-            found = all_sets.compared(names, best, least)
+        improved = best
+        for members in sets_with_merged_steps(all_sets, space, best.names):
+            least = improved.score - required * (len(improved.names) - len(members))
+            found = all_sets.judge_above(members, best, least)
             if found is not None and found.score > least:
-                likeliest = found
-        if likeliest is best:
+                improved = found
+        if improved is best:
             return best
-        best = likeliest
+        best = improved
 
 
-def _of_likeliest_kind(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
-    """The set with each step that has a form of the kind that is likeliest at its moments.
+def _choose_step_kinds(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+    """Exchange each step that has a form for the most probable kind of step at its times.
 
-    Beside an ordinary remainder nothing is exchanged: its laws are not exact.
+    With the ordinary remainder nothing is exchanged: its laws are not exact.
     """
     if all_sets.is_real(best.names):
         return best
     while True:
-        tried = [
-            all_sets.with_(best.names - {key}, other)
+        alternatives = [
+            all_sets.with_member(best.names - {key}, other)
             for key in library_members(all_sets, best)
-            for other in at_its_moments(all_sets, space, key)
+            for other in step_alternatives(all_sets, space, key)
         ]
-        likelier = all_sets.likeliest(best, tried)
-        if likelier is best:
+        improved = all_sets.most_probable(best, alternatives)
+        if improved is best:
             return best
-        best = likelier
+        best = improved
 
 
-def _is_form(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
-    """Whether of a member mostly what it leaves of its form is there: it is no name of anything.
+def _is_mostly_form(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
+    """Whether a member consists mostly of its form component: then it is not the effect.
 
-    Its coefficients are within their deviations, or its own columns, however large, hold less than
-    the larger part of what both add.
+    This is so if each coefficient is below its deviation, or if the member's own columns, at any
+    size, fit less than `OWN_PART` of the power of what the member and its form add.
     """
     if key not in all_sets.forms:
         return False
@@ -137,174 +143,183 @@ def _is_form(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
     own = columns.mag if columns.on_mag else columns.gyro
     if own is None:
         return False
-    added = [added_by(all_sets, best, one)[0] for one in (key, all_sets.forms[key])]
-    both = np.sum(added, axis=0).ravel()
-    flat = np.asarray(own).reshape(len(both), -1)
-    held = flat @ np.linalg.lstsq(flat, both)[0]
-    return bool(held @ held < priors.OWN_PART * (both @ both))
+    contributions = [contribution_of(all_sets, best, one)[0] for one in (key, all_sets.forms[key])]
+    total = np.sum(contributions, axis=0).ravel()
+    own_columns = np.asarray(own).reshape(len(total), -1)
+    projection = own_columns @ np.linalg.lstsq(own_columns, total)[0]
+    return bool(projection @ projection < priors.OWN_PART * (total @ total))
 
 
-def _without_one_moment(
-    all_sets: Hypotheses, best: Hypothesis, asked: Mapping[str, float]
+def _drop_cancelling_pair(
+    all_sets: Hypotheses, best: Hypothesis, required: Mapping[str, float]
 ) -> Hypothesis:
-    """The set without names of one moment that are not worth together what each has to be.
+    """Remove two effects that change at one time and are not worth what both require together.
 
-    Steps of the field and of the iron at a moment undo each other: with one of them left out what
-    the other does is seen, and each looks sure.
+    Steps of the field and of the iron at one time cancel: without one of them the other's
+    contribution is no longer compensated, so each of them looks certain.
     """
-    moments = {key: all_sets.component(key).moments_s for key in asked}
-    for first, last in itertools.combinations(sorted(key for key in asked if moments[key]), 2):
-        apart_s = np.abs(np.subtract.outer(moments[first], moments[last]))
-        if np.min(apart_s) > priors.APPROACH_S:
+    times_s = {key: all_sets.component(key).moments_s for key in required}
+    for first, last in itertools.combinations(sorted(key for key in required if times_s[key]), 2):
+        separation_s = np.abs(np.subtract.outer(times_s[first], times_s[last]))
+        if np.min(separation_s) > priors.APPROACH_S:
             continue
-        least = best.score - asked[first] - asked[last]
-        fewer = all_sets.compared(best.names - {first, last}, best, least)
-        if fewer is not None and fewer.score > least:
-            return fewer
+        least = best.score - required[first] - required[last]
+        reduced = all_sets.judge_above(best.names - {first, last}, best, least)
+        if reduced is not None and reduced.score > least:
+            return reduced
     return best
 
 
-def _with_one_part(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
-    """The set with a part of what recordings leave in place of all of them, where that is likelier.
+def _try_single_remainder_part(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+    """Replace the ordinary remainder by a single part of it, if that is more probable.
 
-    What has but one of them, and that far beyond the others, leaves nothing ordinary.
+    If one part alone is there, far above the others, it is not what a recording ordinarily leaves.
     """
-    rest = frozenset(all_sets.remainder)
-    if all_sets.real or not rest & best.names or not space.courses:
+    remainder = frozenset(all_sets.remainder)
+    if all_sets.real or not remainder & best.names or not space.courses:
         return best
-    found = single_remainder_parts(all_sets.component(key) for key in all_sets.remainder)
-    all_sets.made.add(found)
-    bare = best.names - rest
-    return all_sets.likeliest(best, [bare | {one.key} for one in found])
+    parts = single_remainder_parts(all_sets.component(key) for key in all_sets.remainder)
+    all_sets.made.add(parts)
+    without_remainder = best.names - remainder
+    return all_sets.most_probable(best, [without_remainder | {one.key} for one in parts])
 
 
-def _with_heading(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
-    """The set with a field by heading, where that is likelier and nothing else is unknown.
+def _try_field_by_heading(all_sets: Hypotheses, space: Space, best: Hypothesis) -> Hypothesis:
+    """Add a field by heading, if that is more probable and nothing else is unknown.
 
-    Of rooms it is not asked: where one walks in a circle, the heading is the place.
+    It is not tested in a real recording: on a walk in a circle, the heading is the place.
     """
     unknown = any(all_sets.component(key).row is None for key in best.names)
     if unknown or all_sets.real or not space.courses:
         return best
     heading = field_by_heading(all_sets.made.context)
     all_sets.made.add([heading])
-    return all_sets.likeliest(best, [best.names | {heading.key}])
+    return all_sets.most_probable(best, [best.names | {heading.key}])
 
 
-def _beside_others(
+def _test_against_alternatives(
     all_sets: Hypotheses, space: Space, best: Hypothesis, rivals: dict[str, Hypothesis]
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
-    """The names that hold beside sources of other laws; the set as it was where all do.
+    """Remove effects that other laws of an unknown source replace; unchanged if all effects remain.
 
-    A source that is quick is noise of a colour as well: only in place of a name it is told.
+    Noise of any colour fits a quick source as well, so such a source is reported only if it
+    replaces an effect.
     """
     if not library_members(all_sets, best) or not space.courses:
         return best, rivals
     parts = single_remainder_parts(all_sets.component(key) for key in all_sets.remainder)
-    others = alternative_sources(all_sets.made.context)
-    all_sets.made.add([*parts, *others])
-    wide, rest = best, frozenset(all_sets.remainder)
-    for one in (*others, *parts):
-        more = wide.names | {one.key}
-        wide = all_sets.likeliest(wide, [more - rest] if one in parts else [more, more - rest])
-    if wide is best:
+    alternatives = alternative_sources(all_sets.made.context)
+    all_sets.made.add([*parts, *alternatives])
+    extended, remainder = best, frozenset(all_sets.remainder)
+    for one in (*alternatives, *parts):
+        members = extended.names | {one.key}
+        extended = all_sets.most_probable(
+            extended, [members - remainder] if one in parts else [members, members - remainder]
+        )
+    if extended is best:
         return best, rivals
-    held, others_rivals = _borne_out(all_sets, space, wide)
-    if set(library_members(all_sets, held)) >= set(library_members(all_sets, best)):
+    accepted, accepted_rivals = _drop_unsupported(all_sets, space, extended)
+    if set(library_members(all_sets, accepted)) >= set(library_members(all_sets, best)):
         return best, rivals
-    return held, others_rivals
+    return accepted, accepted_rivals
 
 
-def _held_to_form(
+def _test_constant_coefficients(
     all_sets: Hypotheses, space: Space, best: Hypothesis, rivals: dict[str, Hypothesis]
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
-    """With a free factor for each name that stands in for something: its coefficient varies.
+    """Add a free factor to each effect whose coefficient varies: it stands in for another source.
 
-    A factor is taken once: one that is not borne out beside the names that are left stays out.
+    Each effect is given one factor at most.  If that is dropped for lack of support, no factor of
+    the effect is tried again.
     """
-    taken = set[str]()
+    tried_factors = set[str]()
     while True:
-        asked = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.FORM_ODDS
-        found, made = best, all_sets.made
+        required = priors.ODDS_REAL if all_sets.is_real(best.names) else priors.FORM_ODDS
+        extended, made = best, all_sets.made
         for key in library_members(all_sets, best):
-            one = all_sets.component(key)
-            # a quick cause's phase is summed from its column, and wanders as that errs
-            wanders = one.row is not None and one.row.quick and "covariate" in one.setting
-            if wanders or not taken.isdisjoint(factor_keys(key)):
+            effect = all_sets.component(key)
+            # the phase of a quick cause is the integral of its column, and drifts with its errors
+            phase_from_column = (
+                effect.row is not None and effect.row.quick and "covariate" in effect.setting
+            )
+            if phase_from_column or not tried_factors.isdisjoint(factor_keys(key)):
                 continue
-            forms = coefficient_factors(one, added_by(all_sets, best, key)[0], made.context)
-            made.add(forms)
-            for form in forms:
-                least = max(best.score + asked, found.score)
-                free = all_sets.compared(best.names | {form.key}, best, least)
-                if free is None or free.score <= least:
+            factors = coefficient_factors(effect, contribution_of(all_sets, best, key)[0], made.context)
+            made.add(factors)
+            for factor in factors:
+                least = max(best.score + required, extended.score)
+                with_factor = all_sets.judge_above(best.names | {factor.key}, best, least)
+                if with_factor is None or with_factor.score <= least:
                     continue
-                if float(np.exp(all_sets.psi_of(free)[form.key][0])) > priors.VARIES:
-                    found = free
-        if found is best:
+                if float(np.exp(all_sets.psi_of(with_factor)[factor.key][0])) > priors.VARIES:
+                    extended = with_factor
+        if extended is best:
             return best, rivals
-        taken |= found.names - best.names
-        best, rivals = _borne_out(all_sets, space, found)
+        tried_factors |= extended.names - best.names
+        best, rivals = _drop_unsupported(all_sets, space, extended)
 
 
-def _of_one_source(
+def _drop_parts_of_unknown_source(
     all_sets: Hypotheses, space: Space, best: Hypothesis, rivals: dict[str, Hypothesis]
 ) -> tuple[Hypothesis, dict[str, Hypothesis]]:
-    """The set without names that act along the one direction in which something unknown acts.
+    """Remove effects that act along the one direction along which something unknown acts.
 
-    A source that no name has is drawn by logged columns that go with it, each in part: all along
-    its direction, the rest as well.  Several names, or one that is less sure than the rest, are
-    one unknown source; one that is surer leaves a rest.
+    Logged columns that vary with an unknown source each fit a part of it, along its direction, and
+    leave a residual along the same.  Several such effects, or one that is less certain than the
+    residual, are parts of one unknown source; a single one that is more certain leaves a residual.
     """
     odds = {key: best.score - rival.score for key, rival in rivals.items()}
     members = [key for key in odds if key != LAG and all_sets.component(key).columns.on_mag]
-    named = [key for key in members if all_sets.component(key).row is not None]
-    unknown = [key for key in set(members) - set(named) if not is_ordinary(all_sets, best, key)]
-    added = {key: added_by(all_sets, best, key)[0] for key in (*named, *unknown)}
+    effects = [key for key in members if all_sets.component(key).row is not None]
+    unknown = [key for key in set(members) - set(effects) if not is_ordinary(all_sets, best, key)]
+    contributions = {key: contribution_of(all_sets, best, key)[0] for key in (*effects, *unknown)}
     for key in sorted(unknown, key=lambda one: -odds[one]):
-        direction, share = single_source(added[key], np.ones(len(added[key])))
+        direction, share = single_source(contributions[key], np.ones(len(contributions[key])))
         if share < priors.MAINLY_ONE:
             continue
-        alike = [one for one in named if is_along(direction, added[one])]
-        parts = alike if len(alike) > 1 else [one for one in alike if odds[one] < odds[key]]
+        aligned = [one for one in effects if acts_along(direction, contributions[one])]
+        parts = aligned if len(aligned) > 1 else [one for one in aligned if odds[one] < odds[key]]
         if parts:
-            fewer = all_sets.judge(best.names - set(parts), best)
-            return _of_one_source(all_sets, space, *_borne_out(all_sets, space, fewer))
+            reduced = all_sets.judge(best.names - set(parts), best)
+            return _drop_parts_of_unknown_source(
+                all_sets, space, *_drop_unsupported(all_sets, space, reduced)
+            )
     return best, rivals
 
 
-def asked_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
-    """Log odds from which on a member is told.
+def required_odds(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
+    """Log odds from which on a member is accepted.
 
-    Beside something unknown a name has to be the larger part: a source that no law here has leaves
-    a rest, and names take that, of either sensor: a gyro's error by force for what slides by it.
-    What takes a rest by a logged column takes it by that column at other times as well.
+    If something unknown is in the set, an effect has to be the larger part: a source for which
+    there is no exact law leaves a residual, and effects on either sensor fit it, such as a gyro's
+    error by force where something slides by the force.  An effect by a logged column has to exceed
+    what its column is worth at other times as well.
     """
-    one = all_sets.component(key)
+    member = all_sets.component(key)
     if key == LAG:
         return priors.NAME_ODDS
-    asked = priors.UNKNOWN_ODDS if one.row is None else priors.NAME_ODDS
+    required = priors.UNKNOWN_ODDS if member.row is None else priors.NAME_ODDS
     if all_sets.is_real(best.names):
-        asked = priors.ODDS_REAL
-    if one.row is None:
-        return asked
-    asked = max(asked, priors.BESIDE_UNKNOWN * all_sets.unknown_nats)
+        required = priors.ODDS_REAL
+    if member.row is None:
+        return required
+    required = max(required, priors.BESIDE_UNKNOWN * all_sets.unknown_nats)
     unknown = [
         other for other in sorted(best.names - frozenset(all_sets.remainder))
         if all_sets.component(other).row is None and not is_ordinary(all_sets, best, other)
     ]  # fmt: skip
     if not unknown:
-        return asked
-    if "covariate" in one.setting:
-        return asked + _at_other_times(all_sets, best, key)
+        return required
+    if "covariate" in member.setting:
+        return required + _shifted_copy_nats(all_sets, best, key)
     nats = best.score - all_sets.judge(best.names - frozenset(unknown), best).score
-    return max(asked, priors.BESIDE_UNKNOWN * nats)
+    return max(required, priors.BESIDE_UNKNOWN * nats)
 
 
-def _at_other_times(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
-    """Nats that a member would be worth once more at the best of other times, 0 at least.
+def _shifted_copy_nats(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
+    """Log Bayes factor of the best copy of a member shifted in time, 0 at least.
 
-    Beside the member itself: what comes again and again is like itself at other times.
+    With the member itself in the model: a repeating cause resembles itself at other times.
     """
     copies = [all_sets.component(key).moved(share) for share in priors.SHIFTS]
     all_sets.made.add(copies)
@@ -312,9 +327,9 @@ def _at_other_times(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     return max(0.0, *scan.log_bayes_factors([copy.key for copy in copies]).values())
 
 
-def _without(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> Hypothesis:
-    """The likeliest set without a member: with nothing or a course in its place."""
-    fewer = all_sets.without(best.names, key)
-    courses = [] if all_sets.component(key).effect is None else space.courses
-    tried = [fewer | {course} for course in courses if course not in fewer]
-    return all_sets.likeliest(all_sets.judge(fewer, best), tried, near=best)
+def _best_without(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> Hypothesis:
+    """The best set without a member: nothing, or a free process in time, replaces it."""
+    reduced = all_sets.without_member(best.names, key)
+    processes = [] if all_sets.component(key).effect is None else space.courses
+    alternatives = [reduced | {process} for process in processes if process not in reduced]
+    return all_sets.most_probable(all_sets.judge(reduced, best), alternatives, near=best)

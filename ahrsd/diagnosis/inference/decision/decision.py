@@ -1,8 +1,8 @@
-"""From the likeliest set to an answer: names with their rivals, what is left, what is ordinary.
+"""From the most probable set to an answer: findings with rivals, what is unknown, what is ordinary.
 
-A name is told where every set without it is less likely by odds that the losses ask for
-(`acceptance`).  What is left is unknown where a free course is as sure, or where a part of the
-ordinary remainder is beyond its 95 %.
+An effect is a finding if every set without it is less probable by odds that follow from the losses
+(`acceptance`).  What remains is unknown if a free process in time is as certain, or if a part of
+the ordinary remainder exceeds its 95 %.
 """
 
 from __future__ import annotations
@@ -16,21 +16,27 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Finding, Unexplained
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.components.ordinary_remainder import GYRO_MATRIX, TURNS
-from ahrsd.diagnosis.inference.decision.acceptance import accepted
-from ahrsd.diagnosis.inference.decision.findings import as_finding, drift_finding, turn_finding
+from ahrsd.diagnosis.inference.decision.acceptance import accept_members
+from ahrsd.diagnosis.inference.decision.findings import (
+    drift_finding,
+    finding_and_term,
+    misalignment_finding,
+)
 from ahrsd.diagnosis.inference.decision.members import coefficients, is_ordinary
-from ahrsd.diagnosis.inference.decision.unexplained import changing_source, left_beyond_ordinary
+from ahrsd.diagnosis.inference.decision.unexplained import changing_source, largest_unexplained
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space
 from ahrsd.diagnosis.model import Term
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """Names, terms and what is left of one hypothesis.
+    """Findings, terms and what is unexplained of one hypothesis.
 
-    best: with nothing that is not told;  keys: of the findings and of the terms, in their order
-    unknown: of what is left: a course, a part of the remainder, a source's steps
-    rivals: what is likeliest without each member
+    best: the set whose members are all accepted
+    keys: keys of the findings and of the terms, in their order
+    unknown: keys of what is unexplained: a process, a part of the remainder, the steps of a source
+    rivals: the best set without each member
+    log_odds: the largest of the members' odds and the evidence of what is unexplained
     """
 
     best: Hypothesis
@@ -43,84 +49,92 @@ class Answer:
     log_odds: float
 
 
-def decided(
+def decide(
     all_sets: Hypotheses, space: Space, best: Hypothesis, library: Mapping[str, Effect]
 ) -> Answer:
     """The answer of a search."""
-    best, rivals = accepted(all_sets, space, best)
+    best, rivals = accept_members(all_sets, space, best)
     odds = {key: best.score - rival.score for key, rival in rivals.items()}
-    switching = _switching(all_sets, best)
-    found, terms, keys = [], [], []
+    repeated_kinds = _repeated_step_kinds(all_sets, best)
+    findings, terms, keys = [], [], []
     for key in sorted(odds, key=lambda one: -odds[one]):
         effect = all_sets.component(key).effect
-        if effect is None or effect in switching or is_ordinary(all_sets, best, key):
+        if effect is None or effect in repeated_kinds or is_ordinary(all_sets, best, key):
             continue
-        finding, term = as_finding(all_sets, space, best, key, odds[key], library)
-        found.append(finding)
+        finding, term = finding_and_term(all_sets, space, best, key, odds[key], library)
+        findings.append(finding)
         terms.append(term)
         keys.append(key)
-    drifts = _drifts(all_sets, space, best, library)
-    for key, row in drifts.items():
-        finding, term = drift_finding(all_sets, space, best, key, odds[key], row, library)
-        found.append(finding)
+    drift_effects = _drift_effects(all_sets, space, best, library)
+    for key, drift in drift_effects.items():
+        finding, term = drift_finding(all_sets, space, best, key, odds[key], drift, library)
+        findings.append(finding)
         terms.append(term)
         keys.append(key)
-    if (turned := _beyond_ordinary_turn(all_sets, best, library)) is not None:
-        straight = all_sets.judge(best.names - {GYRO_MATRIX}, best)
-        rivals = {**rivals, GYRO_MATRIX: straight}
-        finding, term = turn_finding(all_sets, best, best.score - straight.score, turned, library)
-        found.append(finding)
+    if (misalignment := _misalignment_effect(all_sets, best, library)) is not None:
+        reduced = all_sets.judge(best.names - {GYRO_MATRIX}, best)
+        rivals = {**rivals, GYRO_MATRIX: reduced}
+        finding, term = misalignment_finding(
+            all_sets, best, best.score - reduced.score, misalignment, library
+        )
+        findings.append(finding)
         terms.append(term)
         keys.append(GYRO_MATRIX)
-    unknown, left = left_beyond_ordinary(
-        all_sets, space, best, {k: v for k, v in odds.items() if k not in drifts}
+    unknown, unexplained = largest_unexplained(
+        all_sets, space, best, {k: v for k, v in odds.items() if k not in drift_effects}
     )
-    if switching and not left.detected:
-        unknown, left = changing_source(all_sets, best, switching[0], odds)
-    surest = max([*odds.values(), left.evidence_nats], default=0.0)
-    told = tuple(found), tuple(terms), left, surest
-    return Answer(best, tuple(keys), unknown, rivals, *told)
+    if repeated_kinds and not unexplained.detected:
+        unknown, unexplained = changing_source(all_sets, best, repeated_kinds[0], odds)
+    largest_nats = max([*odds.values(), unexplained.evidence_nats], default=0.0)
+    results = tuple(findings), tuple(terms), unexplained, largest_nats
+    return Answer(best, tuple(keys), unknown, rivals, *results)
 
 
-def _drifts(
+def _drift_effects(
     all_sets: Hypotheses, space: Space, best: Hypothesis, library: Mapping[str, Effect]
 ) -> dict[str, Effect]:
-    """Free courses that are as slow as the library's drift of their frame, whatever their form."""
-    named = {all_sets.component(key).effect for key in best.names}
-    out = {}
+    """Free processes as slow as the library's drift in their frame, by key, whatever their form."""
+    present = {all_sets.component(key).effect for key in best.names}
+    drifts = {}
     for key in space.courses:
         if key not in best.names or is_ordinary(all_sets, best, key):
             continue
         frame, corner = all_sets.component(key).frame, float(np.exp(all_sets.psi_of(best)[key][1]))
-        rows = [one for name, one in library.items() if one.course and name not in named]
+        rows = [
+            one for identifier, one in library.items() if one.course and identifier not in present
+        ]
         rows = [one for one in rows if (one.frame or one.family) == frame]
         if rows and corner < priors.DRIFT_CORNER:
-            out[key] = rows[0]
-    return out
+            drifts[key] = rows[0]
+    return drifts
 
 
-def _beyond_ordinary_turn(
+def _misalignment_effect(
     all_sets: Hypotheses, best: Hypothesis, library: Mapping[str, Effect]
 ) -> Effect | None:
-    """The library's turn between the sensors, where it is beyond what recordings ordinarily have.
+    """The library's turn between the sensors, if the gyro's matrix has more of it than is ordinary.
 
-    It stands in the gyro's matrix, which every real recording has.
+    That matrix is a part of the ordinary remainder.
     """
-    named = {all_sets.component(key).effect for key in best.names}
-    rows = [one for name, one in library.items() if one.turns_sensors and name not in named]
+    present = {all_sets.component(key).effect for key in best.names}
+    rows = [
+        one
+        for identifier, one in library.items()
+        if one.turns_sensors and identifier not in present
+    ]
     if not rows or GYRO_MATRIX not in best.names:
         return None
-    turn, unsure = (part[TURNS] for part in coefficients(all_sets, best, GYRO_MATRIX))
-    surely = float(np.linalg.norm(turn)) - 2.0 * float(np.linalg.norm(unsure))
-    return rows[0] if surely > priors.CROOKED * priors.ORDINARY_MISALIGNMENT_RAD else None
+    turn, deviation = (part[TURNS] for part in coefficients(all_sets, best, GYRO_MATRIX))
+    least_turn_rad = float(np.linalg.norm(turn)) - 2.0 * float(np.linalg.norm(deviation))
+    return rows[0] if least_turn_rad > priors.CROOKED * priors.ORDINARY_MISALIGNMENT_RAD else None
 
 
-def _switching(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
-    """Kinds of steps of which there are so many that they are one source that changes, most first.
+def _repeated_step_kinds(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
+    """Kinds of steps with so many members that they are one source that changes, most first.
 
-    Those that are ordinary count as well.
+    Steps of ordinary size count as well.
     """
     members = [all_sets.component(key) for key in sorted(best.names)]
     kinds = sorted(one.effect for one in members if one.effect is not None and one.jumps)
-    many = [k for k in dict.fromkeys(kinds) if kinds.count(k) >= priors.CHANGES]
-    return sorted(many, key=kinds.count, reverse=True)
+    repeated = [k for k in dict.fromkeys(kinds) if kinds.count(k) >= priors.CHANGES]
+    return sorted(repeated, key=kinds.count, reverse=True)

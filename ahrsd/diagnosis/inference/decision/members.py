@@ -1,4 +1,4 @@
-"""What the members of a set are: their coefficients, what they add, and whether it is ordinary."""
+"""The members of a set: coefficients, contributions, sizes, and whether they are ordinary."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ahrsd.samples import Array
 
 
 def coefficients(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, Array]:
-    """Likeliest coefficients of a member and their deviations."""
+    """Posterior mean and deviation of a member's coefficients."""
     begin = 0
     for one in best.keys:
         width = all_sets.component(one).width
@@ -30,75 +30,77 @@ def coefficients(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Arra
     raise KeyError(key)
 
 
-def added_by(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, str]:
-    """(N, 3) what a member adds to the readings, and its unit: gauss, or rad/s of the gyro's."""
-    one, track = all_sets.component(key), all_sets.made.context.track
+def contribution_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> tuple[Array, str]:
+    """(N, 3) what a member adds to the readings, and its unit: gauss, or rad/s for a gyro."""
+    component, track = all_sets.component(key), all_sets.made.context.track
     value, _ = coefficients(all_sets, best, key)
-    matrix = one.columns.mag if one.columns.on_mag else one.columns.gyro
-    added = np.zeros((len(track), 3)) if matrix is None else np.asarray(matrix @ value)
-    return added, "gauss" if one.columns.on_mag else "rad/s"
+    matrix = component.columns.mag if component.columns.on_mag else component.columns.gyro
+    contribution = np.zeros((len(track), 3)) if matrix is None else np.asarray(matrix @ value)
+    return contribution, "gauss" if component.columns.on_mag else "rad/s"
 
 
 def size_of(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
-    """How large a member surely is: an effect in its usual scales, all else in its unit.
+    """A lower limit of a member's size: of an effect in usual scales, of all else in its unit.
 
-    Of an effect what is beyond two deviations: where the motion hardly shows a coefficient, a large
-    one says nothing.
+    Of an effect: the largest coefficient less two deviations.  Where the motion hardly shows a
+    coefficient, a large value of it means nothing.
     """
-    one = all_sets.component(key)
-    if one.effect is not None and isinstance(one.law, ScaledLaw):
+    component = all_sets.component(key)
+    if component.effect is not None and isinstance(component.law, ScaledLaw):
         value, deviation = coefficients(all_sets, best, key)
-        return float(np.max(np.maximum(np.abs(value) - 2.0 * deviation, 0.0) / one.law.scale))
+        return float(np.max(np.maximum(np.abs(value) - 2.0 * deviation, 0.0) / component.law.scale))
     psi = all_sets.psi_of(best)[key]
-    return float(np.exp(psi[0])) * float(getattr(one.law, "unit", 1.0))
+    return float(np.exp(psi[0])) * float(getattr(component.law, "unit", 1.0))
 
 
-def names_of(all_sets: Hypotheses, best: Hypothesis) -> Sequence[str]:
-    """Effects in a set, sorted."""
+def effects_of(all_sets: Hypotheses, best: Hypothesis) -> Sequence[str]:
+    """Identifiers of the effects in a set, sorted."""
     return sorted(one for key in best.names if (one := all_sets.component(key).effect))
 
 
 def library_members(all_sets: Hypotheses, best: Hypothesis) -> list[str]:
-    """Members that the library has, without the delay."""
-    known = [key for key in sorted(best.names) if all_sets.component(key).row is not None]
-    return [key for key in known if key != LAG]
+    """Keys of the members that are effects of the library, without the delay."""
+    effects = [key for key in sorted(best.names) if all_sets.component(key).row is not None]
+    return [key for key in effects if key != LAG]
 
 
 def is_ordinary(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
     """Whether a member is no larger than what real recordings ordinarily have of its kind."""
     if key == LAG or not all_sets.is_real(best.names):
         return False
-    one = all_sets.component(key)
-    if one.jumps and _is_place(all_sets, key):
+    component = all_sets.component(key)
+    if component.jumps and _is_place_change(all_sets, key):
         return True
-    course = priors.ORDINARY_COURSE.get(one.frame, 0.0)
-    return size_of(all_sets, best, key) < (course if one.row is None else one.row.ordinary)
+    ordinary_size = priors.ORDINARY_COURSE.get(component.frame, 0.0)
+    return size_of(all_sets, best, key) < (
+        ordinary_size if component.row is None else component.row.ordinary
+    )
 
 
-def _is_place(all_sets: Hypotheses, key: str) -> bool:
-    """Whether a step of the field is where the sensor is lifted off a place or put down on it."""
-    one, recorded = all_sets.component(key), all_sets.made.point.problem.recorded
-    spells = still_intervals(recorded.time_s, recorded.gyro_b_rad_s)
-    if not spells or one.frame != "world":
+def _is_place_change(all_sets: Hypotheses, key: str) -> bool:
+    """Whether a step of the field is the sensor lifted off a place or put down on one."""
+    component, recorded = all_sets.component(key), all_sets.made.point.problem.recorded
+    intervals = still_intervals(recorded.time_s, recorded.gyro_b_rad_s)
+    if not intervals or component.frame != "world":
         return False
-    off = np.abs(np.ravel(spells)[:, None] - one.moments_s)
-    return bool(np.min(off) < 2.0 * priors.TRANSITION_S)
+    separation_s = np.abs(np.ravel(intervals)[:, None] - component.moments_s)
+    return bool(np.min(separation_s) < 2.0 * priors.TRANSITION_S)
 
 
 def nats_of_remainder(all_sets: Hypotheses, best: Hypothesis) -> float:
-    """By how much likelier a set is with what recordings ordinarily leave."""
+    """By how many nats a set is more probable than without its ordinary remainder."""
     without = best.names - frozenset(all_sets.remainder)
     return 0.0 if without == best.names else best.score - all_sets.judge(without).score
 
 
 def cost_if_left_out(all_sets: Hypotheses, best: Hypothesis, key: str) -> Cost:
-    """What the calibration would be off by in the set without a member."""
+    """How far off the calibration of the set would be without a member."""
     made = all_sets.made
-    middle, here = prior_of(made.point.problem.track).mean, made.point.filtered.model
-    fewer = all_sets.judge(all_sets.without(best.names, key), best)
-    left_out, known = (
-        model_from_coefficients(coefficients(all_sets, one, CALIBRATION)[0] + middle, here)
-        for one in (fewer, best)
+    prior_mean, current = prior_of(made.point.problem.track).mean, made.point.filtered.model
+    reduced = all_sets.judge(all_sets.without_member(best.names, key), best)
+    model_without, model_with = (
+        model_from_coefficients(coefficients(all_sets, one, CALIBRATION)[0] + prior_mean, current)
+        for one in (reduced, best)
     )
-    shift = np.linalg.norm(left_out.hard_iron_gauss - known.hard_iron_gauss)
-    return Cost(float(shift), heading_error_deg(left_out, known, made.context.field_b))
+    shift = np.linalg.norm(model_without.hard_iron_gauss - model_with.hard_iron_gauss)
+    return Cost(float(shift), heading_error_deg(model_without, model_with, made.context.field_b))

@@ -1,4 +1,4 @@
-"""Which delay it is: a late magnetometer, a filter, half a step of the gyro's integration."""
+"""The kind of a delay: a late magnetometer, a filter, half a step of the gyro's integration."""
 
 from __future__ import annotations
 
@@ -22,60 +22,63 @@ from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.samples import Array
 
 
-def which_delay(
+def delay_probabilities(
     all_sets: Hypotheses, best: Hypothesis, lag_s: Array, deviation_s: Array,
     library: Mapping[str, Effect],
 ) -> dict[str, float]:  # fmt: skip
-    """Which delay it is, with probabilities, that which is told first.
+    """Probabilities of the kinds of a delay, the largest first.
 
-    A filter's is as likely before the readings as any other, and told first only where its form is
-    surely there; half a step's where the delay is that and no other.
+    A priori a filter is as probable as any other kind; it comes first only if the readings clearly
+    show its form.  Half a step comes first only if the delay is half a step and no other.
     """
-    tau, unsure = float(lag_s[0]), float(deviation_s[0])
-    late = cast("Effect", all_sets.component(LAG).row)
-    plain = plain_delay(library, 1.0 if tau >= 0.0 else -1.0) or late
+    delay_s, sigma_s = float(lag_s[0]), float(deviation_s[0])
+    delay_row = cast("Effect", all_sets.component(LAG).row)
+    plain = plain_delay(library, 1.0 if delay_s >= 0.0 else -1.0) or delay_row
     nats = {plain.identifier: 0.0}
     half_s = _half_step_s(all_sets)
-    for row in library.values() if tau > 0.0 else ():
+    for row in library.values() if delay_s > 0.0 else ():
         if row.filters:
-            whole = _nats_of_filter(all_sets, best, tau)
-            nats[row.identifier] = whole if whole > priors.ODDS_REAL else min(whole, 0.0)
+            filter_nats = _filter_log_odds(all_sets, best, delay_s)
+            nats[row.identifier] = (
+                filter_nats if filter_nats > priors.ODDS_REAL else min(filter_nats, 0.0)
+            )
         elif row.of_step and half_s is not None:
-            miss, usual = (tau - half_s) / unsure, tau / priors.ORDINARY_LAG_S
-            point = 0.5 * (usual**2 - miss**2) + float(np.log(priors.ORDINARY_LAG_S / unsure))
-            nats[row.identifier] = point + float(np.log(priors.HALF_STEP))
+            offset, usual = (delay_s - half_s) / sigma_s, delay_s / priors.ORDINARY_LAG_S
+            nats_of_half = 0.5 * (usual**2 - offset**2)
+            nats_of_half += float(np.log(priors.ORDINARY_LAG_S / sigma_s))
+            nats[row.identifier] = nats_of_half + float(np.log(priors.HALF_STEP))
     total = np.logaddexp.reduce(list(nats.values()))
-    shares = {name: float(np.exp(one - total)) for name, one in nats.items()}
-    return dict(sorted(shares.items(), key=lambda item: -item[1]))
+    probabilities = {identifier: float(np.exp(one - total)) for identifier, one in nats.items()}
+    return dict(sorted(probabilities.items(), key=lambda item: -item[1]))
 
 
-def _nats_of_filter(all_sets: Hypotheses, best: Hypothesis, tau: float) -> float:
-    """What the readings say for all of a delay being a filter's against none of it; -inf of a part.
+def _filter_log_odds(all_sets: Hypotheses, best: Hypothesis, delay_s: float) -> float:
+    """Log odds of all of a delay being a filter's against none of it; -inf if it is a part.
 
-    Where the readings hardly show a filter's form, next to nothing.  Nor where they have more of it
-    than a filter has: then it is neither of the two.
+    Nearly zero where the readings hardly show a filter's form.  Zero at most where they show more
+    of it than a filter has: then it is neither of the two.
     """
     if LAG_FORM in best.keys:
         value, deviation = (float(one[0]) for one in coefficients(all_sets, best, LAG_FORM))
     else:
-        form = delay_form(all_sets.made.context, tau)
+        form = delay_form(all_sets.made.context, delay_s)
         scan = candidate_scan(all_sets.made, best.keys, best.at)
         value, deviation = (float(one[0]) for one in scan.estimate(form))
-    shown = max(deviation**-2 - priors.LAG_IS_FILTER**-2, 1e-9)  # without what was believed before
-    part = value / (deviation**2 * shown)
-    nats = shown * (part - 0.5)
-    if abs(part - 1.0) < max(2.0 / np.sqrt(shown), priors.NEARLY_ALL):
+    information = max(deviation**-2 - priors.LAG_IS_FILTER**-2, 1e-9)  # less the prior's
+    filter_share = value / (deviation**2 * information)
+    nats = information * (filter_share - 0.5)
+    if abs(filter_share - 1.0) < max(2.0 / np.sqrt(information), priors.NEARLY_ALL):
         return nats
-    return min(nats, 0.0) if part > 1.0 else -np.inf
+    return min(nats, 0.0) if filter_share > 1.0 else -np.inf
 
 
 def _half_step_s(all_sets: Hypotheses) -> float | None:
-    """Half of the recording's step, None where the steps are not alike."""
+    """Half of the recording's time step; None if the steps differ."""
     step_s = usual_step(all_sets.made.point.problem.recorded.dt_s)
     return None if step_s is None else step_s / 2.0
 
 
 def delay_unit(all_sets: Hypotheses, effect: Effect) -> float:
-    """Seconds of an effect's unit of delay."""
+    """The unit of an effect's delay in seconds."""
     half_s = _half_step_s(all_sets) if effect.of_step else None
     return 1.0 if half_s is None else half_s

@@ -1,1 +1,1 @@
-"""The likeliest set of components, and what may be put into one."""
+"""The search for the most probable set of components, and what a set may contain."""

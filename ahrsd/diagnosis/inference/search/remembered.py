@@ -1,10 +1,10 @@
-"""What iron has from before the recording, along each axis, sought beside a model.
+"""The memory that iron has from before the recording, along each axis, fitted given a model.
 
-The middle of a play operator, or what is behind by when the recording begins (setting `memory`), is
-no coefficient: it is in the columns.  Near where it is sought its change is linear, and the
-likeliest change beside the coefficients is one step; where it is not (a play that has met its end)
-each axis is moved by itself.  All of it in the sensor's own noise: what is not yet explained is
-noise still.
+The middle of a play operator, or how far viscous iron lags the field, at the start of the recording
+(setting `memory`) is not a coefficient: it is in the columns.  Near its present value the columns
+change linearly with it, and one step leads to the memory of the largest posterior.  Where they do
+not (a play that has reached its end) each axis is changed separately.  All of it is done at the
+sensor's own noise: at a higher noise level, what is not yet explained still counts as noise.
 """
 
 from __future__ import annotations
@@ -14,32 +14,38 @@ import numpy as np
 from ahrsd.diagnosis.effects.effect import Setting
 from ahrsd.diagnosis.inference.components.component import Component
 from ahrsd.diagnosis.inference.likelihood.candidates import CandidateScan
-from ahrsd.diagnosis.inference.search.near_settings import changed, opened
+from ahrsd.diagnosis.inference.search.near_settings import perturbed_settings, with_setting_slopes
 from ahrsd.samples import Array
 
-#: digits to which it is sought, of what may be remembered
+#: digits to which the memory is rounded, relative to the largest one
 _DIGITS = 3
 
 
-def remembered(scan: CandidateScan, one: Component, round_: int) -> list[Setting]:
-    """Settings of an effect with another memory, nearer by the round; none where it has none."""
-    row = one.row
+def memory_settings(scan: CandidateScan, component: Component, round_: int) -> list[Setting]:
+    """Settings of an effect with another memory, nearer in each round; none if it has no memory."""
+    row = component.row
     if row is None or not row.remembers:
         return []
-    most, memory = row.remembers, np.array(one.setting.get("memory", (0.0, 0.0, 0.0)))
-    moved = memory + np.vstack([np.eye(3), -np.eye(3)]) * most / 2**round_
-    found = np.clip(np.vstack([moved, memory + _step(scan, one, memory)]), -most, most)
-    found = np.round(found / most, _DIGITS) * most
-    kept = {tuple(each) for each in found.tolist()} - {tuple(memory.tolist())}
-    return [{**one.setting, "memory": each} for each in sorted(kept)]
+    most, memory = row.remembers, np.array(component.setting.get("memory", (0.0, 0.0, 0.0)))
+    axis_steps = memory + np.vstack([np.eye(3), -np.eye(3)]) * most / 2**round_
+    proposals = np.clip(
+        np.vstack([axis_steps, memory + _memory_step(scan, component, memory)]), -most, most
+    )
+    proposals = np.round(proposals / most, _DIGITS) * most
+    kept = {tuple(each) for each in proposals.tolist()} - {tuple(memory.tolist())}
+    return [{**component.setting, "memory": each} for each in sorted(kept)]
 
 
-def _step(scan: CandidateScan, one: Component, memory: Array) -> Array:
-    """(3,) to the likeliest memory as it is seen from here."""
+def _memory_step(scan: CandidateScan, component: Component, memory: Array) -> Array:
+    """(3,) the linear step to the most probable memory."""
     context = scan.made.context
-    nearby = {k: each for k, each in changed(one, context).items() if k.startswith("memory")}
-    whole = opened(one, context, scan.estimate(one)[0], nearby)
-    if whole is None:
+    perturbed = {
+        k: each
+        for k, each in perturbed_settings(component, context).items()
+        if k.startswith("memory")
+    }
+    with_slopes = with_setting_slopes(component, context, scan.estimate(component)[0], perturbed)
+    if with_slopes is None:
         return np.zeros(3)
-    parts = np.array([each["memory"] for each in nearby.values()]) - memory
-    return np.asarray(scan.estimate(whole)[0][-len(nearby) :] @ parts)
+    parts = np.array([each["memory"] for each in perturbed.values()]) - memory
+    return np.asarray(scan.estimate(with_slopes)[0][-len(perturbed) :] @ parts)

@@ -1,4 +1,4 @@
-"""What a search at one point may choose from: the library's settings there, courses, forms."""
+"""What a search at one point may choose from: the library's settings, free processes, forms."""
 
 from __future__ import annotations
 
@@ -27,109 +27,118 @@ from ahrsd.diagnosis.inference.search.model_search import (
     Hypothesis,
     Names,
     Space,
-    searched,
+    beam_search,
 )
-from ahrsd.diagnosis.inference.search.remembered import remembered
-from ahrsd.diagnosis.inference.search.switching_sources import switching
+from ahrsd.diagnosis.inference.search.remembered import memory_settings
+from ahrsd.diagnosis.inference.search.switching_sources import find_switching_sources
 
-COURSES = ("free sensor", "free world", "free gyro")
-#: columns that are made before the first of them pass the filter
-_TOGETHER = 500
+FREE_PROCESSES = ("free sensor", "free world", "free gyro")
+#: columns that are computed before they pass the filter as a batch
+_BATCH_COLUMNS = 500
 
 
-def best_at(
-    rich: FittedPoint, library: Mapping[str, Effect], named: Sequence[Component], was_real: bool
+def search_at_point(
+    fitted: FittedPoint, library: Mapping[str, Effect], effects: Sequence[Component], was_real: bool
 ) -> tuple[Hypotheses, Space, Hypothesis]:
-    """The likeliest set at a richest model, searched from what is known and from nothing."""
-    base = rich.base
-    all_sets, space = space_at(rich, library, named)
+    """The most probable set at a richest model, searched from known effects and from nothing.
+
+    was_real: whether the set in which the effects were found had the ordinary remainder
+    """
+    base = fitted.base
+    all_sets, space = build_search_space(fitted, library, effects)
     made = all_sets.made
     real = frozenset(base.remainder)
-    known = all_sets.without(frozenset(one.key for one in named), LAG)
+    known = all_sets.without_member(frozenset(one.key for one in effects), LAG)
     lag = frozenset([LAG]) & made.seen.keys()
-    starts: list[Names] = [frozenset(), lag, real | lag, real | lag | {COURSES[0]}]
+    starts: list[Names] = [frozenset(), lag, real | lag, real | lag | {FREE_PROCESSES[0]}]
     if known:
-        here = known | real if was_real else known
-        starts = [here, known, here | {COURSES[0]}, here | set(COURSES[:2]) - real]
+        start = known | real if was_real else known
+        starts = [start, known, start | {FREE_PROCESSES[0]}, start | set(FREE_PROCESSES[:2]) - real]
     if not (known and was_real):
-        _offered(all_sets, space, all_sets.judge(()))
-    found = searched(all_sets, space, starts)
-    if not all_sets.is_real(found[0].names):
-        new = [found[0].names | {key} for key in _offered(all_sets, space, found[0])]
-        if new:
-            found = searched(all_sets, space, [found[0].names, *new])
-    return all_sets, space, found[0]
+        _add_switching_sources(all_sets, space, all_sets.judge(()))
+    hypotheses = beam_search(all_sets, space, starts)
+    if not all_sets.is_real(hypotheses[0].names):
+        extended = [
+            hypotheses[0].names | {key}
+            for key in _add_switching_sources(all_sets, space, hypotheses[0])
+        ]
+        if extended:
+            hypotheses = beam_search(all_sets, space, [hypotheses[0].names, *extended])
+    return all_sets, space, hypotheses[0]
 
 
-def _offered(all_sets: Hypotheses, space: Space, here: Hypothesis) -> list[str]:
-    """Keys of sources that switch, as a set leaves them, put among what may be in one."""
-    new = switching(all_sets, here)
-    all_sets.made.add(new)
-    space.sources.extend(one.key for one in new if one.key not in space.sources)
-    return [one.key for one in new]
+def _add_switching_sources(all_sets: Hypotheses, space: Space, hypothesis: Hypothesis) -> list[str]:
+    """Keys of the switching sources in a set's residual, which are added to the space."""
+    sources = find_switching_sources(all_sets, hypothesis)
+    all_sets.made.add(sources)
+    space.sources.extend(one.key for one in sources if one.key not in space.sources)
+    return [one.key for one in sources]
 
 
-def _by_hundreds(
+def _batches(
     parts: Iterable[tuple[str, list[Component]]],
 ) -> Iterator[list[tuple[str, list[Component]]]]:
-    """Effects together that have some hundred columns: few batches, and few columns at a time."""
-    some: list[tuple[str, list[Component]]] = []
+    """Effects in batches of some hundred columns, which limits both batches and memory."""
+    batch: list[tuple[str, list[Component]]] = []
     for one in parts:
-        some.append(one)
-        if sum(each.width for _, found in some for each in found) >= _TOGETHER:
-            yield some
-            some = []
-    if some:
-        yield some
+        batch.append(one)
+        if sum(each.width for _, components in batch for each in components) >= _BATCH_COLUMNS:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
 
 
-def _passed(
+def _filter_library(
     made: Linearised, library: Mapping[str, Effect]
 ) -> tuple[dict[str, list[str]], list[Component]]:
-    """Keys of the library's components by effect, all passed; and those that hold the delay."""
+    """Keys of the library's components by effect, all passed through the filter.
+
+    Also the components that contain the delay; each is there with the delay projected out as well.
+    """
     delay = made.seen[LAG].component if LAG in made.seen else None
-    whole: list[Component] = []
+    containing_delay: list[Component] = []
     effects: dict[str, list[str]] = {}
-    for some in _by_hundreds(library_components(made.context, library)):
-        passed = []
-        for name, parts in some:
-            held = [] if delay is None or not contains_component(parts[0], delay) else parts
-            beside = [] if delay is None else [project_out(one, delay) for one in held]
-            effects[name] = [one.key for one in (*parts, *beside)]
-            passed += [*parts, *beside]
-            whole += held
-        made.add(passed)
-        made.make_columns_lazy([one for _, parts in some for one in parts])
+    for batch in _batches(library_components(made.context, library)):
+        components = []
+        for identifier, parts in batch:
+            containing = [] if delay is None or not contains_component(parts[0], delay) else parts
+            projected = [] if delay is None else [project_out(one, delay) for one in containing]
+            effects[identifier] = [one.key for one in (*parts, *projected)]
+            components += [*parts, *projected]
+            containing_delay += containing
+        made.add(components)
+        made.make_columns_lazy([one for _, parts in batch for one in parts])
     if delay is not None:
         effects[delay.effect or LAG] = [LAG]
-    return effects, whole
+    return effects, containing_delay
 
 
-def space_at(
-    rich: FittedPoint, library: Mapping[str, Effect], named: Sequence[Component]
+def build_search_space(
+    fitted: FittedPoint, library: Mapping[str, Effect], accepted: Sequence[Component]
 ) -> tuple[Hypotheses, Space]:
-    """The sets at a richest model, none judged yet, and what they may be made of."""
-    base = rich.base
+    """The sets at a richest model, none fitted yet, and what they may be made of."""
+    base = fitted.base
     made, context = base.made.copy(), base.made.context
-    effects, whole = _passed(made, library)
+    effects, containing_delay = _filter_library(made, library)
     forms = {}
-    for one in named:
-        listed = effects.setdefault(one.effect or one.key, [])
-        if one.key not in listed:
-            listed.append(one.key)
+    for one in accepted:
+        keys = effects.setdefault(one.effect or one.key, [])
+        if one.key not in keys:
+            keys.append(one.key)
         form = form_component(one, context, library)
         if form is not None:
             made.add([form])
             forms[one.key] = form.key
     if LAG_FORM in made.seen:
         forms[LAG] = LAG_FORM
-    psi = psi_by_key(made, base.whole, rich.at)
-    holding = {one.key: projected_key(one.key) for one in whole}
-    all_sets = Hypotheses(made, base.remainder, rich.at.log_noise, psi, forms, holding)
+    psi = psi_by_key(made, base.whole, fitted.at)
+    projected = {one.key: projected_key(one.key) for one in containing_delay}
+    all_sets = Hypotheses(made, base.remainder, fitted.at.log_noise, psi, forms, projected)
     all_sets.unknown_nats = 0.0 if made.point.directed is None else made.point.directed.nats
     length_s = context.track.duration_s
 
-    def made_of(one: Component, settings: Iterable[Setting]) -> list[Component]:
+    def refined(one: Component, settings: Iterable[Setting]) -> list[Component]:
         if one.row is None or one.key == LAG:
             return []
         row, tried = one.row, max(priors.SOUGHT_SETTINGS, len(effects[one.row.identifier]))
@@ -138,27 +147,35 @@ def space_at(
             for one in settings
         ]
 
-    def finer(one: Component, round_: int) -> list[Component]:
-        return made_of(one, neighbouring_settings(one.setting, length_s, round_))
+    def refine_setting(one: Component, round_: int) -> list[Component]:
+        return refined(one, neighbouring_settings(one.setting, length_s, round_))
 
-    def closer(scan: CandidateScan, one: Component, round_: int) -> list[Component]:
-        return made_of(one, remembered(scan, one, round_))
+    def refine_memory(scan: CandidateScan, one: Component, round_: int) -> list[Component]:
+        return refined(one, memory_settings(scan, one, round_))
 
-    def left_of(one: Component) -> Component | None:
+    def form_of_component(one: Component) -> Component | None:
         return form_component(one, context, library)
 
     def steps_at(time_s: float) -> list[Component]:
         setting = {"onset_s": round(time_s, 3)}
-        jumping = [row for row in library.values() if row.jumps]
+        step_effects = [row for row in library.values() if row.jumps]
         return [
             effect_component(context, row, setting, priors.PROPOSED_ONSETS).with_lazy_columns(
                 context
             )
-            for row in jumping
+            for row in step_effects
         ]
 
-    def come_and_gone(begins: Component, ends: Component) -> list[Component]:
+    def components_between(begins: Component, ends: Component) -> list[Component]:
         return interval_components(begins, ends, context, library, priors.SOUGHT_SETTINGS**2)
 
-    space = Space(effects, COURSES, finer, closer, left_of, steps_at, come_and_gone)
+    space = Space(
+        effects,
+        FREE_PROCESSES,
+        refine_setting,
+        refine_memory,
+        form_of_component,
+        steps_at,
+        components_between,
+    )
     return all_sets, space

@@ -1,18 +1,17 @@
-"""Sources that switch: one that comes and goes, and one that goes from level to level.
+"""Sources that switch: one that comes and goes, and one with a level that changes.
 
-Of the first there is nothing for most of the time, and for spells a field of its own.
+A source that switches on, hits, rings or passes, once or often, shows as bursts of seconds.  A
+Gaussian process in time over the whole recording is no model of that, and noise of any colour,
+whose level is constant in time, absorbs its evidence.  Here a two-state Markov chain says when the
+source is on.  The source is zero while it is off, and a free function of time while it is on:
 
-What switches now and then, hits, rings or passes, once or often, shows as bursts of seconds.  A
-course in time over the whole recording is no law of that, and beside noise of any colour, which is
-as loud all of the time, no evidence of it is left.  Here the time is a chain of two states, and
-while it is on the source is a free course:
-
-    x(t) = sum_k w_k cos(pi k (t - t0) / T) in a spell from t0 to t0 + T,  k from 0 on
+    x(t) = sum_k w_k cos(pi k (t - t0) / T) in an interval from t0 to t0 + T,  k = 0, 1, ...
     var w_k = size^2 / (1 + (k / T corner)^2)
 
-The other has levels of one size between moments at which it changes, which come at any time.
+The second kind has levels of one size between change points, which come at any time.
 
-States and moments are found in the residual of a set, and paid with their probability.
+States and change points are found in the residual of a set; their log probability is a part of the
+prior odds.
 """
 
 from __future__ import annotations
@@ -42,19 +41,19 @@ from ahrsd.diagnosis.where_and_when.locate import (
 )
 from ahrsd.samples import Array
 
-#: frames in which such a source is asked
+#: frames of such sources
 FRAMES: tuple[Frame, ...] = ("sensor", "world")
-#: rounds in which size and states are found of each other
+#: alternations between the size and the states of the chain
 _ROUNDS = 8
-#: half waves with which ends are sought, and steps to each side
-_FEW, _AWAY = 3, 2
+#: half waves of the trial components that refine an end, and steps tried to each side
+_END_WAVES, _END_STEPS = 3, 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SpellLaw:
+class IntervalLaw:
     """psi: logarithms of the size, in `unit`, and of the corner, in half waves a second.
 
-    order (q,): half waves a second of each coefficient, 0 of a mean
+    order (q,): half waves a second of each coefficient, 0 for a mean
     """
 
     order: Array
@@ -92,203 +91,235 @@ class SpellLaw:
 
     def log_prior(self, psi: Array) -> tuple[float, Array]:
         """Log density of psi and its gradient (k,)."""
-        each = [
+        terms = [
             log_density(value, 0.0, 0.0, low, high)
             for value, low, high in zip(psi, self.low, self.high, strict=True)
         ]
-        return sum(nats for nats, _ in each), np.concatenate([slope for _, slope in each])
+        return sum(nats for nats, _ in terms), np.concatenate([slope for _, slope in terms])
 
 
-def switching(all_sets: Hypotheses, here: Hypothesis) -> list[Component]:
-    """What a set leaves as sources that switch, in each frame; none where nothing does."""
+def find_switching_sources(all_sets: Hypotheses, hypothesis: Hypothesis) -> list[Component]:
+    """Components for the switching sources in a set's residual, in each frame; may be empty."""
     made = all_sets.made
-    left = made.residual(here.keys, here.at) / made.point.loud.amplitude[:, None]
-    left = np.where(made.point.filtered.used[:, None], left, 0.0)
+    residual = made.residual(hypothesis.keys, hypothesis.at) / made.point.loud.amplitude[:, None]
+    residual = np.where(made.point.filtered.used[:, None], residual, 0.0)
     rows = max(1, round(priors.SPELL_PIECE_S * made.point.problem.rate_hz))
-    spells, log_odds = _spells(left, made.point.filtered.used, rows, made.point.problem.rate_hz)
-    # of what is often alike noise of a colour would leave nothing
-    quiet = replace(here.at, log_noise=np.full(len(here.at.log_noise), here.at.log_noise[-1]))
-    found: list[Component] = []
-    if spells:
-        spells = _closest(all_sets, here, quiet, spells, rows)
-        log_odds -= 2 * len(spells) * float(np.log(rows))  # ends are sought to a row, not a piece
-        found += [_coming(made.context, frame, spells, log_odds) for frame in FRAMES]
-    left = made.residual(here.keys, quiet) / made.point.loud.amplitude[:, None]
-    left = np.where(made.point.filtered.used[:, None], left, 0.0)
-    moments = changes(left, 2 * rows)
-    if priors.CHANGES <= len(moments) <= priors.MOST_WAVES:
-        found += [_levels(made.context, frame, moments) for frame in FRAMES]
-    return found
+    intervals, log_odds = _find_intervals(
+        residual, made.point.filtered.used, rows, made.point.problem.rate_hz
+    )
+    # coloured noise would absorb a source that often has the same form: use the sensor's noise
+    sensor_noise = replace(
+        hypothesis.at, log_noise=np.full(len(hypothesis.at.log_noise), hypothesis.at.log_noise[-1])
+    )
+    components: list[Component] = []
+    if intervals:
+        intervals = _refine_interval_ends(all_sets, hypothesis, sensor_noise, intervals, rows)
+        # the ends are fitted to a row, not to a piece
+        log_odds -= 2 * len(intervals) * float(np.log(rows))
+        components += [
+            _interval_component(made.context, frame, intervals, log_odds) for frame in FRAMES
+        ]
+    residual = made.residual(hypothesis.keys, sensor_noise) / made.point.loud.amplitude[:, None]
+    residual = np.where(made.point.filtered.used[:, None], residual, 0.0)
+    change_rows = change_points(residual, 2 * rows)
+    if priors.CHANGES <= len(change_rows) <= priors.MOST_WAVES:
+        components += [_level_component(made.context, frame, change_rows) for frame in FRAMES]
+    return components
 
 
-def _spells(
-    left: Array, used: NDArray[np.bool], rows: int, rate_hz: float
+def _find_intervals(
+    residual: Array, used: NDArray[np.bool], rows: int, rate_hz: float
 ) -> tuple[list[tuple[int, int]], float]:
-    """Rows from and to which a source is on, of a residual of unit variance, and their odds."""
-    starts = np.arange(0, len(left), rows)
-    sums = np.add.reduceat(left, starts)
+    """Intervals (first row, row behind the last) in which a source is on, and their log odds.
+
+    residual: (N, 3) of unit variance
+    """
+    starts = np.arange(0, len(residual), rows)
+    sums = np.add.reduceat(residual, starts)
     count = np.add.reduceat(used.astype(float), starts)
-    on, log_odds = likeliest_states(np.sum(sums**2, axis=1), count, rows / rate_hz)
+    on, log_odds = most_probable_states(np.sum(sums**2, axis=1), count, rows / rate_hz)
     if np.mean(on) > priors.MOST_ON:
         return [], 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]]))).reshape(-1, 2)
-    return [(int(a) * rows, min(int(b) * rows, len(left))) for a, b in edges], log_odds
+    return [(int(a) * rows, min(int(b) * rows, len(residual))) for a, b in edges], log_odds
 
 
-def _closest(
-    all_sets: Hypotheses, here: Hypothesis, at: ModelFit, spells: list[tuple[int, int]], rows: int
+def _refine_interval_ends(
+    all_sets: Hypotheses,
+    hypothesis: Hypothesis,
+    at: ModelFit,
+    intervals: list[tuple[int, int]],
+    rows: int,
 ) -> list[tuple[int, int]]:
-    """Spells with their ends where the readings are likeliest.
+    """The intervals with their ends at the largest evidence.
 
-    A filter follows what stays, and swings back behind it: a residual has other ends.
+    A filter follows a constant field, and swings back behind it: the residual has other ends.
     """
     made, count = all_sets.made, len(all_sets.made.context.track)
-    scan = candidate_scan(made, here.keys, at)
+    scan = candidate_scan(made, hypothesis.keys, at)
     for step in (rows, rows, max(1, rows // 2), 1):
         for end in (1, 0):
-            tried: dict[str, tuple[int, tuple[int, int]]] = {}
-            new = []
-            for number, spell in enumerate(spells):
-                for away in range(-_AWAY, _AWAY + 1):
-                    a, b = (spell[k] + away * step * (k == end) for k in (0, 1))
+            interval_by_key: dict[str, tuple[int, tuple[int, int]]] = {}
+            candidates = []
+            for number, interval in enumerate(intervals):
+                for offset in range(-_END_STEPS, _END_STEPS + 1):
+                    a, b = (interval[k] + offset * step * (k == end) for k in (0, 1))
                     if not 0 <= a < b - 1 < count:
                         continue
-                    one = _coming(made.context, "sensor", [(a, b)], 0.0, _FEW)
-                    tried[one.key] = number, (a, b)
-                    new.append(one)
-            trial = made.copy()  # what was tried ends with its round
-            trial.add(new)
-            worth = replace(scan, made=trial).log_bayes_factors(list(tried))
+                    component = _interval_component(
+                        made.context, "sensor", [(a, b)], 0.0, _END_WAVES
+                    )
+                    interval_by_key[component.key] = number, (a, b)
+                    candidates.append(component)
+            trial = made.copy()  # the trial components of a round are not kept
+            trial.add(candidates)
+            worth = replace(scan, made=trial).log_bayes_factors(list(interval_by_key))
             best: dict[int, float] = {}
             for key, nats in worth.items():
-                number, spell = tried[key]
+                number, interval = interval_by_key[key]
                 if nats > best.get(number, -np.inf):
-                    best[number], spells[number] = nats, spell
-    return _joined(spells)
+                    best[number], intervals[number] = nats, interval
+    return _merge_overlapping(intervals)
 
 
-def _joined(spells: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """In their order, and those that overlap as one."""
-    out: list[tuple[int, int]] = []
-    for a, b in sorted(spells):
-        if out and a <= out[-1][1]:
-            out[-1] = out[-1][0], max(b, out[-1][1])
+def _merge_overlapping(intervals: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Sorted intervals; those that overlap are merged."""
+    merged: list[tuple[int, int]] = []
+    for a, b in sorted(intervals):
+        if merged and a <= merged[-1][1]:
+            merged[-1] = merged[-1][0], max(b, merged[-1][1])
         else:
-            out.append((a, b))
-    return out
+            merged.append((a, b))
+    return merged
 
 
-def changes(left: Array, rows: int) -> list[int]:
-    """Rows at which the mean of a residual of unit variance (N, 3) jumps.
+def change_points(residual: Array, rows: int) -> list[int]:
+    """Rows at which the mean of a residual (N, 3) of unit variance jumps.
 
-    rows: before and behind, of which means are held against each other
+    rows: number of rows before and behind whose means are compared
     """
-    total = np.vstack([np.zeros(3), np.cumsum(left, axis=0)])
-    at = np.arange(rows, len(left) - rows + 1)
-    jump = (total[at + rows] - 2.0 * total[at] + total[at - rows]) / rows
+    cumulative = np.vstack([np.zeros(3), np.cumsum(residual, axis=0)])
+    middle = np.arange(rows, len(residual) - rows + 1)
+    jump = (cumulative[middle + rows] - 2.0 * cumulative[middle] + cumulative[middle - rows]) / rows
     square = 0.5 * rows * np.sum(jump**2, axis=1)
-    found: list[int] = []
+    points: list[int] = []
     for k in np.argsort(-square):
         if square[k] < priors.JUMPS:
             break
-        if all(abs(int(at[k]) - one) >= rows for one in found):
-            found.append(int(at[k]))
-        if len(found) > priors.MOST_WAVES:
+        if all(abs(int(middle[k]) - one) >= rows for one in points):
+            points.append(int(middle[k]))
+        if len(points) > priors.MOST_WAVES:
             break
-    return sorted(found)
+    return sorted(points)
 
 
-def _levels(context: Context, frame: Frame, moments: Sequence[int]) -> Component:
-    """One field from each moment (a row) to the next, along each axis of a frame."""
+def _level_component(context: Context, frame: Frame, change_rows: Sequence[int]) -> Component:
+    """A constant field between consecutive change points (rows), along each axis of a frame."""
     time_s = context.track.time_s
-    edges = np.array([time_s[0], *time_s[list(moments)], time_s[-1]])
+    edges = np.array([time_s[0], *time_s[list(change_rows)], time_s[-1]])
     columns = frame_columns(context, frame, segments_between(time_s, edges))
     low, high = (np.array([np.log(one)]) for one in priors.COURSE_SIZES)
     unit = priors.COURSE_UNIT[frame]
     law = ScaledLaw(np.full(columns.width, unit), low, high)
-    lasting = float(time_s[-1] - time_s[0])
-    odds = float(np.log(priors.COURSE * _share(frame))) - lasting / priors.BETWEEN_S
-    odds += len(moments) * float(np.log(lasting / len(time_s) / priors.BETWEEN_S))
-    key = f"{frame} that changes {len(moments)} times from {edges[1]:.3f} s on"
-    return Component(key, frame, columns, law, odds, setting={"edges_s": tuple(edges.tolist())})
+    duration_s = float(time_s[-1] - time_s[0])
+    log_odds = (
+        float(np.log(priors.COURSE * _frame_probability(frame))) - duration_s / priors.BETWEEN_S
+    )
+    log_odds += len(change_rows) * float(np.log(duration_s / len(time_s) / priors.BETWEEN_S))
+    key = f"{frame} that changes {len(change_rows)} times from {edges[1]:.3f} s on"
+    return Component(key, frame, columns, law, log_odds, setting={"edges_s": tuple(edges.tolist())})
 
 
-def likeliest_states(square: Array, count: Array, piece_s: float) -> tuple[NDArray[np.bool], float]:
-    """Which pieces of time a source is on in, and the log probability of such a chain.
+def most_probable_states(
+    square: Array, count: Array, piece_s: float
+) -> tuple[NDArray[np.bool], float]:
+    """The pieces of time in which a source is on, and the log probability of that chain.
 
-    square (n,): of the sum of a piece's rows, each of three numbers of unit variance
-    count (n,): rows of each
-    A piece that is on has a mean of its own, of one variance for all.
+    square (n,): squared norm of the sum of a piece's rows, each of three numbers of unit variance
+    count (n,): rows of each piece
+    A piece that is on has a mean of its own; all these means have one variance.
     """
     stay_on, stay_off = np.exp(-piece_s / priors.SPELL_S), np.exp(-piece_s / priors.BETWEEN_S)
-    move = np.log([[stay_off, 1.0 - stay_off], [1.0 - stay_on, stay_on]])
+    log_transition = np.log([[stay_off, 1.0 - stay_off], [1.0 - stay_on, stay_on]])
     variance = float(np.quantile(square / np.maximum(count, 1.0) ** 2, 0.99)) / 3.0
     on = np.zeros(len(square), dtype=bool)
     for _ in range(_ROUNDS):
         scale = 1.0 + count * variance
-        worth = 0.5 * square * variance / scale - 1.5 * np.log(scale)
-        before, on = on, _viterbi(worth, move)
-        if not on.any() or np.array_equal(before, on):
+        log_factors = 0.5 * square * variance / scale - 1.5 * np.log(scale)
+        previous, on = on, _viterbi(log_factors, log_transition)
+        if not on.any() or np.array_equal(previous, on):
             break
-        seen = square[on] / np.maximum(count[on], 1.0) ** 2 - 3.0 / np.maximum(count[on], 1.0)
-        variance = max(float(np.mean(seen)) / 3.0, 1e-12)
+        mean_square = square[on] / np.maximum(count[on], 1.0) ** 2 - 3.0 / np.maximum(
+            count[on], 1.0
+        )
+        variance = max(float(np.mean(mean_square)) / 3.0, 1e-12)
     states = on.astype(int)
-    return on, float(np.sum(move[states[:-1], states[1:]])) + float(move[0, states[0]])
+    return on, float(np.sum(log_transition[states[:-1], states[1:]])) + float(
+        log_transition[0, states[0]]
+    )
 
 
-def _viterbi(worth: Array, move: Array) -> NDArray[np.bool]:
-    """The likeliest states of a chain that begins off; worth (n,): of being on, nats."""
-    score, back = np.array([0.0, -np.inf]), np.zeros((len(worth), 2), dtype=np.intp)
-    for k, nats in enumerate(worth):
-        through = score[:, None] + move
-        back[k] = np.argmax(through, axis=0)
-        score = np.max(through, axis=0) + np.array([0.0, nats])
-    states = np.zeros(len(worth), dtype=np.intp)
+def _viterbi(log_factors: Array, log_transition: Array) -> NDArray[np.bool]:
+    """The most probable states of a chain that starts off.
+
+    log_factors (n,): evidence that each piece is on, nats;  log_transition (2, 2): from, to
+    """
+    score, predecessor = np.array([0.0, -np.inf]), np.zeros((len(log_factors), 2), dtype=np.intp)
+    for k, nats in enumerate(log_factors):
+        transitions = score[:, None] + log_transition
+        predecessor[k] = np.argmax(transitions, axis=0)
+        score = np.max(transitions, axis=0) + np.array([0.0, nats])
+    states = np.zeros(len(log_factors), dtype=np.intp)
     state = int(np.argmax(score))
-    for k in range(len(worth) - 1, -1, -1):
-        states[k], state = state, int(back[k, state])
+    for k in range(len(log_factors) - 1, -1, -1):
+        states[k], state = state, int(predecessor[k, state])
     return states.astype(bool)
 
 
-def _coming(
+def _interval_component(
     context: Context,
     frame: Frame,
-    spells: Sequence[tuple[int, int]],
+    intervals: Sequence[tuple[int, int]],
     log_odds: float,
-    most: int = priors.MOST_WAVES,
+    most_waves: int = priors.MOST_WAVES,
 ) -> Component:
-    """A free course in each spell, rows from and to, along each axis of a frame.
+    """A free function of time in each interval (first row, row behind the last), on each axis.
 
-    most: half waves of one
+    most_waves: of one interval
     """
     time_s = context.track.time_s
     step_s = float(time_s[-1] - time_s[0]) / (len(time_s) - 1)
-    lasting = step_s * sum(b - a for a, b in spells)
-    shortest_s = max(priors.SPELL_PIECE_S, lasting / priors.MOST_WAVES)
-    counts = [int(np.clip(round(step_s * (b - a) / shortest_s), 1, most)) for a, b in spells]
-    order = [
-        np.arange(count) / (step_s * (b - a)) for (a, b), count in zip(spells, counts, strict=True)
+    total_s = step_s * sum(b - a for a, b in intervals)
+    shortest_s = max(priors.SPELL_PIECE_S, total_s / priors.MOST_WAVES)
+    counts = [
+        int(np.clip(round(step_s * (b - a) / shortest_s), 1, most_waves)) for a, b in intervals
     ]
-    waves = partial(_waves, len(time_s), tuple(spells), counts)
-    columns = columns_in_frame(context, frame, waves, sum(counts))
-    law = SpellLaw(np.repeat(np.concatenate(order), 3), priors.COURSE_UNIT[frame])
-    spans = tuple((float(time_s[a]), float(time_s[b - 1])) for a, b in spells)
+    frequencies = [
+        np.arange(count) / (step_s * (b - a))
+        for (a, b), count in zip(intervals, counts, strict=True)
+    ]
+    time_functions = partial(_interval_cosines, len(time_s), tuple(intervals), counts)
+    columns = columns_in_frame(context, frame, time_functions, sum(counts))
+    law = IntervalLaw(np.repeat(np.concatenate(frequencies), 3), priors.COURSE_UNIT[frame])
+    spans = tuple((float(time_s[a]), float(time_s[b - 1])) for a, b in intervals)
     key = f"{frame} that is there from and to {spans} s"
-    odds = float(np.log(priors.COURSE * _share(frame))) + log_odds
-    return Component(key, frame, columns, law, odds, setting={"spans_s": spans})
+    log_prior = float(np.log(priors.COURSE * _frame_probability(frame))) + log_odds
+    return Component(key, frame, columns, law, log_prior, setting={"spans_s": spans})
 
 
-def _waves(rows: int, spells: Sequence[tuple[int, int]], counts: Sequence[int]) -> Array:
-    """(rows, sum of counts) half waves in each spell, from its mean on."""
-    out = np.zeros((rows, sum(counts)))
+def _interval_cosines(
+    rows: int, intervals: Sequence[tuple[int, int]], counts: Sequence[int]
+) -> Array:
+    """(rows, sum of counts) half waves in each interval, beginning with its mean."""
+    cosines = np.zeros((rows, sum(counts)))
     first = 0
-    for (a, b), count in zip(spells, counts, strict=True):
+    for (a, b), count in zip(intervals, counts, strict=True):
         phase = np.pi * (np.arange(b - a)[:, None] + 0.5) / (b - a)
-        out[a:b, first : first + count] = np.cos(phase * np.arange(count))
+        cosines[a:b, first : first + count] = np.cos(phase * np.arange(count))
         first += count
-    return out
+    return cosines
 
 
-def _share(frame: Frame) -> float:
-    """How often a source that switches is of a frame."""
+def _frame_probability(frame: Frame) -> float:
+    """Prior probability of the frame of a switching source."""
     return priors.SWITCHES_OUTSIDE if frame == "world" else 1.0 - priors.SWITCHES_OUTSIDE
