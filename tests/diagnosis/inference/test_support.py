@@ -53,7 +53,9 @@ def with_current(track: Track, *, field: bool) -> Track:
 def sets_of(track: Track) -> tuple[Hypotheses, Space]:
     problem, cold = problem_of(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
-    return build_search_space(richest_model.fit_richest_model(problem, fit.filtered, EFFECTS), EFFECTS, ())
+    return build_search_space(
+        richest_model.fit_richest_model(problem, fit.filtered, EFFECTS), EFFECTS, ()
+    )
 
 
 @pytest.fixture(scope="module")

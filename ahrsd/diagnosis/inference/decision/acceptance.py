@@ -244,7 +244,9 @@ def _test_constant_coefficients(
             )
             if phase_from_column or not tried_factors.isdisjoint(factor_keys(key)):
                 continue
-            factors = coefficient_factors(effect, contribution_of(all_sets, best, key)[0], made.context)
+            factors = coefficient_factors(
+                effect, contribution_of(all_sets, best, key)[0], made.context
+            )
             made.add(factors)
             for factor in factors:
                 least = max(best.score + required, extended.score)

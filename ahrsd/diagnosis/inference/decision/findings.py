@@ -146,7 +146,11 @@ def _effect_probabilities(
         log_odds = {effect: min(nats, log_odds[own]) for effect, nats in log_odds.items()}
     for effect, keys in space.effects.items():
         candidate = all_sets.component(keys[0])
-        if effect in log_odds and effect != own and contains_component(candidate, member, ROUNDING_SHARE):
+        if (
+            effect in log_odds
+            and effect != own
+            and contains_component(candidate, member, ROUNDING_SHARE)
+        ):
             log_odds[effect] = log_odds[own] + float(np.log(priors.SAME_FORM))
     total = np.logaddexp.reduce(list(log_odds.values()))
     probabilities = {effect: float(np.exp(nats - total)) for effect, nats in log_odds.items()}

@@ -79,7 +79,10 @@ def changing_source(
 
 
 def directed_noise_source(
-    all_sets: Hypotheses, best: Hypothesis, source: DirectedNoise | None, contributions: Sequence[Array]
+    all_sets: Hypotheses,
+    best: Hypothesis,
+    source: DirectedNoise | None,
+    contributions: Sequence[Array],
 ) -> Unexplained:
     """Noise of a higher level along one direction: the octaves that have most of its power.
 

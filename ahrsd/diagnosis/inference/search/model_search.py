@@ -148,7 +148,9 @@ class Hypotheses:
             log_prior += self._repeat_log_odds(members) + self._class_log_prior(members)
             forms = set(keys) - members - {CALIBRATION}
             small = [k for k, key in enumerate(keys) if key in forms and key not in known_psi]
-            at = maximise_above(products, laws, (noise, start), required - log_prior, start_small=small)
+            at = maximise_above(
+                products, laws, (noise, start), required - log_prior, start_small=small
+            )
             if at is None:
                 return None
             log_prior += self._least_value_log_odds(keys, at)

@@ -62,7 +62,9 @@ def with_setting_slopes(
     mag = _with_slopes(component.columns.mag, here.mag, [each.mag for each in shifted], value)
     gyro = _with_slopes(component.columns.gyro, here.gyro, [each.gyro for each in shifted], value)
     largest = component.law.log_variance(component.law.high)
-    law = FixedLaw(np.concatenate([np.exp(largest), np.full(len(perturbed), priors.SETTING_OFF**2)]))
+    law = FixedLaw(
+        np.concatenate([np.exp(largest), np.full(len(perturbed), priors.SETTING_OFF**2)])
+    )
     key = (
         f"{component.key}, open in {', '.join(perturbed)} at {np.array2string(value, precision=6)}"
     )
