@@ -16,7 +16,7 @@ Where the gyro's values are rates at instants (`instants`) the rate is straight 
 and half of a step of the lag is theirs.  Drawn through means it would be off by as much
 as the rate changes within a step, which at 10 Hz on a flight is far more than its noise.
 
-A low-pass is such a delay and, in quick turns, more (`beyond_the_lag`).
+A low-pass is such a delay and, in quick turns, more (`low_pass_beyond_delay`).
 """
 
 from __future__ import annotations
@@ -39,18 +39,20 @@ def without_lag(track: Track, lag_s: float, *, instants: bool = False) -> Track:
 
     instants: the gyro's values are rates at instants and not means, which is part of the lag
     """
-    moved = delayed_gyro(track, lag_s, instants=instants)
-    if not of_magnetometer(track, lag_s):
-        return moved
+    delayed = delayed_gyro(track, lag_s, instants=instants)
+    if not is_magnetometer_lag(track, lag_s):
+        return delayed
     accel = track.accel_b_m_s2
     return replace(
-        moved,
-        accel_b_m_s2=None if accel is None else earlier(track, accel, lag_s),
-        covariates={name: earlier(track, row, lag_s) for name, row in track.covariates.items()},
+        delayed,
+        accel_b_m_s2=None if accel is None else delayed_values(track, accel, lag_s),
+        covariates={
+            name: delayed_values(track, row, lag_s) for name, row in track.covariates.items()
+        },
     )
 
 
-def after_columns_begin(track: Track) -> Track:
+def without_early_readings(track: Track) -> Track:
     """Without a run's first readings, which a late magnetometer took before columns were logged.
 
     The same for every lag: models at different lags are compared by the same readings.  A run so
@@ -66,21 +68,21 @@ def after_columns_begin(track: Track) -> Track:
     return replace(track, mag_b_gauss=mag)
 
 
-def of_magnetometer(track: Track, lag_s: float) -> bool:
+def is_magnetometer_lag(track: Track, lag_s: float) -> bool:
     """Whether a lag is one of all that the magnetometer measures, and not of the gyro alone."""
-    step_s = usual_step(track.dt_s)
+    step_s = regular_step(track.dt_s)
     half = step_s is not None and abs(lag_s / (step_s / 2) - 1.0) < priors.HALF_STEP_WITHIN
     return lag_s > 0.0 and not half
 
 
-def usual_step(dt_s: Array) -> float | None:
+def regular_step(dt_s: Array) -> float | None:
     """The step that nearly all rows (N,) have, seconds; None where there is none."""
     middle = float(np.nanmedian(dt_s))
     alike = np.abs(np.nan_to_num(dt_s, nan=0.0) / middle - 1.0) < priors.STEPS_ALIKE
     return middle if np.mean(alike) > priors.STEPS_ALIKE_SHARE else None
 
 
-def earlier(track: Track, values: Array, ago_s: float) -> Array:
+def delayed_values(track: Track, values: Array, ago_s: float) -> Array:
     """What was logged beside a track's samples, (N,) or (N, k), as it was `ago_s` before."""
     return time_series.earlier(values, track.time_s, track.dt_s, ago_s)
 
@@ -90,31 +92,33 @@ def delayed_gyro(track: Track, tau_s: float, *, instants: bool = False) -> Track
     if tau_s == 0.0 and not instants:
         return track
     gyro = track.gyro_b_rad_s.copy()
-    move = _delayed_instants if instants else _delayed_run
+    move = _delayed_instants if instants else _delayed_means
     for run in track.runs or (slice(0, len(track)),):
         if run.stop - run.start > 2:
             gyro[run] = move(track.time_s[run], track.gyro_b_rad_s[run], tau_s)
     return replace(track, gyro_b_rad_s=gyro)
 
 
-def _delayed_run(time_s: Array, rate: Array, tau_s: float) -> Array:
+def _delayed_means(time_s: Array, rate: Array, tau_s: float) -> Array:
     """Means over the steps, of means."""
     step_s = np.diff(time_s)
-    before, since, inside = _within(time_s, time_s - tau_s)
-    turn = rate[before + 1] * since[:, None] + _slope(rate[1:], step_s)[before] * inside[:, None]
-    return _means(rate[1:], step_s, before, turn)
+    before, since, inside = _locate_in_steps(time_s, time_s - tau_s)
+    turn = (
+        rate[before + 1] * since[:, None] + _rate_slope(rate[1:], step_s)[before] * inside[:, None]
+    )
+    return _mean_rates(rate[1:], step_s, before, turn)
 
 
 def _delayed_instants(time_s: Array, rate: Array, tau_s: float) -> Array:
     """Means over the steps, of rates at instants, which are early by half of a step."""
     step_s = np.diff(time_s)
-    before, since, inside = _within(time_s, time_s - tau_s + np.median(step_s) / 2)
+    before, since, inside = _locate_in_steps(time_s, time_s - tau_s + np.median(step_s) / 2)
     middle, slope = (rate[:-1] + rate[1:]) / 2, np.diff(rate, axis=0) / step_s[:, None]
     turn = middle[before] * since[:, None] + slope[before] * inside[:, None]
-    return _means(middle, step_s, before, turn)
+    return _mean_rates(middle, step_s, before, turn)
 
 
-def _within(time_s: Array, wanted_s: Array) -> tuple[NDArray[np.intp], Array, Array]:
+def _locate_in_steps(time_s: Array, wanted_s: Array) -> tuple[NDArray[np.intp], Array, Array]:
     """Of each time the step that it is in, s since that began, and s^2 of the slope till there."""
     before = np.clip(np.searchsorted(time_s, wanted_s, side="right") - 1, 0, len(time_s) - 2)
     since = wanted_s - time_s[before]
@@ -123,7 +127,7 @@ def _within(time_s: Array, wanted_s: Array) -> tuple[NDArray[np.intp], Array, Ar
     return before, since, inside
 
 
-def _means(mean: Array, step_s: Array, before: NDArray[np.intp], turn: Array) -> Array:
+def _mean_rates(mean: Array, step_s: Array, before: NDArray[np.intp], turn: Array) -> Array:
     """(N, 3) rates between attitudes that are `turn` (N, 3) on from the begin of a step.
 
     mean (N - 1, 3): rates of the steps
@@ -133,11 +137,11 @@ def _means(mean: Array, step_s: Array, before: NDArray[np.intp], turn: Array) ->
     for k, one in enumerate(so3.exp(mean * step_s[:, None])):
         R[k + 1] = R[k] @ one
     at = R[before] @ so3.exp(turn)
-    moved = so3.log(np.swapaxes(at[:-1], 1, 2) @ at[1:]) / step_s[:, None]
-    return np.vstack([moved[:1], moved])
+    rates = so3.log(np.swapaxes(at[:-1], 1, 2) @ at[1:]) / step_s[:, None]
+    return np.vstack([rates[:1], rates])
 
 
-def _slope(rate: Array, step_s: Array) -> Array:
+def _rate_slope(rate: Array, step_s: Array) -> Array:
     """(N - 1, 3) d rate / dt within each step, from the mean rates before and behind; 0 at ends."""
     slope = np.zeros_like(rate)
     between_s = step_s[1:-1] + (step_s[:-2] + step_s[2:]) / 2
@@ -145,7 +149,7 @@ def _slope(rate: Array, step_s: Array) -> Array:
     return slope
 
 
-def beyond_the_lag(context: Context, lag_s: float) -> Columns:
+def low_pass_beyond_delay(context: Context, lag_s: float) -> Columns:
     """What a low-pass of time constant tau does beyond a delay by tau, gauss (N, 3, 1).
 
     g(t) = h(t - tau) is the field of a track whose delay is taken out, D its derivative by time:

@@ -39,7 +39,7 @@ WALKS = priors.ORDINARY_WALK_RAD_S_SQRT_S * np.array([1.0, 2.0, 4.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rest:
+class _StillSeconds:
     """Still seconds.  time_s (n,);  mean (n, 3) rad/s;  noise (3,) of a mean; rows: of each."""
 
     time_s: Array
@@ -53,36 +53,43 @@ class _Rest:
         return np.stack([values[self.second == k].mean(axis=0) for k in self.chosen])
 
 
-def at_rest(fit: NullFit) -> bool:
+def field_hardly_turns(fit: NullFit) -> bool:
     """Whether the field hardly turns in the sensor: then only the gyro can be told about."""
     field = fit.filtered.nominal_b
     unit = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-300)
     return bool(1.0 - np.linalg.norm(unit.mean(axis=0)) < priors.REST_SPREAD)
 
 
-def told_at_rest(library: Mapping[str, Effect], still: Sequence[Finding]) -> Mapping[str, Effect]:
+def effects_testable_at_rest(
+    library: Mapping[str, Effect], found_at_rest: Sequence[Finding]
+) -> Mapping[str, Effect]:
     """What a field that hardly turns can tell: the gyro, what rides with the sensor, what is quick.
 
     still: what a gyro that stands tells of its bias, which is not asked of the field again
     The delays stay: their rows make the column that a model always has.
     """
-    asked = {k: one for k, one in library.items() if not (still and k in priors.REST_CAUSES)}
-    return {k: e for k, e in asked.items() if e.family == "gyro" or e.rides or e.quick or e.delay}
+    tested = {
+        k: one for k, one in library.items() if not (found_at_rest and k in priors.REST_CAUSES)
+    }
+    return {k: e for k, e in tested.items() if e.family == "gyro" or e.rides or e.quick or e.delay}
 
 
-def resting(context: Context, library: Mapping[str, Effect]) -> tuple[Finding, ...]:
+def find_bias_drift_at_rest(context: Context, library: Mapping[str, Effect]) -> tuple[Finding, ...]:
     """The name for what moves the bias of a gyro that stands, with what is as likely; or none."""
-    rest = _rest(context)
-    if rest is None or _turning(rest, context) > priors.REST_TURNS:
+    still = _still_seconds(context)
+    if still is None or _turning_share(still, context) > priors.REST_TURNS:
         return ()
     best: dict[str, tuple[float, Setting]] = {}
-    roots = [_roots(rest, walk) for walk in WALKS]
-    weight = np.array([_log_likelihood(rest, root) for root in roots])
+    roots = [_covariance_roots(still, walk) for walk in WALKS]
+    weight = np.array([_log_likelihood(still, root) for root in roots])
     for name in priors.REST_CAUSES:
         options = library[name].settings(context) if name in library else ()
         if options:
             best[name] = max(
-                ((_evidence(rest, context, library[name], o, roots, weight), o) for o in options),
+                (
+                    (_log_bayes_factor(still, context, library[name], o, roots, weight), o)
+                    for o in options
+                ),
                 key=lambda item: item[0],
             )
             best[name] = (best[name][0] - float(np.log(len(options))), best[name][1])
@@ -94,15 +101,15 @@ def resting(context: Context, library: Mapping[str, Effect]) -> tuple[Finding, .
     )
     name = next(iter(shares))
     setting, root = best[name][1], roots[int(np.argmax(weight))]
-    value, deviation, course = _fitted(rest, context, library[name], setting, root)
-    usual = priors.ORDINARY_WALK_RAD_S_SQRT_S * np.sqrt(rest.time_s[-1] - rest.time_s[0])
+    value, deviation, course = _fit_effect(still, context, library[name], setting, root)
+    usual = priors.ORDINARY_WALK_RAD_S_SQRT_S * np.sqrt(still.time_s[-1] - still.time_s[0])
     if np.ptp(course, axis=0).max() < priors.REST_LARGE * usual:
         return ()
-    return (_finding(rest, library, shares, best[name], value, deviation, course),)
+    return (_build_finding(still, library, shares, best[name], value, deviation, course),)
 
 
-def _finding(
-    rest: _Rest,
+def _build_finding(
+    still: _StillSeconds,
     library: Mapping[str, Effect],
     shares: Mapping[str, float],
     best: tuple[float, Setting],
@@ -119,7 +126,7 @@ def _finding(
         confidence=shares[name],
         alternatives=tuple(Share(other, shares[other]) for other in close),
         where=Where(
-            ((float(rest.time_s[0]), float(rest.time_s[-1])),),
+            ((float(still.time_s[0]), float(still.time_s[-1])),),
             tuple(axis for axis, part in zip("xyz", size, strict=True) if part > 0.2 * size.max()),
             "gyro",
             "at rest",
@@ -138,7 +145,7 @@ def _finding(
     )
 
 
-def _rest(context: Context) -> _Rest | None:
+def _still_seconds(context: Context) -> _StillSeconds | None:
     track = context.track
     second = np.floor(track.time_s - track.time_s[0]).astype(np.intp)
     known = np.flatnonzero(np.bincount(second) > 2)
@@ -153,53 +160,55 @@ def _rest(context: Context) -> _Rest | None:
     mean = means[still]
     noise = np.sqrt(np.mean(np.diff(mean, axis=0) ** 2, axis=0) / 2)
     chosen = known[still]
-    return _Rest(chosen + 0.5 + track.time_s[0], mean, np.maximum(noise, 1e-9), second, chosen)
+    return _StillSeconds(
+        chosen + 0.5 + track.time_s[0], mean, np.maximum(noise, 1e-9), second, chosen
+    )
 
 
-def _turning(rest: _Rest, context: Context) -> float:
+def _turning_share(still: _StillSeconds, context: Context) -> float:
     """Share of the gyro's integral by which the field turns in the sensor; constant rates aside.
 
     0 for a bias that changes, 1 for a slow turn: a vehicle on a straight course is not at rest.
     """
     readings = context.track.mag_b_gauss - context.model.hard_iron_gauss
-    field = rest.means(np.nan_to_num(readings, nan=0.0))
+    field = still.means(np.nan_to_num(readings, nan=0.0))
     unit = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-300)
-    steps_s = np.diff(rest.time_s, prepend=rest.time_s[0])
-    angle = np.cumsum((rest.mean - rest.mean.mean(axis=0)) * steps_s[:, None], axis=0)
-    line = np.column_stack([np.ones(len(unit)), rest.time_s - rest.time_s[0]])
+    steps_s = np.diff(still.time_s, prepend=still.time_s[0])
+    angle = np.cumsum((still.mean - still.mean.mean(axis=0)) * steps_s[:, None], axis=0)
+    line = np.column_stack([np.ones(len(unit)), still.time_s - still.time_s[0]])
     both = np.column_stack([np.cross(unit.mean(axis=0), angle), unit])
-    expected, seen = np.hsplit(both - line @ np.linalg.lstsq(line, both)[0], 2)
-    return float(np.sum(expected * seen) / max(float(np.sum(expected**2)), 1e-300))
+    expected, observed = np.hsplit(both - line @ np.linalg.lstsq(line, both)[0], 2)
+    return float(np.sum(expected * observed) / max(float(np.sum(expected**2)), 1e-300))
 
 
-def _roots(rest: _Rest, walk: float) -> list[Array]:
+def _covariance_roots(still: _StillSeconds, walk: float) -> list[Array]:
     """Per axis the Cholesky factor (n, n) of noise, walk and the bias' own prior."""
-    since = rest.time_s - rest.time_s[0]
+    since = still.time_s - still.time_s[0]
     common = walk**2 * np.minimum.outer(since, since) + priors.REST_BIAS_RAD_S**2
     return [linalg.cholesky(common + np.diag(np.full(len(since), s**2)), lower=True)
-            for s in rest.noise]  # fmt: skip
+            for s in still.noise]  # fmt: skip
 
 
-def _whitened(rest: _Rest, roots: list[Array], columns: Array) -> tuple[Array, Array]:
+def _whiten(still: _StillSeconds, roots: list[Array], columns: Array) -> tuple[Array, Array]:
     """(3 n, p) columns and (3 n,) readings, whitened axis by axis; columns (n, 3, p)."""
     X = [
         linalg.solve_triangular(root, columns[:, axis], lower=True)
         for axis, root in enumerate(roots)
     ]
     e = [
-        linalg.solve_triangular(root, rest.mean[:, axis], lower=True)
+        linalg.solve_triangular(root, still.mean[:, axis], lower=True)
         for axis, root in enumerate(roots)
     ]
     return np.concatenate(X), np.concatenate(e)
 
 
-def _log_likelihood(rest: _Rest, roots: list[Array]) -> float:
-    _, e = _whitened(rest, roots, np.zeros((len(rest.time_s), 3, 1)))
+def _log_likelihood(still: _StillSeconds, roots: list[Array]) -> float:
+    _, e = _whiten(still, roots, np.zeros((len(still.time_s), 3, 1)))
     return -0.5 * float(e @ e) - float(sum(np.sum(np.log(np.diag(root))) for root in roots))
 
 
-def _evidence(
-    rest: _Rest,
+def _log_bayes_factor(
+    still: _StillSeconds,
     context: Context,
     effect: Effect,
     setting: Setting,
@@ -210,22 +219,22 @@ def _evidence(
     columns = effect.columns(context, setting).gyro
     if columns is None:
         return -np.inf
-    means = rest.means(columns)
+    means = still.means(columns)
     scale = np.array([parameter.scale for parameter in effect.parameters])
     gains = []
     for root in roots:
-        X, e = _whitened(rest, root, means)
-        what = total_score(X.T @ X, X.T @ e, np.einsum("ij,ij->j", X, X), scale)
-        gains.append(log_bayes(what))
+        X, e = _whiten(still, root, means)
+        score = total_score(X.T @ X, X.T @ e, np.einsum("ij,ij->j", X, X), scale)
+        gains.append(log_bayes(score))
     return float(logsumexp(weight + np.array(gains)) - logsumexp(weight))
 
 
-def _fitted(
-    rest: _Rest, context: Context, effect: Effect, setting: Setting, root: list[Array]
+def _fit_effect(
+    still: _StillSeconds, context: Context, effect: Effect, setting: Setting, root: list[Array]
 ) -> tuple[Array, Array, Array]:
     """Value (p,), deviation (p,), and course (n, 3) rad/s beside one walk."""
     columns = effect.columns(context, setting).gyro
-    means = rest.means(np.zeros((len(rest.second), 3, 1)) if columns is None else columns)
-    X, e = _whitened(rest, root, means)
+    means = still.means(np.zeros((len(still.second), 3, 1)) if columns is None else columns)
+    X, e = _whiten(still, root, means)
     found = solve(X.T @ X, np.column_stack([X.T @ e, np.eye(X.shape[1])]))
     return found[:, 0], np.sqrt(np.maximum(np.diag(found[:, 1:]), 0.0)), means @ found[:, 0]

@@ -22,14 +22,14 @@ from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
 #: sizes that are tried, in parts of the first guess; simulations that tell the scatter
-_TRIED = np.geomspace(0.25, 4.0, 9)
+_SIZES_TRIED = np.geomspace(0.25, 4.0, 9)
 _COPIES = 8
-_FINE = 400  # sizes between those
-_LEAST = 1e-8  # of a moment's variance: readings that never differ do not scatter
-_QUIETEST = 0.1  # of the noise that is seen: the first guess is that at least
+_FINE_SIZES = 400  # sizes between those
+_LEAST_VARIANCE = 1e-8  # of a moment's variance: readings that never differ do not scatter
+_LEAST_SHARE = 0.1  # of the noise that is seen: the first guess is that at least
 
 
-def before_rounding(
+def noise_before_rounding(
     fit: NullFit,
     seen: Noise,
     step_gauss: float,
@@ -46,7 +46,7 @@ def before_rounding(
     usual = np.ones(len(done.track)) if seen.level is None else seen.level
     loud = float(np.sqrt(np.mean(usual**2)))
     left = 1.0 - step_gauss**2 / 12 / (seen.mag_gauss * loud) ** 2
-    guess = float(np.sqrt(max(left, _QUIETEST**2)))
+    guess = float(np.sqrt(max(left, _LEAST_SHARE**2)))
 
     def law(size: float) -> Noise:
         return replace(seen, level=size * usual)
@@ -55,15 +55,21 @@ def before_rounding(
         mag, whitened = simulate(law(size), seed)
         return _moments(mag, whitened[done.used], step_gauss)
 
-    sizes = guess * _TRIED
+    sizes = guess * _SIZES_TRIED
     found = np.array([moments(size, 0) for size in sizes])
     wanted = _moments(done.track.mag_b_gauss, done.whitened[done.used], step_gauss)
-    fine = np.geomspace(sizes[0], sizes[-1], _FINE)
-    first = fine[int(np.argmin(_distance(_between(fine, sizes, found) - wanted, np.eye(2))))]
+    fine = np.geomspace(sizes[0], sizes[-1], _FINE_SIZES)
+    first = fine[
+        int(
+            np.argmin(
+                _squared_distances(_interpolate_moments(fine, sizes, found) - wanted, np.eye(2))
+            )
+        )
+    ]
     copies = np.array([moments(first, 1 + k) for k in range(_COPIES)])
-    scatter = np.cov(copies.T) + _LEAST * np.eye(2)
-    off = _between(fine, sizes, found) - wanted
-    return law(float(fine[int(np.argmin(_distance(off, scatter)))]))
+    scatter = np.cov(copies.T) + _LEAST_VARIANCE * np.eye(2)
+    off = _interpolate_moments(fine, sizes, found) - wanted
+    return law(float(fine[int(np.argmin(_squared_distances(off, scatter)))]))
 
 
 def calibration_covariance(fit: NullFit) -> Array:
@@ -95,12 +101,12 @@ def _moments(mag_b_gauss: Array, whitened: Array, step_gauss: float) -> Array:
     return np.log([float(np.mean(whitened**2)), float(np.mean(differ)) + 1e-6])
 
 
-def _between(fine: Array, sizes: Array, found: Array) -> Array:
+def _interpolate_moments(fine: Array, sizes: Array, found: Array) -> Array:
     """(F, 2) moments (S, 2) at sizes in between, straight in the logarithm."""
     at = np.log(fine), np.log(sizes)
     return np.column_stack([np.interp(*at, column) for column in found.T])
 
 
-def _distance(off: Array, scatter: Array) -> Array:
+def _squared_distances(off: Array, scatter: Array) -> Array:
     """(F,) Mahalanobis squares of differences (F, 2)."""
     return np.asarray(np.sum(off * np.linalg.solve(scatter, off.T).T, axis=1))

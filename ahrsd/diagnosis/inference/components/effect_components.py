@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.calibration_fit.delay import beyond_the_lag
+from ahrsd.diagnosis.calibration_fit.delay import low_pass_beyond_delay
 from ahrsd.diagnosis.effects.effect import ANGLES, SCALES, Effect, Setting
 from ahrsd.diagnosis.inference.components.component import (
     MOMENTS,
@@ -169,7 +169,7 @@ def beside_key(key: str) -> str:
 def delay_form(context: Context, lag_s: float) -> Component:
     """What a delay by a filter does beyond a delay: of either, in part."""
     law = Fixed(np.array([priors.LAG_IS_FILTER**2]))
-    return Component(LAG_FORM, "sensor", beyond_the_lag(context, abs(lag_s)), law)
+    return Component(LAG_FORM, "sensor", low_pass_beyond_delay(context, abs(lag_s)), law)
 
 
 def key_of(name: str, setting: Setting) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.added_field import heading_error_deg
 from ahrsd.diagnosis.answer.diagnosis import Cost
-from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
+from ahrsd.diagnosis.calibration_fit.null_fit import calibration_prior
 from ahrsd.diagnosis.inference.components.component import Sized
 from ahrsd.diagnosis.inference.components.effect_components import LAG
 from ahrsd.diagnosis.inference.components.ordinary_remainder import still_spells
@@ -94,7 +94,7 @@ def nats_of_remainder(all_sets: Hypotheses, best: Hypothesis) -> float:
 def cost_if_left_out(all_sets: Hypotheses, best: Hypothesis, key: str) -> Cost:
     """What the calibration would be off by in the set without a member."""
     made = all_sets.made
-    middle, here = prior_of(made.point.problem.track).mean, made.point.filtered.model
+    middle, here = calibration_prior(made.point.problem.track).mean, made.point.filtered.model
     fewer = all_sets.judge(all_sets.without(best.names, key), best)
     left_out, known = (
         model_of(coefficients(all_sets, one, CALIBRATION)[0] + middle, here)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
 
 from ahrsd.diagnosis.calibration_fit import noise_fit
-from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
+from ahrsd.diagnosis.calibration_fit.null_fit import calibration_prior
 from ahrsd.diagnosis.calibration_fit.problem import Problem
 from ahrsd.diagnosis.inference.components.component import Component, Fixed
 from ahrsd.diagnosis.inference.likelihood import noise_model
@@ -367,7 +367,7 @@ def unread(point: Point, spans_s: Sequence[tuple[float, float]]) -> Point:
         point.problem,
         recorded=replace(recorded, mag_b_gauss=mag),
         unread_s=_together([*point.problem.unread_s, *spans_s]),
-    ).lagging(point.problem.lag_s)
+    ).with_lag(point.problem.lag_s)
     model = point.filtered.model
     filtered = run_filter(problem.track, model, point.terms_mag, point.terms_gyro)
     return replace(point, problem=problem, filtered=filtered)
@@ -389,7 +389,9 @@ def regained(point: Point) -> Point:
     problem, mag, gyro = point.problem, point.terms_mag, point.terms_gyro
     model = point.filtered.model
     filtered = run_filter(problem.track, model, mag, gyro)
-    again = _no_louder(noise_fit.estimated(filtered, problem.spec, mag, gyro, walk=False), model)
+    again = _no_louder(
+        noise_fit.estimate_noise(filtered, problem.spec, mag, gyro, walk=False), model
+    )
     return replace(point, filtered=run_filter(problem.track, again, mag, gyro))
 
 
@@ -415,7 +417,7 @@ def linearised(
         whitening = point.directed.whitening((edges_hz[1:] + edges_hz[:-1]) / 2.0)
     made = Linearised(point, context, smooth, edges, white, alone=alone, whitening=whitening)
     made.y = made.as_loud(white[:, None])[:, 0]
-    prior = prior_of(point.problem.track)
+    prior = calibration_prior(point.problem.track)
     law = Fixed(prior.deviation**2)
     made.add([Component(CALIBRATION, "sensor", nuisance_columns(smooth), law)])
     made.put_back({CALIBRATION: coefficients(point.filtered.model) - prior.mean})
@@ -468,7 +470,7 @@ def moved(
     }
     if not delayed:
         values |= {key: point.values.get(key, np.zeros(1)) for key in point.exact}
-    middle = prior_of(problem.track).mean
+    middle = calibration_prior(problem.track).mean
     here = coefficients(point.filtered.model) - middle
     found = here + share * (by_key(made, keys, at)[CALIBRATION] - here)
     model = model_of(found + middle, point.filtered.model)
@@ -477,9 +479,7 @@ def moved(
     mag, gyro = added(len(made.context.track), known, out)
     riding = {key: value for key, value in out.items() if known[key].frame == "sensor"}
     lag_s = sum(float(values[key][0]) for key in point.exact if key in values)
-    problem = problem.averaged_beside(
-        added(len(made.context.track), known, riding)[0], model, lag_s
-    )
+    problem = problem.averaged_with(added(len(made.context.track), known, riding)[0], model, lag_s)
     filtered = run_filter(problem.track, model, mag, gyro, held=point.filtered)
     named = {key: value for key, value in out.items() if known[key].effect is not None}
     _, misread = added(len(made.context.track), known, named)
@@ -509,7 +509,7 @@ def along_one_direction(made: Linearised, keys: Sequence[str], at: At) -> Direct
 
 def step_of(made: Linearised, keys: Sequence[str], at: At) -> tuple[Array, Array]:
     """How far the likeliest calibration and delay are from the point, and how well known."""
-    prior = prior_of(made.point.problem.track).mean
+    prior = calibration_prior(made.point.problem.track).mean
     before = {
         CALIBRATION: coefficients(made.point.filtered.model) - prior,
         **{key: made.point.values.get(key, np.zeros(1)) for key in made.point.exact},

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.calibration_fit.delay import of_magnetometer, usual_step
+from ahrsd.diagnosis.calibration_fit.delay import is_magnetometer_lag, regular_step
 from ahrsd.diagnosis.calibration_fit.problem import Problem
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.components.component import Component
@@ -146,10 +146,10 @@ def _delays_of_instants(problem: Problem) -> tuple[float, ...]:
 
     That half alone, and where there is more, all of it, which is the magnetometer's as well.
     """
-    step_s = usual_step(problem.recorded.dt_s)
+    step_s = regular_step(problem.recorded.dt_s)
     if problem.lag_s <= 0.0 or step_s is None:
         return ()
-    more = of_magnetometer(problem.recorded, problem.lag_s)
+    more = is_magnetometer_lag(problem.recorded, problem.lag_s)
     return (step_s / 2, problem.lag_s) if more else (step_s / 2,)
 
 
@@ -159,12 +159,12 @@ def _as_logged(problem: Problem, filtered: Filtered, library: Mapping[str, Effec
     def likely(one: Problem) -> float:
         return _delayed(one, filtered, library, 0.0).nats
 
-    problem = as_logged(problem, likely).lagging(problem.lag_s)
+    problem = as_logged(problem, likely).with_lag(problem.lag_s)
     if not problem.recorded.covariates:
         return problem
     here = _delayed(problem, filtered, library, 0.0)
     for reading in of_means(here.base.made, here.base.whole, here.at, library):
-        other = read_as(problem, reading).lagging(problem.lag_s)
+        other = read_as(problem, reading).with_lag(problem.lag_s)
         found = _delayed(other, filtered, library, 0.0)
         if found.nats > here.nats + priors.ODDS_REAL:
             problem, here = other, found
@@ -175,7 +175,7 @@ def _delayed(
     problem: Problem, filtered: Filtered, library: Mapping[str, Effect], lag_s: float
 ) -> Judged:
     """The small model at a delay."""
-    start = first_point(problem.lagging(lag_s), filtered, (LAG,))
+    start = first_point(problem.with_lag(lag_s), filtered, (LAG,))
     values = {} if lag_s == 0.0 else {LAG: np.array([lag_s])}
     return judged(replace(start, values=values), library, (), whole=False)
 
