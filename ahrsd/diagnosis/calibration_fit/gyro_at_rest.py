@@ -1,9 +1,10 @@
-"""A gyro that stands still reads its bias: what the bias does, without the magnetometer.
+"""A gyro at rest reads its bias: how the bias changes, without the magnetometer.
 
-At rest the field says next to nothing of the gyro (the calibration would explain any slow turn of
-it), but the readings themselves do.  Their means over a second are regressed on what could move a
-bias, beside a random walk of an ordinary gyro's size and a few times that, weighted by likelihood.
-Warming up, time since power-on and wandering look nearly alike; they are told as one set.
+At rest the field contains almost no information on the gyro (the calibration would explain any slow
+turn), but the gyro's readings do.  Their means over a second are regressed on possible causes of a
+bias change.  The model includes a random walk of an ordinary gyro's size and of a few times that,
+weighted by likelihood.  Warm-up, time since power-on and a random walk look nearly alike: they are
+reported as one set of alternatives.
 """
 
 from __future__ import annotations
@@ -34,13 +35,17 @@ HARDLY_TURNED = (
     "the sensor hardly turned: only the gyro, a logged current, switches and alternating fields "
     "can be told"
 )
-#: sizes of the walk that are weighed, rad/s per square root of a second
+#: sizes of the walk that are averaged over, rad/s per square root of a second
 WALKS = priors.ORDINARY_WALK_RAD_S_SQRT_S * np.array([1.0, 2.0, 4.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _StillSeconds:
-    """Still seconds.  time_s (n,);  mean (n, 3) rad/s;  noise (3,) of a mean; rows: of each."""
+    """Still seconds.
+
+    time_s: (n,);  mean: (n, 3) rad/s;  noise: (3,) of a mean
+    second: (N,) second of each row;  chosen: (n,) the still seconds
+    """
 
     time_s: Array
     mean: Array
@@ -54,7 +59,7 @@ class _StillSeconds:
 
 
 def field_hardly_turns(fit: NullFit) -> bool:
-    """Whether the field hardly turns in the sensor: then only the gyro can be told about."""
+    """Whether the field hardly turns in the sensor: then only effects of the gyro can be found."""
     field = fit.filtered.nominal_b
     unit = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-300)
     return bool(1.0 - np.linalg.norm(unit.mean(axis=0)) < priors.REST_SPREAD)
@@ -63,9 +68,10 @@ def field_hardly_turns(fit: NullFit) -> bool:
 def effects_testable_at_rest(
     library: Mapping[str, Effect], found_at_rest: Sequence[Finding]
 ) -> Mapping[str, Effect]:
-    """What a field that hardly turns can tell: the gyro, what rides with the sensor, what is quick.
+    """Effects that can be found while the field hardly turns.
 
-    still: what a gyro that stands tells of its bias, which is not asked of the field again
+    They are those of the gyro, those that ride with the sensor, and quick ones.
+    found_at_rest: findings from the gyro's own readings; causes of these are not tested again
     The delays stay: their rows make the column that a model always has.
     """
     tested = {
@@ -75,7 +81,7 @@ def effects_testable_at_rest(
 
 
 def find_bias_drift_at_rest(context: Context, library: Mapping[str, Effect]) -> tuple[Finding, ...]:
-    """The name for what moves the bias of a gyro that stands, with what is as likely; or none."""
+    """The effect that changes the bias of a gyro at rest, with its alternatives; or nothing."""
     still = _still_seconds(context)
     if still is None or _turning_share(still, context) > priors.REST_TURNS:
         return ()
@@ -117,6 +123,7 @@ def _build_finding(
     deviation: Array,
     course: Array,
 ) -> Finding:
+    """The finding for the most probable effect, with its alternatives."""
     name, *others = shares
     effect = library[name]
     size = np.ptp(course, axis=0)
@@ -146,10 +153,11 @@ def _build_finding(
 
 
 def _still_seconds(context: Context) -> _StillSeconds | None:
+    """The still seconds of a recording; None if there are too few."""
     track = context.track
     second = np.floor(track.time_s - track.time_s[0]).astype(np.intp)
     known = np.flatnonzero(np.bincount(second) > 2)
-    if len(known) < priors.REST_S:  # rows that come more slowly
+    if len(known) < priors.REST_S:  # too few, or less than three rows a second
         return None
     means = np.stack([track.gyro_b_rad_s[second == k].mean(axis=0) for k in known])
     scatter = np.array([track.gyro_b_rad_s[second == k].std(axis=0).max() for k in known])
@@ -166,7 +174,7 @@ def _still_seconds(context: Context) -> _StillSeconds | None:
 
 
 def _turning_share(still: _StillSeconds, context: Context) -> float:
-    """Share of the gyro's integral by which the field turns in the sensor; constant rates aside.
+    """Share of the gyro's integral by which the field turns in the sensor, constant rates removed.
 
     0 for a bias that changes, 1 for a slow turn: a vehicle on a straight course is not at rest.
     """
@@ -182,7 +190,7 @@ def _turning_share(still: _StillSeconds, context: Context) -> float:
 
 
 def _covariance_roots(still: _StillSeconds, walk: float) -> list[Array]:
-    """Per axis the Cholesky factor (n, n) of noise, walk and the bias' own prior."""
+    """Cholesky factor (n, n) for each axis of the covariance of noise, walk and the bias' prior."""
     since = still.time_s - still.time_s[0]
     common = walk**2 * np.minimum.outer(since, since) + priors.REST_BIAS_RAD_S**2
     return [linalg.cholesky(common + np.diag(np.full(len(since), s**2)), lower=True)
@@ -190,7 +198,7 @@ def _covariance_roots(still: _StillSeconds, walk: float) -> list[Array]:
 
 
 def _whiten(still: _StillSeconds, roots: list[Array], columns: Array) -> tuple[Array, Array]:
-    """(3 n, p) columns and (3 n,) readings, whitened axis by axis; columns (n, 3, p)."""
+    """Whitened columns (3 n, p) and readings (3 n,), axis by axis; columns (n, 3, p)."""
     X = [
         linalg.solve_triangular(root, columns[:, axis], lower=True)
         for axis, root in enumerate(roots)
@@ -203,6 +211,7 @@ def _whiten(still: _StillSeconds, roots: list[Array], columns: Array) -> tuple[A
 
 
 def _log_likelihood(still: _StillSeconds, roots: list[Array]) -> float:
+    """Log likelihood of the readings with noise and walk alone."""
     _, e = _whiten(still, roots, np.zeros((len(still.time_s), 3, 1)))
     return -0.5 * float(e @ e) - float(sum(np.sum(np.log(np.diag(root))) for root in roots))
 
@@ -215,7 +224,7 @@ def _log_bayes_factor(
     roots: list[list[Array]],
     weight: Array,
 ) -> float:
-    """Log Bayes factor against the walk alone, over the walks' sizes."""
+    """Log Bayes factor of an effect relative to the walk alone, averaged over the walk's sizes."""
     columns = effect.columns(context, setting).gyro
     if columns is None:
         return -np.inf
@@ -232,7 +241,7 @@ def _log_bayes_factor(
 def _fit_effect(
     still: _StillSeconds, context: Context, effect: Effect, setting: Setting, root: list[Array]
 ) -> tuple[Array, Array, Array]:
-    """Value (p,), deviation (p,), and course (n, 3) rad/s beside one walk."""
+    """Values (p,), deviations (p,), and time series (n, 3) rad/s, with one walk in the model."""
     columns = effect.columns(context, setting).gyro
     means = still.means(np.zeros((len(still.second), 3, 1)) if columns is None else columns)
     X, e = _whiten(still, root, means)

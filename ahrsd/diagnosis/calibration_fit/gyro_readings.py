@@ -1,18 +1,19 @@
 """What a gyro's readings are: mean rates or delta angles, and how much of them is noise.
 
-Where they are means of the rate the turn of a step is not the mean times the step.  The axis of a
-turn moves within a step (coning): to second order the rotation vector of step k is
-w_k dt + (w_(k-1) dt) x (w_k dt) / 12 with w the mean rates, and w_k dt for a gyro whose values are
-its delta angles over dt.  Both are the mean rate to a person, devices send either, and neither is
-physics left out: the recording itself says which it is, by the part f of that product in it.
+If they are means of the rate, the turn of a step is not the mean times the step, because the axis
+of the turn moves within a step (coning).  To second order the rotation vector of step k is
+w_k dt + (w_(k-1) dt) x (w_k dt) / 12 with w the mean rates; it is w_k dt for a gyro whose values
+are its delta angles over dt.  Both are called the mean rate, devices send either, and neither is an
+unmodelled effect.  The recording itself shows which it is, by the fraction f of that product in it.
 
-Differences of a gyro's values are its noise where the motion is smooth.  Where a hand, a road, a
-propeller shakes the sensor they are the motion's, and may be fifty times that.  A filter that takes
-them for noise forgets the attitude within seconds, and along the motion of `broad/01` two of three
-simulated sensors with nothing left out had an unknown.  Readings that are as quiet as their own
-differences say decide: where nothing else is wrong the likelihood of the innovations finds the
-noise, in turn with the calibration, which is poor as long as there is too much of it.  Where
-something is wrong that counts as noise, and nothing is found: differences are all there is.
+Differences of a gyro's values are its noise if the motion is smooth.  If a hand, a road or a
+propeller shakes the sensor, they are due to the motion, and may be fifty times the noise.  A filter
+that takes them for noise forgets the attitude within seconds; along one recorded motion two of
+three simulated sensors with no effect left out had an unknown one.  If nothing else is wrong, the
+likelihood of the innovations finds the noise, alternating with the calibration, which is poor as
+long as the noise is too large.  If something is wrong, that counts as noise, and the differences
+are the only estimate.  The magnetometer decides: its noise must be as low as its own differences
+show.
 """
 
 from __future__ import annotations
@@ -32,15 +33,16 @@ from ahrsd.diagnosis.model import Columns, NullModel
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.samples import Array
 
-_FEWEST_SAMPLES = 25  # samples whose scatter is compared with that of others
-_MOST_ROUNDS = 4  # of noise and calibration, found one after the other
+_FEWEST_SAMPLES = 25  # of a block whose variance is compared with that of others
+_MOST_ROUNDS = 4  # of estimating noise and calibration in turn
 
 
 def with_delta_angles(track: Track, model: NullModel) -> Track:
-    """The track with each mean rate as the rotation vector of its step over dt.
+    """The track with each mean rate replaced by the rotation vector of its step over dt.
 
-    As it is where its rates are that, or where the motion does not tell and it makes no difference.
-    model: a calibration to start from.
+    Unchanged if its rates are that already, or if the motion does not show it and it does not
+    matter.
+    model: a calibration to start from
     """
     if not _samples_resolve_motion(track.gyro_b_rad_s - model.gyro_bias_rad_s):
         return track
@@ -62,13 +64,13 @@ def with_delta_angles(track: Track, model: NullModel) -> Track:
 
 
 def _samples_resolve_motion(rate_b_rad_s: Array) -> bool:
-    """Whether the samples follow the motion."""
+    """Whether the sampling rate is high enough for the motion."""
     change = np.diff(rate_b_rad_s, axis=0)
     return bool(np.mean(change**2) < priors.CONING_UNRESOLVED**2 * np.mean(rate_b_rad_s**2))
 
 
 def _coning_rate(track: Track, bias_rad_s: Array) -> Array:
-    """(N, 3) rad/s that coning adds to a mean rate; 0 where the step before is not known."""
+    """(N, 3) rad/s that coning adds to a mean rate; 0 if the step before is unknown."""
     rate = track.gyro_b_rad_s - bias_rad_s
     turn = rate * np.nan_to_num(track.dt_s)[:, None]
     out = np.zeros_like(rate)
@@ -77,9 +79,9 @@ def _coning_rate(track: Track, bias_rad_s: Array) -> Array:
 
 
 def _fit_coning_share(track: Track, corrected: Track, model: NullModel) -> tuple[float, float]:
-    """f and its standard deviation; f = 0, without bound, if unseen.
+    """f and its standard deviation; f = 0 with an infinite deviation if it is not observable.
 
-    Beside the calibration and what a large error of the gyro's axes, scale or time would be.
+    Estimated jointly with the calibration and with large errors of the gyro's axes, scale and time.
     """
     m = working_factor(track, averaging_model(track, model))
     work, other = average_groups(track, m, model), average_groups(corrected, m, model)
@@ -99,12 +101,13 @@ def _fit_coning_share(track: Track, corrected: Track, model: NullModel) -> tuple
     if information <= 0.0:
         return 0.0, np.inf
     noise = fit.filtered.normalised_innovation
-    part = -float(x @ fit.filtered.whitened.ravel()) / information  # the reading lacks it
+    # negative: the readings lack the coning
+    part = -float(x @ fit.filtered.whitened.ravel()) / information
     return part, float(np.sqrt(noise / information))
 
 
 def _gyro_error_columns(track: Track, bias_rad_s: Array) -> Columns:
-    """The nine of a matrix on the rate, and its derivative: what is late."""
+    """Ten columns: the nine of a matrix on the rate, and the rate's derivative for a delay."""
     rate = track.gyro_b_rad_s - bias_rad_s
     out = np.zeros((len(track), 3, 10))
     for axis in range(3):
@@ -116,7 +119,7 @@ def _gyro_error_columns(track: Track, bias_rad_s: Array) -> Columns:
 def find_lower_gyro_noise(
     recorded: Track, work: Track, spec: Spec, model: NullModel
 ) -> tuple[Spec, NullModel] | None:
-    """The spec and the model with less noise of the gyro than its differences; None for no less.
+    """Spec and model with less gyro noise than its differences show; None if it is not less.
 
     work: the recording at the working rate;  spec, model: of its rows, noise from differences
     """
@@ -139,17 +142,20 @@ def find_lower_gyro_noise(
 
 
 def averaging_model(track: Track, model: NullModel) -> NullModel:
-    """The model by whose noise readings are averaged: a shaken gyro's is not known, and taken for
-    none."""
+    """The model by whose noise readings are averaged.
+
+    The noise of a shaken gyro is unknown and taken as none.
+    """
     return replace(model, sigma_gyro_rad_s=0.0) if is_shaken(track) else model
 
 
 def is_shaken(track: Track) -> bool:
-    """Whether what the gyro's differences are is the motion's for the most part, not noise.
+    """Whether the differences of the gyro's values are mostly motion, not noise.
 
-    Noise is as loud in one second as in the next, and what is smooth over seven samples is none.
-    A hand and a road shake now more, now less: of twelve real recordings eleven have a tenth of
-    their seconds below .67 of the usual level, of 120 simulated motions none below .76.
+    Noise has the same level in every second, and contains nothing that is smooth over seven
+    samples.  A hand and a road shake with a changing level: in eleven of twelve real recordings a
+    tenth of the seconds is below .67 of the usual level, in none of 120 simulated motions below
+    .76.
     """
     third, sixth = (_variance_per_second(track, order) for order in (3, 6))
     if not len(third):
@@ -158,7 +164,10 @@ def is_shaken(track: Track) -> bool:
 
 
 def _variance_per_second(track: Track, order: int) -> Array:
-    """Variance of the gyro per second or 25 samples, were its differences of that order white."""
+    """Variance of the gyro per second, at least 25 samples, if its differences were white.
+
+    order: of the differences
+    """
     found: list[Array] = []
     block = max(_FEWEST_SAMPLES, round(1.0 / track.step_s))
     for run in track.runs or (slice(0, len(track)),):

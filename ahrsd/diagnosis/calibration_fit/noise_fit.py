@@ -1,4 +1,4 @@
-"""Noise levels by differences of readings, and by innovation likelihood on pieces of the track."""
+"""Noise levels from differences of readings, and from the likelihood of innovations on pieces."""
 
 from __future__ import annotations
 
@@ -14,18 +14,16 @@ from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.samples import Array
 
-#: logarithms below its differences from which a shaken gyro's noise is sought
+#: logarithms below the differenced noise, from which a shaken gyro's noise is maximised
 _SHAKEN_STARTS = (0.0, 1.4, 2.8, 4.2, 5.6)
-_WALK_LEVELS = (-3.6, -2.4, -1.2, 0.0)  # levels tried, log below the cap
+_WALK_LEVELS = (-3.6, -2.4, -1.2, 0.0)  # levels tried, in logarithms relative to the cap
 _PIECES, _PIECE_ROWS = 6, 400
-_FINE_STEP = (
-    0.1  # of a logarithm: where no common scale puts right by how much a coarse parabola is off
-)
-SAME_LEVEL = 0.02  # relative change of a noise level that changes nothing
+_FINE_STEP = 0.1  # of a logarithm: no common scale corrects the error of a coarse parabola there
+SAME_LEVEL = 0.02  # relative change of a noise level below which it is the same
 
 
 def first_guess(track: Track, spec: Spec) -> NullModel:
-    """Unit soft iron, and noise from differences where the spec does not say."""
+    """Unit soft iron, and noise from differences if the spec does not give it."""
     mag, gyro = noise_of_differences(track)
     return NullModel(
         np.eye(3),
@@ -56,7 +54,11 @@ def estimate_noise(
     *,
     walk: bool = True,
 ) -> NullModel:
-    """The model of a filter run with its noise estimated anew; what the spec says stays."""
+    """The model of a filter run with its noise estimated anew; levels in the spec are kept.
+
+    terms_mag, terms_gyro: (N, 3) terms to subtract from the readings;  walk: allow a random walk of
+    the gyro's bias
+    """
     clean = without_terms(filtered.track, terms_mag, terms_gyro)
     differenced = spec.shaken_gyro_rad_s or max(noise_of_differences(filtered.track)[1], 1e-9)
     model = _fit_white_noise(cut_pieces(clean), filtered.model, spec, differenced)
@@ -64,10 +66,10 @@ def estimate_noise(
 
 
 def rescale_noise(filtered: Filtered, spec: Spec) -> NullModel:
-    """The noise scaled so that the whole track's normalised innovation becomes 1, not its pieces'.
+    """The noise scaled so that the normalised innovation of the whole track, not its pieces, is 1.
 
-    Both levels together; sigma_mag alone where the gyro's is given or at its cap, and neither where
-    sigma_mag would be below its floor: what is missing to 1 is the magnetometer's.
+    Both levels are scaled together; sigma_mag alone if the gyro's is given or at its cap; neither
+    if sigma_mag would fall below its floor.  Any remaining difference from 1 is the magnetometer's.
     """
     model, factor = filtered.model, float(np.sqrt(filtered.normalised_innovation))
     if spec.sigma_mag_gauss or not np.isfinite(factor) or factor == 0.0:
@@ -122,11 +124,12 @@ def cut_pieces(track: Track) -> Track:
 
 
 def _gyro_noise_cap(differenced: float) -> float:
+    """The largest sigma_gyro that is allowed."""
     return max(priors.GYRO_NOISE_CAP * differenced, priors.FLOOR_GYRO_RAD_S)
 
 
 def _fit_white_noise(track: Track, model: NullModel, spec: Spec, differenced: float) -> NullModel:
-    """Both levels, sigma_gyro drawn to the gyro's differenced noise and within its cap."""
+    """Both levels; sigma_gyro has a prior at the gyro's differenced noise, and a cap."""
     base = replace(model, gyro_walk_rad_s_sqrt_s=0.0)
     given_mag, given_gyro = spec.sigma_mag_gauss, spec.sigma_gyro_rad_s
     below = priors.SHAKEN_TRUST if spec.shaken_gyro_rad_s else priors.GYRO_NOISE_TRUST
@@ -146,11 +149,13 @@ def _fit_white_noise(track: Track, model: NullModel, spec: Spec, differenced: fl
 
 
 def _log_prior(sigma_gyro: float, differenced: float, below: float) -> float:
+    """Log prior of sigma_gyro.  below: width, in logarithms, below the differenced noise."""
     trust = below if sigma_gyro < differenced else priors.GYRO_NOISE_TRUST
     return -0.5 * float(np.square(np.log(sigma_gyro / differenced) / trust))
 
 
 def _fit_both_levels(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
+    """Both levels free: the maximum over their ratio, with the scale solved for."""
     most = np.log(_gyro_noise_cap(differenced) / priors.FLOOR_MAG_GAUSS)
 
     def scaled(level: float) -> tuple[NullModel, float]:
@@ -165,17 +170,19 @@ def _fit_both_levels(track: Track, model: NullModel, differenced: float, below: 
             sigma_mag_gauss=tried.sigma_mag_gauss * root,
             sigma_gyro_rad_s=tried.sigma_gyro_rad_s * root,
         )
-        # with the scale at its best the squares sum to their number
+        # at the maximum-likelihood scale the sum of squares equals their number
         value = float(np.sum(done.log_likelihood)) + 0.5 * count * (scale - 1 - np.log(scale))
         return fitted, value + _log_prior(fitted.sigma_gyro_rad_s, differenced, below)
 
     start = np.log(model.sigma_gyro_rad_s / model.sigma_mag_gauss)
-    if below > priors.GYRO_NOISE_TRUST:  # far below there may be another maximum
+    if below > priors.GYRO_NOISE_TRUST:  # another maximum may be far below
         start = max((start - down for down in _SHAKEN_STARTS), key=lambda level: scaled(level)[1])
     return scaled(_maximise(lambda level: scaled(level)[1], start))[0]
 
 
 def _fit_mag_level(track: Track, model: NullModel) -> NullModel:
+    """sigma_mag alone."""
+
     def of_mag(level: float) -> float:
         return _log_likelihood(track, replace(model, sigma_mag_gauss=float(np.exp(level))))
 
@@ -184,6 +191,8 @@ def _fit_mag_level(track: Track, model: NullModel) -> NullModel:
 
 
 def _fit_gyro_level(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
+    """sigma_gyro alone."""
+
     def of_gyro(level: float) -> float:
         tried = replace(model, sigma_gyro_rad_s=float(np.exp(level)))
         return _log_likelihood(track, tried) + _log_prior(float(np.exp(level)), differenced, below)
@@ -199,7 +208,7 @@ def _fit_gyro_level(track: Track, model: NullModel, differenced: float, below: f
 
 
 def _with_bias_walk(track: Track, model: NullModel) -> NullModel:
-    """With a random walk of the gyro's bias if that is far more likely than none."""
+    """The model with a random walk of the gyro's bias if that is far more likely than none."""
     size = decimation_factor(track)
     coarse = decimate(track, size)
     rate = replace(model, sigma_gyro_rad_s=model.sigma_gyro_rad_s / np.sqrt(size))
@@ -222,11 +231,12 @@ def _with_bias_walk(track: Track, model: NullModel) -> NullModel:
 
 
 def _log_likelihood(track: Track, model: NullModel) -> float:
+    """Log likelihood of the innovations."""
     return float(np.sum(run_filter(track, model, sensitive=False).log_likelihood))
 
 
 def _maximise(function: Callable[[float], float], start: float, step: float = 0.7) -> float:
-    """Where a smooth function of one number is highest: climb in steps, then a parabola."""
+    """Argument that maximises a smooth function of one variable: steps uphill, then a parabola."""
     middle, value = start, function(start)
     left, right = function(start - step), function(start + step)
     for _ in range(12):
@@ -242,7 +252,7 @@ def _maximise(function: Callable[[float], float], start: float, step: float = 0.
 
 
 def _parabola_maximum(left: float, middle: float, right: float) -> float:
-    """Where the parabola through values at -1, 0, 1 is highest, at most 1 away."""
+    """Maximum of the parabola through values at -1, 0, 1, at most 1 away."""
     bend = left - 2 * middle + right
     return 0.0 if bend >= 0 else float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0))
 
@@ -250,9 +260,9 @@ def _parabola_maximum(left: float, middle: float, right: float) -> float:
 def noise_of_differences(track: Track) -> tuple[float, float]:
     """White noise of one reading, (gauss, rad/s), from third differences.
 
-    Of the middle second and the middle axis: a jolt is short, a propeller shakes one axis.
-    Third differences of white noise have 20 times its variance and take out what is smooth over
-    four samples; what motion is left makes both values too large, never too small.
+    The median over seconds and axes: a jolt is short, a propeller shakes one axis.  Third
+    differences of white noise have 20 times its variance and remove what is smooth over four
+    samples.  Remaining motion makes both values too large, never too small.
     """
     return _noise_of_third_differences(track, track.mag_b_gauss), _noise_of_third_differences(
         track, track.gyro_b_rad_s
@@ -260,6 +270,7 @@ def noise_of_differences(track: Track) -> tuple[float, float]:
 
 
 def _noise_of_third_differences(track: Track, values: Array) -> float:
+    """Standard deviation of white noise in values (N, 3); 0 if there are too few."""
     found: list[Array] = []
     known = track.dt_s[np.isfinite(track.dt_s)]
     block = max(8, round(1.0 / float(np.median(known)))) if len(known) else 8

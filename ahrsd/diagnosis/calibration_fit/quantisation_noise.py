@@ -1,9 +1,10 @@
-"""How large the noise is of readings that come in coarse steps.
+"""The noise level of readings that come in coarse steps.
 
-Of coarse steps the loudness is mostly the steps' own, a twelfth of their square.  How often a
-reading differs from the one before is the noise's, where the motion is slow.  So simulations with
-noise of several sizes, rounded to the steps, are held against the recording in both (the method of
-simulated moments): each counts by how much it scatters from simulation to simulation.
+With coarse steps the variance of the readings' noise is mostly that of rounding, a twelfth of the
+step squared.  The noise itself determines how often a reading differs from the one before, if the
+motion is slow.  So simulations with noise of several sizes, rounded to the steps, are compared with
+the recording in both statistics (the method of simulated moments).  Each is weighted by its scatter
+between simulations.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from ahrsd.diagnosis.model import Noise
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
-#: sizes that are tried, in parts of the first guess; simulations that tell the scatter
+#: sizes that are tried, relative to the first guess; simulations that show the scatter
 _SIZES_TRIED = np.geomspace(0.25, 4.0, 9)
 _COPIES = 8
-_FINE_SIZES = 400  # sizes between those
-_LEAST_VARIANCE = 1e-8  # of a moment's variance: readings that never differ do not scatter
-_LEAST_SHARE = 0.1  # of the noise that is seen: the first guess is that at least
+_FINE_SIZES = 400  # interpolated between those
+_LEAST_VARIANCE = 1e-8  # variance of a moment: readings that never differ have no scatter
+_LEAST_SHARE = 0.1  # of the noise including rounding: the first guess at least
 
 
 def noise_before_rounding(
@@ -35,12 +36,13 @@ def noise_before_rounding(
     step_gauss: float,
     simulate: Callable[[Noise, int], tuple[Array, Array]],
 ) -> Noise:
-    """The noise of readings before they were rounded to such steps.
+    """The noise of readings before they were rounded to steps of that size.
 
-    seen: with what rounding adds, which has bounds, and a colour that follows the motion: it is
-    simulated, not drawn.
-    simulate: readings (N, 3) and whitened innovations (N, 3) with a noise law and a seed; with the
-              fit's own calibration where that is 0, else with one that it may as well have found
+    seen: noise including what rounding adds.  Rounding errors are bounded, and their spectrum
+          follows
+    the motion: they are simulated, not drawn.
+    simulate: readings (N, 3) and whitened innovations (N, 3) for a noise law and a seed; with the
+              fit's own calibration if the seed is 0, otherwise with one drawn from its uncertainty
     """
     done = fit.filtered
     usual = np.ones(len(done.track)) if seen.level is None else seen.level
@@ -73,7 +75,7 @@ def noise_before_rounding(
 
 
 def calibration_covariance(fit: NullFit) -> Array:
-    """(11, 11) of the fit's own calibration, in noise of the colour that it leaves."""
+    """(11, 11) of the fit's own calibration, for noise with the spectrum of its residual."""
     seen = sensitivities(fit.filtered, nuisance_columns(fit.filtered))
     flat = seen.reshape(-1, seen.shape[2])
     power = spectral_peak(fit.filtered.whitened, 1.0 / fit.filtered.track.step_s)
@@ -82,10 +84,10 @@ def calibration_covariance(fit: NullFit) -> Array:
 
 
 def readings_of_drawn_calibration(truth: Readings, covariance: Array, seed: int) -> Readings:
-    """Readings of a calibration that the fit may as well have found.
+    """Readings for a calibration drawn from the uncertainty of the fit.
 
-    What a filter sees of it is linear and taken out again; where on their steps the readings lie
-    is not.
+    The filter sees a linear effect of it, which is removed again; but the positions of the readings
+    relative to their quantisation steps differ.
     """
     dice = np.random.default_rng([seed, 3])
     zero = np.zeros(len(covariance))
@@ -96,17 +98,17 @@ def readings_of_drawn_calibration(truth: Readings, covariance: Array, seed: int)
 
 
 def _moments(mag_b_gauss: Array, whitened: Array, step_gauss: float) -> Array:
-    """(2,) logarithms of the loudness and of how often a reading differs from the one before."""
+    """(2,) logarithms of the mean square and of how often a reading differs from the one before."""
     differ = np.abs(np.diff(mag_b_gauss, axis=0)) > step_gauss / 2
     return np.log([float(np.mean(whitened**2)), float(np.mean(differ)) + 1e-6])
 
 
 def _interpolate_moments(fine: Array, sizes: Array, found: Array) -> Array:
-    """(F, 2) moments (S, 2) at sizes in between, straight in the logarithm."""
+    """(F, 2) moments at sizes between those of (S, 2), linear in the logarithm of the size."""
     at = np.log(fine), np.log(sizes)
     return np.column_stack([np.interp(*at, column) for column in found.T])
 
 
 def _squared_distances(off: Array, scatter: Array) -> Array:
-    """(F,) Mahalanobis squares of differences (F, 2)."""
+    """(F,) squared Mahalanobis distances of differences (F, 2)."""
     return np.asarray(np.sum(off * np.linalg.solve(scatter, off.T).T, axis=1))
