@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ahrsd.diagnosis.columns.roles import prepared
+from ahrsd.diagnosis.columns.roles import prepare_columns
 from ahrsd.diagnosis.data_quality.axes_and_units import axis_and_unit_errors, window_equations
 from ahrsd.diagnosis.data_quality.facts import is_finding
 from ahrsd.diagnosis.data_quality.preparation import find_facts
@@ -120,7 +120,7 @@ def without_terms(
     blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
     if not blocks:
         return seen, ()
-    track, refused = prepared(checked(track_of(blocks))[0])
+    track, refused = prepare_columns(checked(track_of(blocks))[0])
     try:
         track, left = without(track, model.calibration, model.terms)
     except ValueError as error:

@@ -84,7 +84,7 @@ class PreparedRecording:
 
 def prepare(track: Track) -> PreparedRecording:
     """A recording ready for a fit.  NothingToFit, with one line, if no fit is possible."""
-    track, notes = roles.prepared(track)
+    track, notes = roles.prepare_columns(track)
     track, jumped = without_clock_jumps(track)
     if why := unusable_reason(track) or dead_sensor_reason(track):
         raise NothingToFit(why)
@@ -169,7 +169,7 @@ def detectable_faults(track: Track) -> tuple[str, ...]:
 
 def diagnose_with_gaps(track: Track, spec: Spec | None, diagnose: Diagnose) -> Diagnosis:
     """The diagnosis, with columns that have gaps if one of its effects depends on them."""
-    gappy = roles.holed(track)
+    gappy = roles.find_columns_with_gaps(track)
     if gappy:
         filled = track.with_columns(
             {**track.covariates, **{k: one.values for k, one in gappy.items()}}

@@ -86,7 +86,7 @@ def _answered(
     richest = richest_model.richest(problem, start.filtered, library)
     if clocks and (clock := wrong_clock(richest)) is not None:
         at_its_time = _answered(
-            clock.moved(asked.track), spec, library, simulated=simulated, clocks=False
+            clock.realigned_track(asked.track), spec, library, simulated=simulated, clocks=False
         )
         moved = at_its_time.found
         if any(one.setting.get("covariate") == clock.column for one in moved.findings):

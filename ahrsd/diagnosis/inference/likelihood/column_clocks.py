@@ -13,7 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.columns.clocks import Late, at_clock, likeliest_clock, suspects
+from ahrsd.diagnosis.columns.clocks import (
+    ColumnClock,
+    column_at_clock,
+    find_shifted_columns,
+    most_probable_clock,
+)
 from ahrsd.diagnosis.effects.design_matrix import on_axes
 from ahrsd.diagnosis.inference.components.component import Component, Sized
 from ahrsd.diagnosis.inference.likelihood.candidates import beside
@@ -26,14 +31,18 @@ from ahrsd.diagnosis.where_and_when.locate import Located, segments
 _COURSE = RICH_COURSES[0]
 
 
-def wrong_clock(found: Judged) -> Late | None:
+def wrong_clock(found: Judged) -> ColumnClock | None:
     """The clock of the column that explains most of the richest model's free course, if wrong."""
     track = found.base.made.context.track
     if not track.covariates:
         return None
-    asked = suspects(_course(found), track)
+    asked = find_shifted_columns(_course(found), track)
     asked = [one for one in asked if abs(one[0]) > priors.ON_TIME_S]
-    return likeliest_clock(_EvidenceBesideModel(found, asked[0][1]), asked[0][0]) if asked else None
+    return (
+        most_probable_clock(_EvidenceBesideModel(found, asked[0][1]), asked[0][0])
+        if asked
+        else None
+    )
 
 
 def _course(found: Judged) -> Located:
@@ -82,7 +91,7 @@ class _EvidenceBesideModel:
         return [worth[one.key] for one in new]
 
     def _component(self, clock: tuple[float, float]) -> Component:
-        course = at_clock(self._made.context.track, self.column, clock, self.middle_s)
+        course = column_at_clock(self._made.context.track, self.column, clock, self.middle_s)
         scaled = course / max(float(np.std(course)), 1e-300)
         low, high = np.log(priors.EFFECT_SIZES)
         law = Sized(np.full(3, priors.COURSE_UNIT["sensor"]), np.array([low]), np.array([high]))

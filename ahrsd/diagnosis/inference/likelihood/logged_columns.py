@@ -17,8 +17,12 @@ from scipy.fft import dct, idct
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.calibration_fit.problem import Problem
-from ahrsd.diagnosis.columns.held_and_noisy import cleaned, drawn_between, held_columns
-from ahrsd.diagnosis.columns.roles import shown
+from ahrsd.diagnosis.columns.held_and_noisy import (
+    denoise_columns,
+    find_held_columns,
+    interpolate_held_columns,
+)
+from ahrsd.diagnosis.columns.roles import label
 from ahrsd.diagnosis.effects.effect import Effect, Setting
 from ahrsd.diagnosis.inference.components import effect_components
 from ahrsd.diagnosis.inference.components.effect_components import LATE_STEP_S
@@ -92,17 +96,19 @@ def as_logged(problem: Problem, likely: Likely) -> Problem:
 
 def _drawn(problem: Problem, name: str) -> Problem | None:
     """With a column drawn straight between its values, where these come seldom."""
-    seldom = tuple(one for one in held_columns(problem.recorded) if one.name == name)
+    seldom = tuple(one for one in find_held_columns(problem.recorded) if one.name == name)
     if not seldom:
         return None
-    said = f"column {shown(name)} comes {seldom[0].often}: drawn straight between its values"
-    return _with(problem, drawn_between(problem.recorded, seldom), said)
+    said = (
+        f"column {label(name)} comes {seldom[0].interval_words}: drawn straight between its values"
+    )
+    return _with(problem, interpolate_held_columns(problem.recorded, seldom), said)
 
 
 def _without_noise(problem: Problem, name: str) -> Problem | None:
     """With a column without its logger's noise, where that can be told from its course."""
-    clean = cleaned(problem.recorded, (name,))
-    said = f"column {shown(name)} has noise of its own: what follows it is judged without it"
+    clean = denoise_columns(problem.recorded, (name,))
+    said = f"column {label(name)} has noise of its own: what follows it is judged without it"
     return None if clean is None else _with(problem, clean, said)
 
 
@@ -182,7 +188,7 @@ def _worth(
 
 def read_as(problem: Problem, reading: Reading) -> Problem:
     """The problem with a column read so."""
-    said = f"column {shown(reading.column)} is read as {reading.words}"
+    said = f"column {label(reading.column)} is read as {reading.words}"
     logged = {**problem.logged, reading.column: reading.setting}
     return replace(_with(problem, reading.of(problem.recorded), said), logged=logged)
 
