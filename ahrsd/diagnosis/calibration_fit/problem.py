@@ -75,11 +75,6 @@ class Problem:
         track = average_groups(moved, self.thin, self.cold, riding)
         return replace(self, track=track, lag_s=lag_s)
 
-    def with_riding(self, riding: Array, model: NullModel) -> Problem:
-        """The same with a known field fixed in the sensor's axes, beyond the model's hard iron."""
-        cold = replace(self.cold, hard_iron_gauss=model.hard_iron_gauss, soft_iron=model.soft_iron)
-        return replace(self, riding=riding, cold=cold).with_lag(self.lag_s)
-
     def averaged_with(self, riding: Array, model: NullModel, lag_s: float) -> Problem:
         """The same with another lag, averaged with a better calibration.
 
