@@ -44,7 +44,7 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_ellipsoid, fit_sphere_centre
-from ahrsd.diagnosis.data_quality.facts import Fact
+from ahrsd.diagnosis.data_quality.facts import Fact, whole_recording
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 from ahrsd.so3 import skew
@@ -148,7 +148,7 @@ def _frame_error(track: Track, best: SignedPermutation, equal: int) -> Fact:
     return Fact(
         "frame_error",
         words,
-        Where(_whole(track), ("x", "y", "z"), "gyro" if odd is None else "sensor"),
+        Where(whole_recording(track), ("x", "y", "z"), "gyro" if odd is None else "sensor"),
         1.0 if equal == 1 else priors.SURE_OF_READINGS,  # probability that it is one of them
         (Value("present", 1.0, 0.0, "1"),),
         # the true rate is signs * reading[axes]
@@ -163,7 +163,11 @@ def _misalignment_fact(track: Track, misalignment: SensorMisalignment) -> Fact:
     return Fact(
         "mag_gyro_misalignment",
         misalignment.words,
-        Where(_whole(track), ("x", "y", "z"), "sensor" if misalignment.of_magnetometer else "gyro"),
+        Where(
+            whole_recording(track),
+            ("x", "y", "z"),
+            "sensor" if misalignment.of_magnetometer else "gyro",
+        ),
         priors.SURE_OF_READINGS,
         tuple(
             Value(name, float(value), 0.0, "rad")
@@ -259,14 +263,10 @@ def _unit_error(
 ) -> Fact:
     """The finding of a wrong unit.  too_large: factor by which the readings are too large."""
     parameters = (Value("factor_less_one", too_large - 1, 0.0, "1"),)
-    where = Where(_whole(track), ("x", "y", "z"), frame)
+    where = Where(whole_recording(track), ("x", "y", "z"), frame)
     return Fact(
         "unit_error", words, where, priors.SURE_OF_READINGS, parameters, dict(setting), stops=True
     )
-
-
-def _whole(track: Track) -> tuple[tuple[float, float], ...]:
-    return ((float(track.time_s[0]), float(track.time_s[-1])),)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,6 +13,7 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.model import Term
+from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
 
@@ -84,6 +85,11 @@ def rounding(facts: Sequence[Fact]) -> tuple[Term, ...]:
         for fact in facts
         if fact.effect == "mag_quantisation"
     )
+
+
+def whole_recording(track: Track) -> tuple[tuple[float, float], ...]:
+    """The interval of the whole recording, seconds."""
+    return ((float(track.time_s[0]), float(track.time_s[-1])),)
 
 
 def row_intervals(rows: NDArray[np.bool], gap: int = 0) -> list[tuple[int, int]]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
-from ahrsd.diagnosis.data_quality.facts import Fact, row_intervals
+from ahrsd.diagnosis.data_quality.facts import Fact, row_intervals, whole_recording
 from ahrsd.diagnosis.track import Track
 from ahrsd.printable import counted
 from ahrsd.samples import Array
@@ -158,7 +158,7 @@ def find_quantisation(track: Track) -> list[Fact]:
     step = float(steps.max())
     axes = tuple(name for name, yes in zip(_AXES, coarse, strict=True) if yes)
     words = f"the magnetometer's readings come in steps of {1e3 * step:.3g} mG, coarser than noise"
-    where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), axes, "sensor")
+    where = Where(whole_recording(track), axes, "sensor")
     parameters = (Value("step", step, 1e-6, "gauss"),)
     return [Fact("mag_quantisation", words, where, priors.SURE_OF_READINGS, parameters)]
 

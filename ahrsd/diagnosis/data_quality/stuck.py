@@ -23,7 +23,7 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_sphere_centre
-from ahrsd.diagnosis.data_quality.facts import Fact, row_intervals
+from ahrsd.diagnosis.data_quality.facts import Fact, row_intervals, whole_recording
 from ahrsd.diagnosis.data_quality.range_and_resolution import quantisation_step
 from ahrsd.diagnosis.time_series import runs
 from ahrsd.diagnosis.track import Track
@@ -441,7 +441,7 @@ def _find_sample_hold(track: Track, repeated: NDArray[np.bool], expected: Array)
         Fact(
             "mag_sample_hold",
             words,
-            Where(_whole(track), _AXES, "sensor"),
+            Where(whole_recording(track), _AXES, "sensor"),
             1.0,
             (Value("held_part", 1.0, 0.0, "1"),),
             {"hold": usual, "period_s": usual * step},
@@ -500,7 +500,3 @@ def _find_doubled(track: Track, repeated: NDArray[np.bool]) -> list[Fact]:
             both,
         )
     ]
-
-
-def _whole(track: Track) -> tuple[tuple[float, float], ...]:
-    return ((float(track.time_s[0]), float(track.time_s[-1])),)

@@ -22,7 +22,7 @@ import numpy as np
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
-from ahrsd.diagnosis.data_quality.facts import Fact
+from ahrsd.diagnosis.data_quality.facts import Fact, whole_recording
 from ahrsd.diagnosis.track import Track
 from ahrsd.printable import counted
 from ahrsd.samples import Array, in_periods
@@ -102,7 +102,7 @@ def _stamp_jitter(track: Track) -> list[Fact]:
     )
     if opposed > priors.JITTER_OPPOSED or _evidence_for_stamps(track) > threshold:
         return []
-    where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), (), "link")
+    where = Where(whole_recording(track), (), "link")
     words = f"the time stamps scatter by {1e3 * jitter:.2g} ms about a regular clock"
     deviation = jitter / float(np.sqrt(len(steps)))
     parameters = (Value("jitter", jitter, deviation, "s"),)
@@ -192,7 +192,7 @@ def _clock_rate_errors(track: Track) -> list[Fact]:
         words = (
             f"time_s runs {1e6 * abs(error):.0f} ppm {'slow' if error > 0 else 'fast'} on {name}"
         )
-        where = Where(((float(track.time_s[0]), float(track.time_s[-1])),), (), "link")
+        where = Where(whole_recording(track), (), "link")
         parameters = (Value("rate_error", error, deviation, "1"),)
         sure = priors.SURE_OF_CLOCK
         out.append(Fact("clock_rate", words, where, sure, parameters, {"clock": name}))
