@@ -46,7 +46,9 @@ KINDS = {
 }
 #: functions that are timed, in the order in which they run, and the modules that call them
 PHASES = {
-    **dict.fromkeys(("prepared", "problem_of", "fit_null", "lost_turns", "wrong_clock"), engine),
+    **dict.fromkeys(
+        ("prepare", "build_problem", "fit_null", "find_lost_turns_at_start", "wrong_clock"), engine
+    ),
     "richest": richest_model,
     **dict.fromkeys(("answered", "quick"), both_rates),
     **dict.fromkeys(("lost_beside", "whole_answer", "beyond_chance"), engine),
