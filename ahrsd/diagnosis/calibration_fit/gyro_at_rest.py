@@ -107,11 +107,11 @@ def find_bias_drift_at_rest(context: Context, library: Mapping[str, Effect]) -> 
     )
     name = next(iter(shares))
     setting, root = best[name][1], roots[int(np.argmax(weight))]
-    value, deviation, course = _fit_effect(still, context, library[name], setting, root)
+    value, deviation, drift = _fit_effect(still, context, library[name], setting, root)
     usual = priors.ORDINARY_WALK_RAD_S_SQRT_S * np.sqrt(still.time_s[-1] - still.time_s[0])
-    if np.ptp(course, axis=0).max() < priors.REST_LARGE * usual:
+    if np.ptp(drift, axis=0).max() < priors.REST_LARGE * usual:
         return ()
-    return (_build_finding(still, library, shares, best[name], value, deviation, course),)
+    return (_build_finding(still, library, shares, best[name], value, deviation, drift),)
 
 
 def _build_finding(
@@ -121,12 +121,12 @@ def _build_finding(
     best: tuple[float, Setting],
     value: Array,
     deviation: Array,
-    course: Array,
+    drift: Array,
 ) -> Finding:
     """The finding for the most probable effect, with its alternatives."""
     name, *others = shares
     effect = library[name]
-    size = np.ptp(course, axis=0)
+    size = np.ptp(drift, axis=0)
     close = [other for other in others if shares[other] > priors.REST_SMALLEST_SHARE]
     return Finding(
         effect=name,
@@ -241,7 +241,7 @@ def _log_bayes_factor(
 def _fit_effect(
     still: _StillSeconds, context: Context, effect: Effect, setting: Setting, root: list[Array]
 ) -> tuple[Array, Array, Array]:
-    """Values (p,), deviations (p,), and time series (n, 3) rad/s, with one walk in the model."""
+    """Values (p,), deviations (p,), and bias drift (n, 3) rad/s, with one walk in the model."""
     columns = effect.columns(context, setting).gyro
     means = still.means(np.zeros((len(still.second), 3, 1)) if columns is None else columns)
     X, e = _whiten(still, root, means)

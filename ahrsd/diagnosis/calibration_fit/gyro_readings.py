@@ -9,11 +9,12 @@ unmodelled effect.  The recording itself shows which it is, by the fraction f of
 Differences of a gyro's values are its noise if the motion is smooth.  If a hand, a road or a
 propeller shakes the sensor, they are due to the motion, and may be fifty times the noise.  A filter
 that takes them for noise forgets the attitude within seconds; along one recorded motion two of
-three simulated sensors with no effect left out had an unknown one.  If nothing else is wrong, the
-likelihood of the innovations finds the noise, alternating with the calibration, which is poor as
-long as the noise is too large.  If something is wrong, that counts as noise, and the differences
-are the only estimate.  The magnetometer decides: its noise must be as low as its own differences
-show.
+three simulated sensors with no effect left out showed an unknown source.
+
+If nothing else is wrong, the likelihood of the innovations finds the noise, alternating with the
+calibration, which is poor as long as the noise is too large.  If something is wrong, that counts as
+noise, and the differences are the only estimate.  The magnetometer decides which is the case: its
+noise must be as low as its own differences show.
 """
 
 from __future__ import annotations

@@ -158,13 +158,17 @@ def _start_from_ellipsoid(track: Track, base: NullModel) -> NullModel | None:
 
 
 def _descend_with_inflation(
-    problem: FitProblem, model: NullModel, quiet: float, inflations: Sequence[float], steps: int
+    problem: FitProblem,
+    model: NullModel,
+    gyro_noise: float,
+    inflations: Sequence[float],
+    steps: int,
 ) -> NullFit:
     """Descend with decreasing inflation of the gyro's noise."""
     for inflation in inflations:
-        inflated = replace(model, sigma_gyro_rad_s=quiet * inflation)
+        inflated = replace(model, sigma_gyro_rad_s=gyro_noise * inflation)
         model = descend(problem, inflated, steps).model
-    return descend(problem, replace(model, sigma_gyro_rad_s=quiet), _MOST_STEPS)
+    return descend(problem, replace(model, sigma_gyro_rad_s=gyro_noise), _MOST_STEPS)
 
 
 def _calibration_starts(track: Track, base: NullModel) -> list[NullModel]:
@@ -221,8 +225,7 @@ def baseline_of(start: NullFit) -> Baseline:
 class CalibrationPrior:
     """Gaussian prior: mean and standard deviation (11,), in the order of the fit's parameters.
 
-    repetition: factor by which the number of data exceeds that of independent ones, for which the
-                deviations are scaled
+    repetition: number of data per independent one, for which the deviations are scaled
     """
 
     mean: Array

@@ -71,8 +71,8 @@ class Problem:
         riding = self.riding
         if riding is not None and is_magnetometer_lag(self.recorded, lag_s):
             riding = delayed_values(self.recorded, riding, lag_s)
-        moved = without_lag(self.recorded, lag_s, instants=self.instants)
-        track = average_groups(moved, self.thin, self.cold, riding)
+        without_delay = without_lag(self.recorded, lag_s, instants=self.instants)
+        track = average_groups(without_delay, self.thin, self.cold, riding)
         return replace(self, track=track, lag_s=lag_s)
 
     def averaged_with(self, riding: Array, model: NullModel, lag_s: float) -> Problem:

@@ -46,9 +46,9 @@ def noise_before_rounding(
     """
     done = fit.filtered
     usual = np.ones(len(done.track)) if seen.level is None else seen.level
-    loud = float(np.sqrt(np.mean(usual**2)))
-    left = 1.0 - step_gauss**2 / 12 / (seen.mag_gauss * loud) ** 2
-    guess = float(np.sqrt(max(left, _LEAST_SHARE**2)))
+    rms_level = float(np.sqrt(np.mean(usual**2)))
+    remaining_share = 1.0 - step_gauss**2 / 12 / (seen.mag_gauss * rms_level) ** 2
+    guess = float(np.sqrt(max(remaining_share, _LEAST_SHARE**2)))
 
     def law(size: float) -> Noise:
         return replace(seen, level=size * usual)

@@ -110,12 +110,12 @@ def _average_with_riding(track: Track, m: int, model: NullModel, riding: Array) 
     """The same, with `riding` removed before the turn and its means added afterwards."""
     names = [f"riding {axis}" for axis in "xyz"]
     known = {**track.covariates, **dict(zip(names, riding.T, strict=True))}
-    made = average_groups(
+    averaged = average_groups(
         replace(track, mag_b_gauss=track.mag_b_gauss - riding, covariates=known), m, model
     )
-    means = np.column_stack([made.covariates[name] for name in names])
-    left = {name: values for name, values in made.covariates.items() if name not in names}
-    return replace(made, mag_b_gauss=made.mag_b_gauss + means, covariates=left)
+    means = np.column_stack([averaged.covariates[name] for name in names])
+    covariates = {name: values for name, values in averaged.covariates.items() if name not in names}
+    return replace(averaged, mag_b_gauss=averaged.mag_b_gauss + means, covariates=covariates)
 
 
 def _average_run(track: Track, run: slice, m: int, model: NullModel) -> dict[str, Array]:

@@ -59,16 +59,16 @@ class ColumnClock:
         return text
 
 
-def find_shifted_columns(course: Located, track: Track) -> list[tuple[float, str]]:
+def find_shifted_columns(series: Located, track: Track) -> list[tuple[float, str]]:
     """(lag_s, column) of columns that explain most of a time series at some lag, the best first.
 
-    course: the time series, in the sensor's axes
+    series: in the sensor's axes
     """
     found = []
     for name, values in track.covariates.items():
         if not roles.role_of(name, values) or roles.refusal_reason(name, values):
             continue
-        match = _ColumnMatch(course, track, name)
+        match = _ColumnMatch(series, track, name)
         reach_s = min(LONGEST_S, track.duration_s / 4)
         lags = np.arange(-reach_s, reach_s + STEP_S, STEP_S)
         share = match.shares(lags)
@@ -131,20 +131,20 @@ def column_at_clock(
     """(N,) a column as it would be at a (lag, drift), less its mean."""
     lag_s, drift = clock
     at_s = track.time_s + lag_s + drift * (track.time_s - middle_s)
-    course = np.interp(at_s, track.time_s, track.covariates[column])
-    return np.asarray(course - course.mean())
+    values = np.interp(at_s, track.time_s, track.covariates[column])
+    return np.asarray(values - values.mean())
 
 
 class _ColumnMatch:
     """One column compared with the time series (J, 3) in its intervals, weighted."""
 
-    def __init__(self, course: Located, track: Track, name: str) -> None:
-        self._edges, self._time_s = course.cut.edges_s, track.time_s
-        self._weight = 1.0 / np.maximum(course.deviation, 1e-12)
+    def __init__(self, series: Located, track: Track, name: str) -> None:
+        self._edges, self._time_s = series.cut.edges_s, track.time_s
+        self._weight = 1.0 / np.maximum(series.deviation, 1e-12)
         self._sum = np.cumsum(
             track.covariates[name] * np.diff(track.time_s, prepend=track.time_s[0])
         )
-        self._y = self._centred(course.course)
+        self._y = self._centred(series.course)
 
     def _means(self, lag_s: float) -> Array:
         """(J,) means of the column over the intervals, shifted by a lag."""

@@ -130,10 +130,10 @@ def denoised_column(values: Array) -> Array | None:
     samples = values[pattern.first :: pattern.rows]
     if len(samples) < SPECTRUM_ROWS or not _is_flat_and_gaussian(samples):
         return None
-    course = denoised(samples[:, None])[:, 0]
-    if np.var(course) < priors.COLUMN_COURSE * np.var(samples):
+    signal = denoised(samples[:, None])[:, 0]
+    if np.var(signal) < priors.COLUMN_COURSE * np.var(samples):
         return None
-    return pattern.interpolate(course, len(values))
+    return pattern.interpolate(signal, len(values))
 
 
 def _is_flat_and_gaussian(values: Array) -> bool:

@@ -409,8 +409,8 @@ def forward_excess_evidence(mean: JumpMeans) -> tuple[float, float]:
 
     def nats(step: float) -> tuple[float, float]:
         odds = np.exp(np.minimum(step * z - step**2 * size / 2, priors.JUMP_MOST_NATS)) - 1.0
-        told = [(float(np.sum(np.log1p(share * odds))), share) for share in _NEAR_JUMP_SHARES]
-        total, share = max(told)
+        candidates = [(float(np.sum(np.log1p(share * odds))), share) for share in _NEAR_JUMP_SHARES]
+        total, share = max(candidates)
         return total / mean.length, share * len(z) / mean.length
 
     forward, count = nats(priors.LOST_TURN_PART)

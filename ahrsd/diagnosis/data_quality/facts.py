@@ -50,7 +50,7 @@ def is_finding(fact: Fact) -> bool:
         return fact.parameters[0].value > priors.MISSING_FINDING_SHARE
     if fact.effect == "stuck_magnetometer":
         return fact.parameters[0].value >= priors.STUCK_FINDING_S
-    if fact.effect == "stuck_gyro":  # no name of the library
+    if fact.effect == "stuck_gyro":  # not an effect of the library
         return False
     if fact.effect == "timestamp_jitter" and not fact.stops:
         return fact.parameters[0].value > priors.JITTER_FINDING_SHARE * float(

@@ -143,7 +143,7 @@ def correct_track(track: Track, facts: Sequence[Fact]) -> Track:
 
 
 def detectable_faults(track: Track) -> tuple[str, ...]:
-    """From which size on the checks would have found a fault in this recording, one line each."""
+    """The smallest faults that the checks would have found in this recording, one line each."""
     mag, gyro = noise_of_differences(track)
     step = track.step_s
     equations = window_equations(track)

@@ -391,8 +391,8 @@ def _find_stuck(track: Track, repeated: NDArray[np.bool]) -> tuple[list[Fact], N
         for span in long
     ]
     fine = any(turned) and _coarsest_step(track) == 0.0
-    for (first, last), moved in zip(long, turned, strict=True):
-        if moved or fine:
+    for (first, last), has_turned in zip(long, turned, strict=True):
+        if has_turned or fine:
             bad[first - (not track.mag_b_gauss[first].any()) : last] = True
             intervals.append((float(track.time_s[first - 1]), float(track.time_s[last - 1])))
     if not intervals:

@@ -151,14 +151,14 @@ def _evidence_for_stamps(track: Track) -> float:
     first, second = residual(stamped), residual(even)
     size = np.maximum(np.abs(first), np.abs(second))
     usual = 1.4826 * np.median(np.abs(first), axis=0)
-    quiet = (size <= priors.STAMPED_OUTLIER * usual).all(axis=1)
-    if np.count_nonzero(quiet) < 100:
+    inliers = (size <= priors.STAMPED_OUTLIER * usual).all(axis=1)
+    if np.count_nonzero(inliers) < 100:
         return 0.0
     # neighbouring differences share a reading: half of their information counts twice
-    ratio = np.sum(second[quiet] ** 2, axis=0) / np.maximum(
-        np.sum(first[quiet] ** 2, axis=0), 1e-300
+    ratio = np.sum(second[inliers] ** 2, axis=0) / np.maximum(
+        np.sum(first[inliers] ** 2, axis=0), 1e-300
     )
-    return float(np.count_nonzero(quiet) / 4 * np.sum(np.log(np.maximum(ratio, 1e-300))))
+    return float(np.count_nonzero(inliers) / 4 * np.sum(np.log(np.maximum(ratio, 1e-300))))
 
 
 def regular_stamps(track: Track) -> Array:
