@@ -226,7 +226,10 @@ def find_columns_with_gaps(track: Track) -> dict[str, ColumnWithGaps]:
 
 
 def _fill_gaps(name: str, values: Array, time_s: Array) -> tuple[Array, str]:
-    """The column with gaps of at most two seconds interpolated, or the reason for its refusal."""
+    """The column with short gaps filled, or the reason for its refusal.
+
+    Gaps of at most COLUMN_GAP_S are interpolated; a column of 0 and 1 keeps its last value.
+    """
     good = np.isfinite(values)
     if good.all():
         return values, ""
