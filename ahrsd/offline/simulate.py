@@ -43,7 +43,7 @@ def along(
 
     `read` is the recording's own track. AhrsdError where a term needs a column that there is not.
     """
-    track, refused = roles.prepared(read)
+    track, refused = roles.prepare_columns(read)
     try:
         context = forward.context_along(track, model.calibration, model.terms)
         truth = forward.truth_along(context)

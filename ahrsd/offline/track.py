@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ahrsd.diagnosis.columns.roles import prepared
-from ahrsd.diagnosis.data_quality.axes_and_units import as_recorded, windows
-from ahrsd.diagnosis.data_quality.facts import matters
-from ahrsd.diagnosis.data_quality.preparation import facts_of
-from ahrsd.diagnosis.data_quality.stuck import dead_axes, without_impossible
-from ahrsd.diagnosis.data_quality.timestamps import without_jumps
+from ahrsd.diagnosis.columns.roles import prepare_columns
+from ahrsd.diagnosis.data_quality.axes_and_units import axis_and_unit_errors, window_equations
+from ahrsd.diagnosis.data_quality.facts import is_finding
+from ahrsd.diagnosis.data_quality.preparation import find_facts
+from ahrsd.diagnosis.data_quality.stuck import dead_axis_notes, without_impossible_readings
+from ahrsd.diagnosis.data_quality.timestamps import without_clock_jumps
 from ahrsd.diagnosis.effects.design_matrix import GRAVITY_M_S2
 from ahrsd.diagnosis.repaired_model.forward import without
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
@@ -65,10 +65,10 @@ def track_of(blocks: list[SampleBlock]) -> Track:
 
 def checked(track: Track) -> tuple[Track, list[str]]:
     """The track without what no sensor gives, and one line for each such thing."""
-    track, jumped = without_jumps(track)
-    track, notes = without_impossible(track)
+    track, jumped = without_clock_jumps(track)
+    track, notes = without_impossible_readings(track)
     accel, said = _acceleration(track)
-    return replace(track, accel_b_m_s2=accel), [*jumped, *notes, *dead_axes(track), *said]
+    return replace(track, accel_b_m_s2=accel), [*jumped, *notes, *dead_axis_notes(track), *said]
 
 
 def _acceleration(track: Track) -> tuple[Array | None, list[str]]:
@@ -98,16 +98,16 @@ def faults(blocks: list[SampleBlock]) -> tuple[list[str], list[str]]:
 
     A clock that jumps where a run begins (a restart of the device) is no wrong time.
     """
-    facts = facts_of(without_jumps(track_of(blocks))[0]) if blocks else ()
+    facts = find_facts(without_clock_jumps(track_of(blocks))[0]) if blocks else ()
     wrong = [fact.words for fact in facts if fact.stops]
-    return wrong, [fact.words for fact in facts if not fact.stops and matters(fact)]
+    return wrong, [fact.words for fact in facts if not fact.stops and is_finding(fact)]
 
 
 def disagreements(track: Track) -> list[str] | None:
     """Where field, gyro and gravity do not mean the same axes; None: it turns too little to tell
     anything, and nothing else is wrong."""
-    found = [fact.words for fact in as_recorded(track)]
-    return found if found or windows(track) else None
+    found = [fact.words for fact in axis_and_unit_errors(track)]
+    return found if found or window_equations(track) else None
 
 
 def without_terms(
@@ -120,7 +120,7 @@ def without_terms(
     blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
     if not blocks:
         return seen, ()
-    track, refused = prepared(checked(track_of(blocks))[0])
+    track, refused = prepare_columns(checked(track_of(blocks))[0])
     try:
         track, left = without(track, model.calibration, model.terms)
     except ValueError as error:

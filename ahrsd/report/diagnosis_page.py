@@ -35,7 +35,7 @@ from ahrsd.diagnosis.answer.text import (
     value_text,
     verdict,
 )
-from ahrsd.diagnosis.columns.roles import shown
+from ahrsd.diagnosis.columns.roles import label
 from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN, legend_above
 from ahrsd.report.template import Picture, number, picture, render
 from ahrsd.samples import Array
@@ -170,7 +170,7 @@ def regime_map(maps: tuple[RegimeMap, ...]) -> Figure:
 
 def _plain(name: str) -> str:
     """A column's name in a picture: a dollar sign begins no formula."""
-    return shown(name).replace("$", r"\$")
+    return label(name).replace("$", r"\$")
 
 
 def courses(drawn: Drawn) -> Figure:
@@ -398,7 +398,7 @@ def _unexplained(found: Diagnosis) -> list[tuple[str, str]]:
     rows += [
         (
             "follows",
-            f"{shown(s.channel)}, correlation {s.correlation:+.2f}, p = {s.p_value:.1g}",
+            f"{label(s.channel)}, correlation {s.correlation:+.2f}, p = {s.p_value:.1g}",
         )
         for s in left.follows
     ]

@@ -32,7 +32,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Where,
 )
 from ahrsd.diagnosis.answer.text import lines
-from ahrsd.diagnosis.columns.roles import SHOWN_CHARACTERS, shown
+from ahrsd.diagnosis.columns.roles import LABEL_CHARACTERS, label
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.report import diagnosis_page
 from ahrsd.report.diagnosis_page import _STATISTICS, write_diagnosis_report
@@ -302,8 +302,8 @@ def test_whatever_a_file_calls_its_columns_it_is_shown_in_one_short_line(name):
     maps = (RegimeMap(name, (0.0, 6.0, 27.0), (0.5, 400.0), (1.0, 2.0)),)
     figure = diagnosis_page.regime_map(maps)
     figure.draw_without_rendering()
-    label = figure.axes[0].get_yticklabels()[0].get_text()
-    assert label.replace(r"\$", "$") == f"{shown(name)}\n0 to 27"
+    tick = figure.axes[0].get_yticklabels()[0].get_text()
+    assert tick.replace(r"\$", "$") == f"{label(name)}\n0 to 27"
     left = replace(diagnosis().unexplained, follows=(Suspect(name, 0.9, 0.01),))
     told = lines(diagnosis(unexplained=left))
     assert "\x1b" not in "\n".join(told)
@@ -316,13 +316,13 @@ def test_a_long_name_makes_no_large_page(tmp_path):
     write_diagnosis_report(page, diagnosis(unexplained=left, drawn=None), "ahrsd diagnose x")
     text = page.read_text(encoding="utf-8")
     assert len(text) < 20_000
-    assert escape(shown(NAMES[-1])) in text
+    assert escape(label(NAMES[-1])) in text
 
 
 def test_a_long_name_keeps_its_beginning_and_its_end():
-    assert shown("motor_current_a") == "motor_current_a"
-    assert shown("a\tb") == "a\\tb"
-    long = shown("begin" + "x" * 100 + "_a")
-    assert len(long) == SHOWN_CHARACTERS
+    assert label("motor_current_a") == "motor_current_a"
+    assert label("a\tb") == "a\\tb"
+    long = label("begin" + "x" * 100 + "_a")
+    assert len(long) == LABEL_CHARACTERS
     assert long.startswith("begin")
     assert long.endswith("..." + "x" * 8 + "_a")

@@ -39,8 +39,8 @@ from ahrsd.diagnosis import priors, time_series
 from ahrsd.diagnosis.answer.diagnosis import Check, Diagnosis, Finding, Unexplained
 from ahrsd.diagnosis.answer.predictive_checks import beside_refitted, checks, usual_noise
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null
-from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate, problem_of
-from ahrsd.diagnosis.data_quality.preparation import would_have_shown
+from ahrsd.diagnosis.calibration_fit.problem import Problem, build_problem, model_of_samples
+from ahrsd.diagnosis.data_quality.preparation import detectable_faults
 from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.innovation_filter.context import (
     Given,
@@ -129,7 +129,7 @@ def beyond_chance(track: Track, ask: Callable[[Track], Answered]) -> Diagnosis:
     if problem is None or start is None or not seen:
         return found
     recorded = problem.recorded
-    models = [model_at_rate(start.model, problem), *([found.model] if found.model else [])]
+    models = [model_of_samples(start.model, problem), *([found.model] if found.model else [])]
     model = max(models, key=lambda one: loudness(recorded, one))
     loud = loudness(recorded, model) >= priors.CHANCE_LOUD
     if not loud and bent(start) < priors.CHANCE_BENT:
@@ -228,7 +228,7 @@ def _fitted(one: Finding) -> bool:
 def _fit_of(copy: Track, problem: Problem) -> NullFit | None:
     """The calibration alone fitted to a copy, as it was to the recording; None where it cannot."""
     try:
-        made, cold = problem_of(copy, problem.spec)
+        made, cold = build_problem(copy, problem.spec)
         return fit_null(made.track, made.spec, cold, walk=False)
     except (np.linalg.LinAlgError, ValueError):
         return None
@@ -329,10 +329,10 @@ def _agreeing(
     counted = tuple(one for one in found.findings if not _fitted(one))
     fitted = {one.term for one in found.findings if _fitted(one)}
     terms = tuple(term for k, term in enumerate(found.terms) if k not in fitted)
-    model, drawn = model_at_rate(start.model, problem), found.drawn
+    model, drawn = model_of_samples(start.model, problem), found.drawn
     if drawn is not None:
         drawn = replace(drawn, after=drawn.before, after_gauss=drawn.before_gauss, contributions=())
-    more = () if counted else would_have_shown(problem.recorded)
+    more = () if counted else detectable_faults(problem.recorded)
     return replace(
         found,
         mismatch=bool(counted),

@@ -21,8 +21,8 @@ from ahrsd.diagnosis import priors, time_series
 from ahrsd.diagnosis.answer.diagnosis import Check
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.calibration_fit.quantisation_noise import (
-    before_rounding,
     calibration_covariance,
+    noise_before_rounding,
     readings_of_drawn_calibration,
 )
 from ahrsd.diagnosis.effects.effect import Effect
@@ -132,7 +132,7 @@ def noise_law(
             made = forward.track_of(forward.simulated(known, terms, noise, seed, library))
             return made.mag_b_gauss, _filtered([made], fit)
 
-        return before_rounding(fit, replace(law, colour=(), level=level), steps[0], simulate)
+        return noise_before_rounding(fit, replace(law, colour=(), level=level), steps[0], simulate)
     law = replace(law, level=level)
     if done.track.lost_turns is None:  # else what is lost makes the tails, and is simulated
         law = replace(

@@ -28,7 +28,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Value,
     Where,
 )
-from ahrsd.diagnosis.columns.roles import shown
+from ahrsd.diagnosis.columns.roles import label
 from ahrsd.diagnosis.effects.effect import Effect
 
 _FRAMES = {
@@ -199,7 +199,7 @@ def _unexplained_lines(left: Unexplained) -> list[str]:
             f"   one source of fixed direction explains {left.single_source_share:.0%} of it"
         )
     out += [
-        f"   follows    {shown(one.channel)} (correlation {one.correlation:+.2f}, "
+        f"   follows    {label(one.channel)} (correlation {one.correlation:+.2f}, "
         f"p = {one.p_value:.1g})"
         for one in left.follows
     ]
@@ -349,7 +349,7 @@ def setting_text(setting: Mapping[str, Any]) -> str:
         if not value:
             continue
         if isinstance(value, str):
-            parts.append(told.words.format(shown(value)))
+            parts.append(told.words.format(label(value)))
         elif isinstance(value, (list, tuple)):
             parts.append(told.words.format(" or ".join(f"{one:.3g}" for one in value)))
         elif value < 0 and told.negative:

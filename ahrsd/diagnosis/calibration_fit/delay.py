@@ -1,22 +1,23 @@
 """A recording without the delay between its magnetometer and its gyro.
 
-A magnetometer that is late by tau shows at t all that it measures as it was at t - tau: the Earth's
-field, that of a current, a place, a joint.  So everything else, whatever it was logged by, is moved
-to where the magnetometer is.  Where the gyro is late, it alone is moved; so it is by half a step,
-by which a gyro's value is early that is the rate at the instant and not the mean over the step.
+A magnetometer with a delay of tau shows at time t all that it measures as it was at t - tau: the
+field of the Earth, of a current, of a place, of a joint.  So all other columns are shifted to the
+magnetometer's time.  If the gyro is late, it alone is shifted.  The same holds for half a step: a
+gyro value that is the rate at an instant, not the mean over the step, is early by that.
 
-The gyro is moved exactly.  Its columns are linear only for
-a lag that is short against the motion, so a lag that has been found is taken out by giving each
-magnetometer sample the rotation between t_(k-1) - tau and t_k - tau.  Between samples the rate is
-straight in time with the mean that the step has and the slope of its neighbours (a constant one
-would be off by the acceleration times a quarter of a step squared, half of what a hand's turns show
-of a lag of some milliseconds); only the gyro's small noise is mixed.
+The gyro is shifted exactly.  Its columns are linear only for a delay that is short compared with
+the motion, so an estimated delay is removed by giving each magnetometer sample the rotation between
+t_(k-1) - tau and t_k - tau.  Between samples the rate is linear in time, with the mean of the step
+and the slope of its neighbours.  (A constant rate would be wrong by the acceleration times a
+quarter of a step squared, half of what the turns of a hand show of a delay of some milliseconds.)
+Only the gyro's small noise is mixed.
 
-Where the gyro's values are rates at instants (`instants`) the rate is straight from value to value,
-and half of a step of the lag is theirs.  Drawn through means it would be off by as much
-as the rate changes within a step, which at 10 Hz on a flight is far more than its noise.
+If the gyro's values are rates at instants (`instants`), the rate is linear from value to value, and
+half a step of the delay is due to them.  For values that are means, this interpolation would be
+wrong by the change of the rate within a step, which at 10 Hz on a flight is far more than the
+noise.
 
-A low-pass is such a delay and, in quick turns, more (`beyond_the_lag`).
+A low-pass acts as such a delay and, in quick turns, as more (`low_pass_beyond_delay`).
 """
 
 from __future__ import annotations
@@ -35,26 +36,29 @@ from ahrsd.samples import Array
 
 
 def without_lag(track: Track, lag_s: float, *, instants: bool = False) -> Track:
-    """The track with a lag of the magnetometer against all else taken out; negative: the gyro's.
+    """The track without a lag of the magnetometer; negative: a lag of the gyro.
 
     instants: the gyro's values are rates at instants and not means, which is part of the lag
     """
-    moved = delayed_gyro(track, lag_s, instants=instants)
-    if not of_magnetometer(track, lag_s):
-        return moved
+    delayed = delayed_gyro(track, lag_s, instants=instants)
+    if not is_magnetometer_lag(track, lag_s):
+        return delayed
     accel = track.accel_b_m_s2
     return replace(
-        moved,
-        accel_b_m_s2=None if accel is None else earlier(track, accel, lag_s),
-        covariates={name: earlier(track, row, lag_s) for name, row in track.covariates.items()},
+        delayed,
+        accel_b_m_s2=None if accel is None else delayed_values(track, accel, lag_s),
+        covariates={
+            name: delayed_values(track, row, lag_s) for name, row in track.covariates.items()
+        },
     )
 
 
-def after_columns_begin(track: Track) -> Track:
-    """Without a run's first readings, which a late magnetometer took before columns were logged.
+def without_early_readings(track: Track) -> Track:
+    """The track without the first readings of each run.
 
-    The same for every lag: models at different lags are compared by the same readings.  A run so
-    short that they are much of it keeps them.
+    A late magnetometer took them before the columns were logged.  They are the same for every lag:
+    models with different lags are compared by the same readings.  A short run, of which they are a
+    large part, keeps them.
     """
     if not track.covariates:
         return track
@@ -66,90 +70,96 @@ def after_columns_begin(track: Track) -> Track:
     return replace(track, mag_b_gauss=mag)
 
 
-def of_magnetometer(track: Track, lag_s: float) -> bool:
-    """Whether a lag is one of all that the magnetometer measures, and not of the gyro alone."""
-    step_s = usual_step(track.dt_s)
+def is_magnetometer_lag(track: Track, lag_s: float) -> bool:
+    """Whether a lag concerns all that the magnetometer measures, and not the gyro alone."""
+    step_s = regular_step(track.dt_s)
     half = step_s is not None and abs(lag_s / (step_s / 2) - 1.0) < priors.HALF_STEP_WITHIN
     return lag_s > 0.0 and not half
 
 
-def usual_step(dt_s: Array) -> float | None:
-    """The step that nearly all rows (N,) have, seconds; None where there is none."""
+def regular_step(dt_s: Array) -> float | None:
+    """The step that nearly all rows (N,) have, seconds; None if there is none."""
     middle = float(np.nanmedian(dt_s))
     alike = np.abs(np.nan_to_num(dt_s, nan=0.0) / middle - 1.0) < priors.STEPS_ALIKE
     return middle if np.mean(alike) > priors.STEPS_ALIKE_SHARE else None
 
 
-def earlier(track: Track, values: Array, ago_s: float) -> Array:
-    """What was logged beside a track's samples, (N,) or (N, k), as it was `ago_s` before."""
+def delayed_values(track: Track, values: Array, ago_s: float) -> Array:
+    """Values logged with the track's samples, (N,) or (N, k), as they were `ago_s` before."""
     return time_series.earlier(values, track.time_s, track.dt_s, ago_s)
 
 
 def delayed_gyro(track: Track, tau_s: float, *, instants: bool = False) -> Track:
-    """The track with the rates of tau_s earlier; beyond the ends of a run they stay as they are."""
+    """The track with the rates of tau_s earlier; those beyond the ends of a run do not change."""
     if tau_s == 0.0 and not instants:
         return track
     gyro = track.gyro_b_rad_s.copy()
-    move = _delayed_instants if instants else _delayed_run
+    move = _delayed_instants if instants else _delayed_means
     for run in track.runs or (slice(0, len(track)),):
         if run.stop - run.start > 2:
             gyro[run] = move(track.time_s[run], track.gyro_b_rad_s[run], tau_s)
     return replace(track, gyro_b_rad_s=gyro)
 
 
-def _delayed_run(time_s: Array, rate: Array, tau_s: float) -> Array:
-    """Means over the steps, of means."""
+def _delayed_means(time_s: Array, rate: Array, tau_s: float) -> Array:
+    """Mean rates over the steps, from mean rates."""
     step_s = np.diff(time_s)
-    before, since, inside = _within(time_s, time_s - tau_s)
-    turn = rate[before + 1] * since[:, None] + _slope(rate[1:], step_s)[before] * inside[:, None]
-    return _means(rate[1:], step_s, before, turn)
+    before, since, inside = _locate_in_steps(time_s, time_s - tau_s)
+    turn = (
+        rate[before + 1] * since[:, None] + _rate_slope(rate[1:], step_s)[before] * inside[:, None]
+    )
+    return _mean_rates(rate[1:], step_s, before, turn)
 
 
 def _delayed_instants(time_s: Array, rate: Array, tau_s: float) -> Array:
-    """Means over the steps, of rates at instants, which are early by half of a step."""
+    """Mean rates over the steps, from rates at instants, which are early by half a step."""
     step_s = np.diff(time_s)
-    before, since, inside = _within(time_s, time_s - tau_s + np.median(step_s) / 2)
+    before, since, inside = _locate_in_steps(time_s, time_s - tau_s + np.median(step_s) / 2)
     middle, slope = (rate[:-1] + rate[1:]) / 2, np.diff(rate, axis=0) / step_s[:, None]
     turn = middle[before] * since[:, None] + slope[before] * inside[:, None]
-    return _means(middle, step_s, before, turn)
+    return _mean_rates(middle, step_s, before, turn)
 
 
-def _within(time_s: Array, wanted_s: Array) -> tuple[NDArray[np.intp], Array, Array]:
-    """Of each time the step that it is in, s since that began, and s^2 of the slope till there."""
+def _locate_in_steps(time_s: Array, wanted_s: Array) -> tuple[NDArray[np.intp], Array, Array]:
+    """Position of each time in the steps.
+
+    Returns the index of its step, the seconds since that began, and the integral, s^2, of the
+    step's centred time up to there, which multiplies the slope of the rate.
+    """
     before = np.clip(np.searchsorted(time_s, wanted_s, side="right") - 1, 0, len(time_s) - 2)
     since = wanted_s - time_s[before]
-    inside = since * (since - np.diff(time_s)[before]) / 2  # none beyond the ends
+    inside = since * (since - np.diff(time_s)[before]) / 2  # 0 beyond the ends
     inside = np.where((wanted_s < time_s[0]) | (wanted_s > time_s[-1]), 0.0, inside)
     return before, since, inside
 
 
-def _means(mean: Array, step_s: Array, before: NDArray[np.intp], turn: Array) -> Array:
-    """(N, 3) rates between attitudes that are `turn` (N, 3) on from the begin of a step.
+def _mean_rates(mean: Array, step_s: Array, before: NDArray[np.intp], turn: Array) -> Array:
+    """(N, 3) rates between attitudes that are `turn` (N, 3) after the begin of a step.
 
-    mean (N - 1, 3): rates of the steps
+    mean: (N - 1, 3) rates of the steps;  before: index of the step
     """
     R = np.empty((len(mean) + 1, 3, 3))
     R[0] = np.eye(3)
     for k, one in enumerate(so3.exp(mean * step_s[:, None])):
         R[k + 1] = R[k] @ one
     at = R[before] @ so3.exp(turn)
-    moved = so3.log(np.swapaxes(at[:-1], 1, 2) @ at[1:]) / step_s[:, None]
-    return np.vstack([moved[:1], moved])
+    rates = so3.log(np.swapaxes(at[:-1], 1, 2) @ at[1:]) / step_s[:, None]
+    return np.vstack([rates[:1], rates])
 
 
-def _slope(rate: Array, step_s: Array) -> Array:
-    """(N - 1, 3) d rate / dt within each step, from the mean rates before and behind; 0 at ends."""
+def _rate_slope(rate: Array, step_s: Array) -> Array:
+    """(N - 1, 3) d rate / dt within each step, from the mean rates before and after; 0 at ends."""
     slope = np.zeros_like(rate)
     between_s = step_s[1:-1] + (step_s[:-2] + step_s[2:]) / 2
     slope[1:-1] = (rate[2:] - rate[:-2]) / between_s[:, None]
     return slope
 
 
-def beyond_the_lag(context: Context, lag_s: float) -> Columns:
+def low_pass_beyond_delay(context: Context, lag_s: float) -> Columns:
     """What a low-pass of time constant tau does beyond a delay by tau, gauss (N, 3, 1).
 
-    g(t) = h(t - tau) is the field of a track whose delay is taken out, D its derivative by time:
-    LP_tau[h] - g = tau^2/2 D^2 g - tau^3/3 D^3 g + ..., half of what a filter of g has at D^2.
+    g(t) = h(t - tau) is the field of a track without its delay, D its derivative in time:
+    LP_tau[h] - g = tau^2/2 D^2 g - tau^3/3 D^3 g + ..., half of the D^2 term of a filter of g.
     """
     readings = readings_of(context)
     time_s, dt_s = readings.time_s, readings.dt_s

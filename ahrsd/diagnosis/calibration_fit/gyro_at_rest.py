@@ -1,9 +1,10 @@
-"""A gyro that stands still reads its bias: what the bias does, without the magnetometer.
+"""A gyro at rest reads its bias: how the bias changes, without the magnetometer.
 
-At rest the field says next to nothing of the gyro (the calibration would explain any slow turn of
-it), but the readings themselves do.  Their means over a second are regressed on what could move a
-bias, beside a random walk of an ordinary gyro's size and a few times that, weighted by likelihood.
-Warming up, time since power-on and wandering look nearly alike; they are told as one set.
+At rest the field contains almost no information on the gyro (the calibration would explain any slow
+turn), but the gyro's readings do.  Their means over a second are regressed on possible causes of a
+bias change.  The model includes a random walk of an ordinary gyro's size and of a few times that,
+weighted by likelihood.  Warm-up, time since power-on and a random walk look nearly alike: they are
+reported as one set of alternatives.
 """
 
 from __future__ import annotations
@@ -34,13 +35,17 @@ HARDLY_TURNED = (
     "the sensor hardly turned: only the gyro, a logged current, switches and alternating fields "
     "can be told"
 )
-#: sizes of the walk that are weighed, rad/s per square root of a second
+#: sizes of the walk that are averaged over, rad/s per square root of a second
 WALKS = priors.ORDINARY_WALK_RAD_S_SQRT_S * np.array([1.0, 2.0, 4.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rest:
-    """Still seconds.  time_s (n,);  mean (n, 3) rad/s;  noise (3,) of a mean; rows: of each."""
+class _StillSeconds:
+    """Still seconds.
+
+    time_s: (n,);  mean: (n, 3) rad/s;  noise: (3,) of a mean
+    second: (N,) second of each row;  chosen: (n,) the still seconds
+    """
 
     time_s: Array
     mean: Array
@@ -53,36 +58,44 @@ class _Rest:
         return np.stack([values[self.second == k].mean(axis=0) for k in self.chosen])
 
 
-def at_rest(fit: NullFit) -> bool:
-    """Whether the field hardly turns in the sensor: then only the gyro can be told about."""
+def field_hardly_turns(fit: NullFit) -> bool:
+    """Whether the field hardly turns in the sensor: then only effects of the gyro can be found."""
     field = fit.filtered.nominal_b
     unit = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-300)
     return bool(1.0 - np.linalg.norm(unit.mean(axis=0)) < priors.REST_SPREAD)
 
 
-def told_at_rest(library: Mapping[str, Effect], still: Sequence[Finding]) -> Mapping[str, Effect]:
-    """What a field that hardly turns can tell: the gyro, what rides with the sensor, what is quick.
+def effects_testable_at_rest(
+    library: Mapping[str, Effect], found_at_rest: Sequence[Finding]
+) -> Mapping[str, Effect]:
+    """Effects that can be found while the field hardly turns.
 
-    still: what a gyro that stands tells of its bias, which is not asked of the field again
+    They are those of the gyro, those that ride with the sensor, and quick ones.
+    found_at_rest: findings from the gyro's own readings; causes of these are not tested again
     The delays stay: their rows make the column that a model always has.
     """
-    asked = {k: one for k, one in library.items() if not (still and k in priors.REST_CAUSES)}
-    return {k: e for k, e in asked.items() if e.family == "gyro" or e.rides or e.quick or e.delay}
+    tested = {
+        k: one for k, one in library.items() if not (found_at_rest and k in priors.REST_CAUSES)
+    }
+    return {k: e for k, e in tested.items() if e.family == "gyro" or e.rides or e.quick or e.delay}
 
 
-def resting(context: Context, library: Mapping[str, Effect]) -> tuple[Finding, ...]:
-    """The name for what moves the bias of a gyro that stands, with what is as likely; or none."""
-    rest = _rest(context)
-    if rest is None or _turning(rest, context) > priors.REST_TURNS:
+def find_bias_drift_at_rest(context: Context, library: Mapping[str, Effect]) -> tuple[Finding, ...]:
+    """The effect that changes the bias of a gyro at rest, with its alternatives; or nothing."""
+    still = _still_seconds(context)
+    if still is None or _turning_share(still, context) > priors.REST_TURNS:
         return ()
     best: dict[str, tuple[float, Setting]] = {}
-    roots = [_roots(rest, walk) for walk in WALKS]
-    weight = np.array([_log_likelihood(rest, root) for root in roots])
+    roots = [_covariance_roots(still, walk) for walk in WALKS]
+    weight = np.array([_log_likelihood(still, root) for root in roots])
     for name in priors.REST_CAUSES:
         options = library[name].settings(context) if name in library else ()
         if options:
             best[name] = max(
-                ((_evidence(rest, context, library[name], o, roots, weight), o) for o in options),
+                (
+                    (_log_bayes_factor(still, context, library[name], o, roots, weight), o)
+                    for o in options
+                ),
                 key=lambda item: item[0],
             )
             best[name] = (best[name][0] - float(np.log(len(options))), best[name][1])
@@ -94,32 +107,33 @@ def resting(context: Context, library: Mapping[str, Effect]) -> tuple[Finding, .
     )
     name = next(iter(shares))
     setting, root = best[name][1], roots[int(np.argmax(weight))]
-    value, deviation, course = _fitted(rest, context, library[name], setting, root)
-    usual = priors.ORDINARY_WALK_RAD_S_SQRT_S * np.sqrt(rest.time_s[-1] - rest.time_s[0])
-    if np.ptp(course, axis=0).max() < priors.REST_LARGE * usual:
+    value, deviation, drift = _fit_effect(still, context, library[name], setting, root)
+    usual = priors.ORDINARY_WALK_RAD_S_SQRT_S * np.sqrt(still.time_s[-1] - still.time_s[0])
+    if np.ptp(drift, axis=0).max() < priors.REST_LARGE * usual:
         return ()
-    return (_finding(rest, library, shares, best[name], value, deviation, course),)
+    return (_build_finding(still, library, shares, best[name], value, deviation, drift),)
 
 
-def _finding(
-    rest: _Rest,
+def _build_finding(
+    still: _StillSeconds,
     library: Mapping[str, Effect],
     shares: Mapping[str, float],
     best: tuple[float, Setting],
     value: Array,
     deviation: Array,
-    course: Array,
+    drift: Array,
 ) -> Finding:
+    """The finding for the most probable effect, with its alternatives."""
     name, *others = shares
     effect = library[name]
-    size = np.ptp(course, axis=0)
+    size = np.ptp(drift, axis=0)
     close = [other for other in others if shares[other] > priors.REST_SMALLEST_SHARE]
     return Finding(
         effect=name,
         confidence=shares[name],
         alternatives=tuple(Share(other, shares[other]) for other in close),
         where=Where(
-            ((float(rest.time_s[0]), float(rest.time_s[-1])),),
+            ((float(still.time_s[0]), float(still.time_s[-1])),),
             tuple(axis for axis, part in zip("xyz", size, strict=True) if part > 0.2 * size.max()),
             "gyro",
             "at rest",
@@ -138,11 +152,12 @@ def _finding(
     )
 
 
-def _rest(context: Context) -> _Rest | None:
+def _still_seconds(context: Context) -> _StillSeconds | None:
+    """The still seconds of a recording; None if there are too few."""
     track = context.track
     second = np.floor(track.time_s - track.time_s[0]).astype(np.intp)
     known = np.flatnonzero(np.bincount(second) > 2)
-    if len(known) < priors.REST_S:  # rows that come more slowly
+    if len(known) < priors.REST_S:  # too few, or less than three rows a second
         return None
     means = np.stack([track.gyro_b_rad_s[second == k].mean(axis=0) for k in known])
     scatter = np.array([track.gyro_b_rad_s[second == k].std(axis=0).max() for k in known])
@@ -153,79 +168,82 @@ def _rest(context: Context) -> _Rest | None:
     mean = means[still]
     noise = np.sqrt(np.mean(np.diff(mean, axis=0) ** 2, axis=0) / 2)
     chosen = known[still]
-    return _Rest(chosen + 0.5 + track.time_s[0], mean, np.maximum(noise, 1e-9), second, chosen)
+    return _StillSeconds(
+        chosen + 0.5 + track.time_s[0], mean, np.maximum(noise, 1e-9), second, chosen
+    )
 
 
-def _turning(rest: _Rest, context: Context) -> float:
-    """Share of the gyro's integral by which the field turns in the sensor; constant rates aside.
+def _turning_share(still: _StillSeconds, context: Context) -> float:
+    """Share of the gyro's integral by which the field turns in the sensor, constant rates removed.
 
     0 for a bias that changes, 1 for a slow turn: a vehicle on a straight course is not at rest.
     """
     readings = context.track.mag_b_gauss - context.model.hard_iron_gauss
-    field = rest.means(np.nan_to_num(readings, nan=0.0))
+    field = still.means(np.nan_to_num(readings, nan=0.0))
     unit = field / np.maximum(np.linalg.norm(field, axis=1, keepdims=True), 1e-300)
-    steps_s = np.diff(rest.time_s, prepend=rest.time_s[0])
-    angle = np.cumsum((rest.mean - rest.mean.mean(axis=0)) * steps_s[:, None], axis=0)
-    line = np.column_stack([np.ones(len(unit)), rest.time_s - rest.time_s[0]])
+    steps_s = np.diff(still.time_s, prepend=still.time_s[0])
+    angle = np.cumsum((still.mean - still.mean.mean(axis=0)) * steps_s[:, None], axis=0)
+    line = np.column_stack([np.ones(len(unit)), still.time_s - still.time_s[0]])
     both = np.column_stack([np.cross(unit.mean(axis=0), angle), unit])
-    expected, seen = np.hsplit(both - line @ np.linalg.lstsq(line, both)[0], 2)
-    return float(np.sum(expected * seen) / max(float(np.sum(expected**2)), 1e-300))
+    expected, observed = np.hsplit(both - line @ np.linalg.lstsq(line, both)[0], 2)
+    return float(np.sum(expected * observed) / max(float(np.sum(expected**2)), 1e-300))
 
 
-def _roots(rest: _Rest, walk: float) -> list[Array]:
-    """Per axis the Cholesky factor (n, n) of noise, walk and the bias' own prior."""
-    since = rest.time_s - rest.time_s[0]
+def _covariance_roots(still: _StillSeconds, walk: float) -> list[Array]:
+    """Cholesky factor (n, n) for each axis of the covariance of noise, walk and the bias' prior."""
+    since = still.time_s - still.time_s[0]
     common = walk**2 * np.minimum.outer(since, since) + priors.REST_BIAS_RAD_S**2
     return [linalg.cholesky(common + np.diag(np.full(len(since), s**2)), lower=True)
-            for s in rest.noise]  # fmt: skip
+            for s in still.noise]  # fmt: skip
 
 
-def _whitened(rest: _Rest, roots: list[Array], columns: Array) -> tuple[Array, Array]:
-    """(3 n, p) columns and (3 n,) readings, whitened axis by axis; columns (n, 3, p)."""
+def _whiten(still: _StillSeconds, roots: list[Array], columns: Array) -> tuple[Array, Array]:
+    """Whitened columns (3 n, p) and readings (3 n,), axis by axis; columns (n, 3, p)."""
     X = [
         linalg.solve_triangular(root, columns[:, axis], lower=True)
         for axis, root in enumerate(roots)
     ]
     e = [
-        linalg.solve_triangular(root, rest.mean[:, axis], lower=True)
+        linalg.solve_triangular(root, still.mean[:, axis], lower=True)
         for axis, root in enumerate(roots)
     ]
     return np.concatenate(X), np.concatenate(e)
 
 
-def _log_likelihood(rest: _Rest, roots: list[Array]) -> float:
-    _, e = _whitened(rest, roots, np.zeros((len(rest.time_s), 3, 1)))
+def _log_likelihood(still: _StillSeconds, roots: list[Array]) -> float:
+    """Log likelihood of the readings with noise and walk alone."""
+    _, e = _whiten(still, roots, np.zeros((len(still.time_s), 3, 1)))
     return -0.5 * float(e @ e) - float(sum(np.sum(np.log(np.diag(root))) for root in roots))
 
 
-def _evidence(
-    rest: _Rest,
+def _log_bayes_factor(
+    still: _StillSeconds,
     context: Context,
     effect: Effect,
     setting: Setting,
     roots: list[list[Array]],
     weight: Array,
 ) -> float:
-    """Log Bayes factor against the walk alone, over the walks' sizes."""
+    """Log Bayes factor of an effect relative to the walk alone, averaged over the walk's sizes."""
     columns = effect.columns(context, setting).gyro
     if columns is None:
         return -np.inf
-    means = rest.means(columns)
+    means = still.means(columns)
     scale = np.array([parameter.scale for parameter in effect.parameters])
     gains = []
     for root in roots:
-        X, e = _whitened(rest, root, means)
-        what = total_score(X.T @ X, X.T @ e, np.einsum("ij,ij->j", X, X), scale)
-        gains.append(log_bayes(what))
+        X, e = _whiten(still, root, means)
+        score = total_score(X.T @ X, X.T @ e, np.einsum("ij,ij->j", X, X), scale)
+        gains.append(log_bayes(score))
     return float(logsumexp(weight + np.array(gains)) - logsumexp(weight))
 
 
-def _fitted(
-    rest: _Rest, context: Context, effect: Effect, setting: Setting, root: list[Array]
+def _fit_effect(
+    still: _StillSeconds, context: Context, effect: Effect, setting: Setting, root: list[Array]
 ) -> tuple[Array, Array, Array]:
-    """Value (p,), deviation (p,), and course (n, 3) rad/s beside one walk."""
+    """Values (p,), deviations (p,), and bias drift (n, 3) rad/s, with one walk in the model."""
     columns = effect.columns(context, setting).gyro
-    means = rest.means(np.zeros((len(rest.second), 3, 1)) if columns is None else columns)
-    X, e = _whitened(rest, root, means)
+    means = still.means(np.zeros((len(still.second), 3, 1)) if columns is None else columns)
+    X, e = _whiten(still, root, means)
     found = solve(X.T @ X, np.column_stack([X.T @ e, np.eye(X.shape[1])]))
     return found[:, 0], np.sqrt(np.maximum(np.diag(found[:, 1:]), 0.0)), means @ found[:, 0]

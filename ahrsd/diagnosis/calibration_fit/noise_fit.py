@@ -1,4 +1,4 @@
-"""Noise levels by differences of readings, and by innovation likelihood on pieces of the track."""
+"""Noise levels from differences of readings, and from the likelihood of innovations on pieces."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.calibration_fit.resampling import decimated, decimation
+from ahrsd.diagnosis.calibration_fit.resampling import decimate, decimation_factor
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.samples import Array
 
-#: logarithms below its differences from which a shaken gyro's noise is sought
+#: logarithms below the differenced noise, from which a shaken gyro's noise is maximised
 _SHAKEN_STARTS = (0.0, 1.4, 2.8, 4.2, 5.6)
-_WALKS = (-3.6, -2.4, -1.2, 0.0)  # levels tried, log below the cap
+_WALK_LEVELS = (-3.6, -2.4, -1.2, 0.0)  # levels tried, in logarithms relative to the cap
 _PIECES, _PIECE_ROWS = 6, 400
-_FINE = 0.1  # of a logarithm: where no common scale puts right by how much a coarse parabola is off
-SAME = 0.02  # relative change of a noise level that changes nothing
+_FINE_STEP = 0.1  # of a logarithm: no common scale corrects the error of a coarse parabola there
+SAME_LEVEL = 0.02  # relative change of a noise level below which it is the same
 
 
 def first_guess(track: Track, spec: Spec) -> NullModel:
-    """Unit soft iron, and noise from differences where the spec does not say."""
+    """Unit soft iron, and noise from differences if the spec does not give it."""
     mag, gyro = noise_of_differences(track)
     return NullModel(
         np.eye(3),
@@ -35,7 +35,7 @@ def first_guess(track: Track, spec: Spec) -> NullModel:
     )
 
 
-def alike(a: NullModel, b: NullModel) -> bool:
+def same_noise(a: NullModel, b: NullModel) -> bool:
     """Whether two models have the same noise for every purpose."""
     levels = [
         (a.sigma_mag_gauss, b.sigma_mag_gauss),
@@ -43,10 +43,10 @@ def alike(a: NullModel, b: NullModel) -> bool:
     ]
     walk = max(a.gyro_walk_rad_s_sqrt_s, b.gyro_walk_rad_s_sqrt_s)
     same_walk = abs(a.gyro_walk_rad_s_sqrt_s - b.gyro_walk_rad_s_sqrt_s) <= 0.2 * walk
-    return same_walk and all(abs(np.log(x / y)) < SAME for x, y in levels)
+    return same_walk and all(abs(np.log(x / y)) < SAME_LEVEL for x, y in levels)
 
 
-def estimated(
+def estimate_noise(
     filtered: Filtered,
     spec: Spec,
     terms_mag: Array | None = None,
@@ -54,18 +54,22 @@ def estimated(
     *,
     walk: bool = True,
 ) -> NullModel:
-    """The model of a filter run with its noise estimated anew; what the spec says stays."""
-    clean = cleaned(filtered.track, terms_mag, terms_gyro)
+    """The model of a filter run with its noise estimated anew; levels in the spec are kept.
+
+    terms_mag, terms_gyro: (N, 3) terms to subtract from the readings;  walk: allow a random walk of
+    the gyro's bias
+    """
+    clean = without_terms(filtered.track, terms_mag, terms_gyro)
     differenced = spec.shaken_gyro_rad_s or max(noise_of_differences(filtered.track)[1], 1e-9)
-    model = _white(pieces(clean), filtered.model, spec, differenced)
-    return _walking(clean, model) if walk else replace(model, gyro_walk_rad_s_sqrt_s=0.0)
+    model = _fit_white_noise(cut_pieces(clean), filtered.model, spec, differenced)
+    return _with_bias_walk(clean, model) if walk else replace(model, gyro_walk_rad_s_sqrt_s=0.0)
 
 
-def rescaled(filtered: Filtered, spec: Spec) -> NullModel:
-    """The noise scaled so that the whole track's normalised innovation becomes 1, not its pieces'.
+def rescale_noise(filtered: Filtered, spec: Spec) -> NullModel:
+    """The noise scaled so that the normalised innovation of the whole track, not its pieces, is 1.
 
-    Both levels together; sigma_mag alone where the gyro's is given or at its cap, and neither where
-    sigma_mag would be below its floor: what is missing to 1 is the magnetometer's.
+    Both levels are scaled together; sigma_mag alone if the gyro's is given or at its cap; neither
+    if sigma_mag would fall below its floor.  Any remaining difference from 1 is the magnetometer's.
     """
     model, factor = filtered.model, float(np.sqrt(filtered.normalised_innovation))
     if spec.sigma_mag_gauss or not np.isfinite(factor) or factor == 0.0:
@@ -76,18 +80,18 @@ def rescaled(filtered: Filtered, spec: Spec) -> NullModel:
     gyro = model.sigma_gyro_rad_s
     if not spec.sigma_gyro_rad_s:
         differenced = spec.shaken_gyro_rad_s or noise_of_differences(filtered.track)[1]
-        gyro = float(np.clip(gyro * factor, priors.FLOOR_GYRO_RAD_S, _cap(differenced)))
+        gyro = float(np.clip(gyro * factor, priors.FLOOR_GYRO_RAD_S, _gyro_noise_cap(differenced)))
     return replace(model, sigma_mag_gauss=mag, sigma_gyro_rad_s=gyro)
 
 
-def cleaned(track: Track, terms_mag: Array | None, terms_gyro: Array | None) -> Track:
+def without_terms(track: Track, terms_mag: Array | None, terms_gyro: Array | None) -> Track:
     """The track without the contributions of its terms."""
     mag = track.mag_b_gauss if terms_mag is None else track.mag_b_gauss - terms_mag
     gyro = track.gyro_b_rad_s if terms_gyro is None else track.gyro_b_rad_s - terms_gyro
     return replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro)
 
 
-def pieces(track: Track) -> Track:
+def cut_pieces(track: Track) -> Track:
     """Up to 2,400 rows of a track: pieces spread over it evenly, each a run of its own."""
     if len(track) <= _PIECES * _PIECE_ROWS:
         return track
@@ -119,37 +123,40 @@ def pieces(track: Track) -> Track:
     )
 
 
-def _cap(differenced: float) -> float:
+def _gyro_noise_cap(differenced: float) -> float:
+    """The largest sigma_gyro that is allowed."""
     return max(priors.GYRO_NOISE_CAP * differenced, priors.FLOOR_GYRO_RAD_S)
 
 
-def _white(track: Track, model: NullModel, spec: Spec, differenced: float) -> NullModel:
-    """Both levels, sigma_gyro drawn to the gyro's differenced noise and within its cap."""
+def _fit_white_noise(track: Track, model: NullModel, spec: Spec, differenced: float) -> NullModel:
+    """Both levels; sigma_gyro has a prior at the gyro's differenced noise, and a cap."""
     base = replace(model, gyro_walk_rad_s_sqrt_s=0.0)
     given_mag, given_gyro = spec.sigma_mag_gauss, spec.sigma_gyro_rad_s
     below = priors.SHAKEN_TRUST if spec.shaken_gyro_rad_s else priors.GYRO_NOISE_TRUST
     if given_mag and given_gyro:
         return replace(base, sigma_mag_gauss=given_mag, sigma_gyro_rad_s=given_gyro)
     if given_gyro:
-        return _mag_alone(track, replace(base, sigma_gyro_rad_s=given_gyro))
+        return _fit_mag_level(track, replace(base, sigma_gyro_rad_s=given_gyro))
     if given_mag:
-        return _gyro_alone(track, replace(base, sigma_mag_gauss=given_mag), differenced, below)
-    free = _by_ratio(track, base, differenced, below)
+        return _fit_gyro_level(track, replace(base, sigma_mag_gauss=given_mag), differenced, below)
+    free = _fit_both_levels(track, base, differenced, below)
     if free.sigma_mag_gauss < priors.FLOOR_MAG_GAUSS:
         at_floor = replace(base, sigma_mag_gauss=priors.FLOOR_MAG_GAUSS)
-        return _gyro_alone(track, at_floor, differenced, below)
-    if free.sigma_gyro_rad_s <= _cap(differenced):
+        return _fit_gyro_level(track, at_floor, differenced, below)
+    if free.sigma_gyro_rad_s <= _gyro_noise_cap(differenced):
         return replace(free, sigma_gyro_rad_s=max(free.sigma_gyro_rad_s, priors.FLOOR_GYRO_RAD_S))
-    return _mag_alone(track, replace(free, sigma_gyro_rad_s=_cap(differenced)))
+    return _fit_mag_level(track, replace(free, sigma_gyro_rad_s=_gyro_noise_cap(differenced)))
 
 
-def _prior(sigma_gyro: float, differenced: float, below: float) -> float:
+def _log_prior(sigma_gyro: float, differenced: float, below: float) -> float:
+    """Log prior of sigma_gyro.  below: width, in logarithms, below the differenced noise."""
     trust = below if sigma_gyro < differenced else priors.GYRO_NOISE_TRUST
     return -0.5 * float(np.square(np.log(sigma_gyro / differenced) / trust))
 
 
-def _by_ratio(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
-    most = np.log(_cap(differenced) / priors.FLOOR_MAG_GAUSS)
+def _fit_both_levels(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
+    """Both levels free: the maximum over their ratio, with the scale solved for."""
+    most = np.log(_gyro_noise_cap(differenced) / priors.FLOOR_MAG_GAUSS)
 
     def scaled(level: float) -> tuple[NullModel, float]:
         ratio = float(np.exp(min(level, most)))
@@ -163,63 +170,73 @@ def _by_ratio(track: Track, model: NullModel, differenced: float, below: float) 
             sigma_mag_gauss=tried.sigma_mag_gauss * root,
             sigma_gyro_rad_s=tried.sigma_gyro_rad_s * root,
         )
-        # with the scale at its best the squares sum to their number
+        # at the maximum-likelihood scale the sum of squares equals their number
         value = float(np.sum(done.log_likelihood)) + 0.5 * count * (scale - 1 - np.log(scale))
-        return fitted, value + _prior(fitted.sigma_gyro_rad_s, differenced, below)
+        return fitted, value + _log_prior(fitted.sigma_gyro_rad_s, differenced, below)
 
     start = np.log(model.sigma_gyro_rad_s / model.sigma_mag_gauss)
-    if below > priors.GYRO_NOISE_TRUST:  # far below there may be another maximum
+    if below > priors.GYRO_NOISE_TRUST:  # another maximum may be far below
         start = max((start - down for down in _SHAKEN_STARTS), key=lambda level: scaled(level)[1])
-    return scaled(_highest(lambda level: scaled(level)[1], start))[0]
+    return scaled(_maximise(lambda level: scaled(level)[1], start))[0]
 
 
-def _mag_alone(track: Track, model: NullModel) -> NullModel:
+def _fit_mag_level(track: Track, model: NullModel) -> NullModel:
+    """sigma_mag alone."""
+
     def of_mag(level: float) -> float:
-        return _likelihood(track, replace(model, sigma_mag_gauss=float(np.exp(level))))
+        return _log_likelihood(track, replace(model, sigma_mag_gauss=float(np.exp(level))))
 
-    best = _highest(of_mag, np.log(model.sigma_mag_gauss))
+    best = _maximise(of_mag, np.log(model.sigma_mag_gauss))
     return replace(model, sigma_mag_gauss=max(float(np.exp(best)), priors.FLOOR_MAG_GAUSS))
 
 
-def _gyro_alone(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
+def _fit_gyro_level(track: Track, model: NullModel, differenced: float, below: float) -> NullModel:
+    """sigma_gyro alone."""
+
     def of_gyro(level: float) -> float:
         tried = replace(model, sigma_gyro_rad_s=float(np.exp(level)))
-        return _likelihood(track, tried) + _prior(float(np.exp(level)), differenced, below)
+        return _log_likelihood(track, tried) + _log_prior(float(np.exp(level)), differenced, below)
 
-    rough = _highest(of_gyro, np.log(differenced))
-    best = float(np.exp(_highest(of_gyro, rough, _FINE)))
+    rough = _maximise(of_gyro, np.log(differenced))
+    best = float(np.exp(_maximise(of_gyro, rough, _FINE_STEP)))
     return replace(
-        model, sigma_gyro_rad_s=float(np.clip(best, priors.FLOOR_GYRO_RAD_S, _cap(differenced)))
+        model,
+        sigma_gyro_rad_s=float(
+            np.clip(best, priors.FLOOR_GYRO_RAD_S, _gyro_noise_cap(differenced))
+        ),
     )
 
 
-def _walking(track: Track, model: NullModel) -> NullModel:
-    """With a random walk of the gyro's bias if that is far more likely than none."""
-    size = decimation(track)
-    coarse = decimated(track, size)
+def _with_bias_walk(track: Track, model: NullModel) -> NullModel:
+    """The model with a random walk of the gyro's bias if that is far more likely than none."""
+    size = decimation_factor(track)
+    coarse = decimate(track, size)
     rate = replace(model, sigma_gyro_rad_s=model.sigma_gyro_rad_s / np.sqrt(size))
-    still = _likelihood(coarse, rate)
+    without_walk = _log_likelihood(coarse, rate)
     top = np.log(priors.WALK_CAP_RAD_S_SQRT_S)
 
     def of_walk(level: float) -> float:
-        return _likelihood(coarse, replace(rate, gyro_walk_rad_s_sqrt_s=float(np.exp(level))))
+        return _log_likelihood(coarse, replace(rate, gyro_walk_rad_s_sqrt_s=float(np.exp(level))))
 
-    tried = [of_walk(top + level) for level in _WALKS]
+    tried = [of_walk(top + level) for level in _WALK_LEVELS]
     at = int(np.argmax(tried))
-    if tried[at] < still + priors.WALK_NATS:
+    if tried[at] < without_walk + priors.WALK_NATS:
         return model
-    level = _WALKS[at]
-    if 0 < at < len(_WALKS) - 1:
-        level += _parabola(tried[at - 1], tried[at], tried[at + 1]) * (_WALKS[1] - _WALKS[0])
+    level = _WALK_LEVELS[at]
+    if 0 < at < len(_WALK_LEVELS) - 1:
+        level += _parabola_maximum(tried[at - 1], tried[at], tried[at + 1]) * (
+            _WALK_LEVELS[1] - _WALK_LEVELS[0]
+        )
     return replace(model, gyro_walk_rad_s_sqrt_s=float(np.exp(top + level)))
 
 
-def _likelihood(track: Track, model: NullModel) -> float:
+def _log_likelihood(track: Track, model: NullModel) -> float:
+    """Log likelihood of the innovations."""
     return float(np.sum(run_filter(track, model, sensitive=False).log_likelihood))
 
 
-def _highest(function: Callable[[float], float], start: float, step: float = 0.7) -> float:
-    """Where a smooth function of one number is highest: climb in steps, then a parabola."""
+def _maximise(function: Callable[[float], float], start: float, step: float = 0.7) -> float:
+    """Argument that maximises a smooth function of one variable: steps uphill, then a parabola."""
     middle, value = start, function(start)
     left, right = function(start - step), function(start + step)
     for _ in range(12):
@@ -231,11 +248,11 @@ def _highest(function: Callable[[float], float], start: float, step: float = 0.7
             right = function(middle + step)
         else:
             break
-    return middle + _parabola(left, value, right) * step
+    return middle + _parabola_maximum(left, value, right) * step
 
 
-def _parabola(left: float, middle: float, right: float) -> float:
-    """Where the parabola through values at -1, 0, 1 is highest, at most 1 away."""
+def _parabola_maximum(left: float, middle: float, right: float) -> float:
+    """Maximum of the parabola through values at -1, 0, 1, at most 1 away."""
     bend = left - 2 * middle + right
     return 0.0 if bend >= 0 else float(np.clip(0.5 * (left - right) / bend, -1.0, 1.0))
 
@@ -243,14 +260,17 @@ def _parabola(left: float, middle: float, right: float) -> float:
 def noise_of_differences(track: Track) -> tuple[float, float]:
     """White noise of one reading, (gauss, rad/s), from third differences.
 
-    Of the middle second and the middle axis: a jolt is short, a propeller shakes one axis.
-    Third differences of white noise have 20 times its variance and take out what is smooth over
-    four samples; what motion is left makes both values too large, never too small.
+    The median over seconds and axes: a jolt is short, a propeller shakes one axis.  Third
+    differences of white noise have 20 times its variance and remove what is smooth over four
+    samples.  Remaining motion makes both values too large, never too small.
     """
-    return _of_differences(track, track.mag_b_gauss), _of_differences(track, track.gyro_b_rad_s)
+    return _noise_of_third_differences(track, track.mag_b_gauss), _noise_of_third_differences(
+        track, track.gyro_b_rad_s
+    )
 
 
-def _of_differences(track: Track, values: Array) -> float:
+def _noise_of_third_differences(track: Track, values: Array) -> float:
+    """Standard deviation of white noise in values (N, 3); 0 if there are too few."""
     found: list[Array] = []
     known = track.dt_s[np.isfinite(track.dt_s)]
     block = max(8, round(1.0 / float(np.median(known)))) if len(known) else 8

@@ -1,22 +1,23 @@
-"""The null: calibration and noise that explain a recording best.
+"""The null model: the calibration and the noise that explain a recording best.
 
-`descended` finds the lowest cost from where it is set down, noise as it is, by Gauss-Newton on the
-whitened innovations, the gains held within a step.  The cold start descends on a decimated track
-from a sphere, from no iron and from a linear fit with the gyro, with the gyro's
-noise inflated 30, 10, 3, 1 times: a short memory forgives a wrong bias and soft iron.  Where none
-of these explains the data nor two agree, it begins anew at 100 times.  Where that noise
-turns up more field than the magnetometer's own, the size of the field says where the iron is, by a
-valley too narrow to be followed in straight steps: there it begins at the ellipsoid of the
-readings, as it is.
+`descend` finds the lowest cost from a starting point, with the noise fixed, by Gauss-Newton on the
+whitened innovations; the gains are held within a short step.  The cold start descends on a
+decimated track from a sphere fit, from no iron and from a linear fit with the gyro.  It inflates
+the gyro's noise 30, 10, 3, 1 times: a filter with a short memory tolerates a wrong bias and soft
+iron.  If none of these starts explains the data and no two of them agree, it starts again at 100
+times.  If the gyro's noise turns the field by more than the magnetometer's own noise, the size of
+the field determines the iron, by a valley of the cost too narrow for straight steps.  Then the
+ellipsoid through the readings is the start, without inflation.
 
-A Gaussian prior (`Prior`) keeps what the motion does not show.  It is a thousand times too wide to
-matter where the motion shows anything.  Where it does not, it keeps the calibration from running
-after slow noise: at rest A and b would go anywhere.
+A Gaussian prior (`CalibrationPrior`) fixes what the motion does not show.  It is a thousand times
+too wide to matter where the motion shows anything.  Elsewhere it keeps the calibration from
+following slow noise: at rest A and b would be arbitrary.
 
-Noise by innovation likelihood: the filter's gain is a function of sigma_gyro / sigma_mag, the
-scale follows from the mean square.  sigma_gyro is never more than GYRO_NOISE_CAP times what the
-gyro's own differences say: free, it swallows every drift of the gyro.  For the same reason the bias
-wanders only when the likelihood says so, and not faster than WALK_CAP_RAD_S_SQRT_S.
+The noise is found by the likelihood of the innovations: the filter's gain is a function of
+sigma_gyro / sigma_mag, and the scale follows from the mean square.  sigma_gyro is never more than
+GYRO_NOISE_CAP times the noise that the differences of the gyro's readings show: without this limit
+it absorbs every drift of the gyro.  For the same reason the bias is a random walk only if the
+likelihood supports it, and not faster than WALK_CAP_RAD_S_SQRT_S.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Baseline
 from ahrsd.diagnosis.calibration_fit import noise_fit
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
-from ahrsd.diagnosis.calibration_fit.resampling import decimated, decimation, turned_up
+from ahrsd.diagnosis.calibration_fit.resampling import decimate, decimation_factor, gyro_noise_ratio
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import (
     Filtered,
@@ -47,20 +48,20 @@ from ahrsd.estimator.chain import linear_start
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
-#: inflations of the gyro's noise by which a cold start descends, and most steps at each; where no
-#: start of the first comes to what explains the data, from a shorter memory and with more steps
-_LADDERS = (((30.0, 10.0, 3.0), 2), ((100.0, 30.0, 10.0, 3.0), 6))
+#: inflations of the gyro's noise by which a cold start descends, and most steps at each; the second
+#: set, with a shorter memory and more steps, if no start of the first explains the data
+_INFLATIONS = (((30.0, 10.0, 3.0), 2), ((100.0, 30.0, 10.0, 3.0), 6))
 _SHORTEST_RUN = 8  # samples of a run that the linear start can use
-_STEPS = 60  # most; a fit ends where it has converged
-_REESTIMATE = 0.3  # normalised innovation (log) beyond which the noise is found from the beginning
-_GOOD = 1.5  # normalised innovation of a start that needs no rival
-_WORTH = 10.0  # by which a further start's cost must be lower
-_FARTHEST_GAUSS = 3.0  # hard iron of a start: beyond, the start is nonsense
+_MOST_STEPS = 60  # a fit ends earlier if it has converged
+_REESTIMATE = 0.3  # |log| of the normalised innovation beyond which the noise is estimated anew
+_GOOD_INNOVATION = 1.5  # normalised innovation of a start that is accepted without a further one
+_CLEARLY_LOWER = 10.0  # by which the cost of a further start must be lower
+_FARTHEST_GAUSS = 3.0  # hard iron of a start, at most
 _BLOCKS = 40  # in which the scores are summed
-_DONE = 0.05  # largest step in standard deviations
-_NEAR = 3.0  # largest step in standard deviations behind which the gains are as before it
+_CONVERGED = 0.05  # largest step of a converged fit, in standard deviations
+_GAINS_HELD = 3.0  # largest step, in standard deviations, for which the gains are held
 _HALVINGS = 3
-_SMALLEST_EIGENVALUE = 0.05  # of the soft iron: beyond, no calibration
+_SMALLEST_EIGENVALUE = 0.05  # of the soft iron: less is no calibration
 
 
 def fit_null(
@@ -73,39 +74,39 @@ def fit_null(
 ) -> NullFit:
     """Fit calibration and noise to a track.
 
-    start: begin there (a fit of nearly the same data) instead of cold
-    noise: estimate what the spec leaves open; else keep the noise of `start`
-    walk:  let the gyro's bias wander where the data say so
+    start: starting point (a fit of nearly the same data); None for a cold start
+    noise: estimate what the spec leaves open; otherwise keep the noise of `start`
+    walk:  let the gyro's bias be a random walk if the data support it
 
-    NothingToFit where there is nothing to fit to (`unusable`).
+    NothingToFit if there is nothing to fit to (`unusable_reason`).
     """
-    reason = unusable(track)
+    reason = unusable_reason(track)
     if reason:
         raise NothingToFit(reason)
     known = spec or Spec()
-    problem = FitProblem(track, prior_of(track))
+    problem = FitProblem(track, calibration_prior(track))
     if start is None:
-        start = noise_fit.estimated(
+        start = noise_fit.estimate_noise(
             run_filter(track, cold_start(track, known), sensitive=False), known, walk=walk
         )
-    fit = descended(problem, start, _STEPS)
-    prior = problem.prior.sharper(repetition_of(fit.filtered))
+    fit = descend(problem, start, _MOST_STEPS)
+    prior = problem.prior.sharper(score_variance_ratio(fit.filtered))
     if prior is not problem.prior:
         problem = replace(problem, prior=prior)
-        fit = descended(problem, start, _STEPS)
+        fit = descend(problem, start, _MOST_STEPS)
     if not noise:
         return fit
     if abs(np.log(fit.filtered.normalised_innovation)) > _REESTIMATE:
-        again = noise_fit.estimated(fit.filtered, known, walk=walk)
-        fit = descended(problem, again, _STEPS)
-    again = noise_fit.rescaled(fit.filtered, known)
-    if noise_fit.alike(again, fit.model):
+        estimated = noise_fit.estimate_noise(fit.filtered, known, walk=walk)
+        fit = descend(problem, estimated, _MOST_STEPS)
+    estimated = noise_fit.rescale_noise(fit.filtered, known)
+    if noise_fit.same_noise(estimated, fit.model):
         return fit
-    return descended(problem, again, _STEPS)
+    return descend(problem, estimated, _MOST_STEPS)
 
 
-def unusable(track: Track) -> str | None:
-    """Why there is nothing that a calibration could be fitted to; None where there is."""
+def unusable_reason(track: Track) -> str | None:
+    """Why no calibration can be fitted; None if one can."""
     if track.usual_gauss == 0.0:
         return "the magnetometer has no readings: nothing can be said about the field"
     steps = np.isfinite(track.dt_s) & np.isfinite(track.mag_b_gauss).all(axis=1)
@@ -116,80 +117,85 @@ def unusable(track: Track) -> str | None:
 
 
 def cold_start(track: Track, spec: Spec) -> NullModel:
-    """A model to begin from, without knowing anything but the track."""
-    size = decimation(track)
-    coarse = decimated(track, size)
+    """A starting model from the track alone."""
+    size = decimation_factor(track)
+    coarse = decimate(track, size)
     first = noise_fit.first_guess(track, spec)
-    # a row's rate is the mean of its samples': their noise averages
-    quiet = first.sigma_gyro_rad_s / np.sqrt(size)
-    problem = FitProblem(coarse, prior_of(track))
+    # a row's rate is the mean of its samples' rates: their noise averages
+    gyro_noise = first.sigma_gyro_rad_s / np.sqrt(size)
+    problem = FitProblem(coarse, calibration_prior(track))
     best: NullFit | None = None
     base = replace(first, gyro_bias_rad_s=problem.prior.mean[8:])
-    by_size = _by_size(coarse, replace(base, sigma_gyro_rad_s=quiet))
-    if by_size is not None:
-        best = descended(problem, by_size, _STEPS)
-        if best.filtered.normalised_innovation < _GOOD:
-            return _of_noise(best.model, first)
-    starts = _starts(coarse, base)
-    for ladder, model in itertools.product(_LADDERS, starts):
-        fit = _loosely(problem, model, quiet, *ladder)
-        agreed = best is not None and abs(fit.cost - best.cost) < _WORTH
-        if best is None or fit.cost < best.cost - _WORTH:
+    from_ellipsoid = _start_from_ellipsoid(coarse, replace(base, sigma_gyro_rad_s=gyro_noise))
+    if from_ellipsoid is not None:
+        best = descend(problem, from_ellipsoid, _MOST_STEPS)
+        if best.filtered.normalised_innovation < _GOOD_INNOVATION:
+            return _with_noise_of(best.model, first)
+    starts = _calibration_starts(coarse, base)
+    for ladder, model in itertools.product(_INFLATIONS, starts):
+        fit = _descend_with_inflation(problem, model, gyro_noise, *ladder)
+        agreed = best is not None and abs(fit.cost - best.cost) < _CLEARLY_LOWER
+        if best is None or fit.cost < best.cost - _CLEARLY_LOWER:
             best = fit
-        if agreed or fit.filtered.normalised_innovation < _GOOD:
+        if agreed or fit.filtered.normalised_innovation < _GOOD_INNOVATION:
             break
-    return _of_noise(first if best is None else best.model, first)
+    return _with_noise_of(first if best is None else best.model, first)
 
 
-def _of_noise(model: NullModel, like: NullModel) -> NullModel:
+def _with_noise_of(model: NullModel, like: NullModel) -> NullModel:
     """A model with the noise of another one."""
     mag, gyro = like.sigma_mag_gauss, like.sigma_gyro_rad_s
     return replace(model, sigma_mag_gauss=mag, sigma_gyro_rad_s=gyro)
 
 
-def _by_size(track: Track, base: NullModel) -> NullModel | None:
-    """Where the field's size says more than its turns do, the iron that keeps it constant."""
+def _start_from_ellipsoid(track: Track, base: NullModel) -> NullModel | None:
+    """If the field's size is more informative than its turns: the iron that keeps it constant."""
     mag = track.mag_b_gauss[np.isfinite(track.mag_b_gauss).all(axis=1)]
-    found = ellipsoid(mag) if turned_up(track, base) > 1.0 else None
-    if found is None or not _believable(*found):
+    found = fit_ellipsoid(mag) if gyro_noise_ratio(track, base) > 1.0 else None
+    if found is None or not _is_plausible(*found):
         return None
     return replace(base, soft_iron=found[0], hard_iron_gauss=found[1])
 
 
-def _loosely(
-    problem: FitProblem, model: NullModel, quiet: float, inflations: Sequence[float], steps: int
+def _descend_with_inflation(
+    problem: FitProblem,
+    model: NullModel,
+    gyro_noise: float,
+    inflations: Sequence[float],
+    steps: int,
 ) -> NullFit:
-    """Descend with less and less inflation of the gyro's noise."""
+    """Descend with decreasing inflation of the gyro's noise."""
     for inflation in inflations:
-        loose = replace(model, sigma_gyro_rad_s=quiet * inflation)
-        model = descended(problem, loose, steps).model
-    return descended(problem, replace(model, sigma_gyro_rad_s=quiet), _STEPS)
+        inflated = replace(model, sigma_gyro_rad_s=gyro_noise * inflation)
+        model = descend(problem, inflated, steps).model
+    return descend(problem, replace(model, sigma_gyro_rad_s=gyro_noise), _MOST_STEPS)
 
 
-def _starts(track: Track, base: NullModel) -> list[NullModel]:
-    """Calibrations to descend from, the most likely first."""
+def _calibration_starts(track: Track, base: NullModel) -> list[NullModel]:
+    """Calibrations from which to descend, the most probable first."""
     seen = np.isfinite(track.mag_b_gauss).all(axis=1)
     mag = track.mag_b_gauss[seen]
     out = []
-    out.append(replace(base, hard_iron_gauss=sphere_centre(mag)))
+    out.append(replace(base, hard_iron_gauss=fit_sphere_centre(mag)))
     out.append(base)
-    well = turned(mag) > priors.IRON_TURNED and seen.all()
-    linear = linear_start(_epochs(track)) if well else None
+    well = field_scatter(mag) > priors.IRON_TURNED and seen.all()
+    linear = linear_start(_estimator_epochs(track)) if well else None
     if linear is not None:
         A = chain.symmetric(linear[:6])
         A = A * 3 / np.trace(A)
-        if _believable(A, linear[6:]):
+        if _is_plausible(A, linear[6:]):
             out.append(replace(base, soft_iron=A, hard_iron_gauss=linear[6:]))
     return out
 
 
-def _believable(soft_iron: Array, hard_iron_gauss: Array) -> bool:
+def _is_plausible(soft_iron: Array, hard_iron_gauss: Array) -> bool:
+    """Whether an iron is near enough to none for a start."""
     near = np.linalg.norm(hard_iron_gauss) < _FARTHEST_GAUSS
     return bool(near and np.linalg.norm(soft_iron - np.eye(3)) < 1.0)
 
 
-def _epochs(track: Track) -> list[chain.EpochData]:
-    """Runs as the estimator's linear start takes them."""
+def _estimator_epochs(track: Track) -> list[chain.EpochData]:
+    """The runs as the estimator's linear start takes them."""
     dt = np.nan_to_num(track.dt_s, nan=0.0)
     return [
         chain.EpochData(
@@ -205,8 +211,8 @@ def _epochs(track: Track) -> list[chain.EpochData]:
     ]
 
 
-def baseline(start: NullFit) -> Baseline:
-    """What the null model leaves, for an answer."""
+def baseline_of(start: NullFit) -> Baseline:
+    """What the null model leaves unexplained, for a diagnosis."""
     done = start.filtered
     return Baseline(
         float(np.sqrt(np.mean(done.innovation[done.used] ** 2))),
@@ -216,55 +222,60 @@ def baseline(start: NullFit) -> Baseline:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prior:
-    """What is believed before the data: mean and deviation (11,), in the order of the fit.
+class CalibrationPrior:
+    """Gaussian prior: mean and standard deviation (11,), in the order of the fit's parameters.
 
-    repetition: of how many data one says something new: the deviations are for that many
+    repetition: number of data per independent one, for which the deviations are scaled
     """
 
     mean: Array
     deviation: Array
     repetition: float = 1.0
 
-    def sharper(self, repetition: float) -> Prior:
-        """For data of which only one in `repetition` says anything new; itself where all do."""
+    def sharper(self, repetition: float) -> CalibrationPrior:
+        """The prior for data of which one in `repetition` is independent; itself if all are."""
         if repetition < priors.REPEATED:
             return self
         sharp = self.deviation / np.sqrt(repetition / self.repetition)
-        return Prior(self.mean, sharp, repetition)
+        return CalibrationPrior(self.mean, sharp, repetition)
 
 
-def prior_of(track: Track) -> Prior:
-    """The usual one; where the sensor rests for long, its gyro reads its bias.
+def calibration_prior(track: Track) -> CalibrationPrior:
+    """The usual prior; if the sensor rests for long, the gyro's reading there is its bias.
 
-    Iron shows itself by turning only.  Without turning, slow noise of the magnetometer would be
-    laid at its door, so the less the field turned, the closer the iron is held.
+    Iron is visible only by turning.  Without turning, slow noise of the magnetometer would be
+    attributed to it, so the prior of the iron is the narrower, the less the field turned.
     """
     mean, deviation = np.zeros(11), priors.CALIBRATION_DEVIATION.copy()
-    deviation[:8] *= np.clip(turned(track.mag_b_gauss) / priors.IRON_TURNED, 0.02, 1.0)
-    rest = rate_at_rest(track)
-    if rest is not None:
-        mean[8:] = rest.rate_rad_s
+    deviation[:8] *= np.clip(field_scatter(track.mag_b_gauss) / priors.IRON_TURNED, 0.02, 1.0)
+    at_rest = rate_at_rest(track)
+    if at_rest is not None:
+        mean[8:] = at_rest.rate_rad_s
         deviation[8:] = np.minimum(
-            np.hypot(priors.STILL_BIAS_RAD_S, rest.unseen_rad_s), priors.CALIBRATION_DEVIATION[8:]
+            np.hypot(priors.STILL_BIAS_RAD_S, at_rest.unseen_rad_s),
+            priors.CALIBRATION_DEVIATION[8:],
         )
-    return Prior(mean, deviation)
+    return CalibrationPrior(mean, deviation)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rest:
-    """Still seconds: the gyro's mean reading (3,), and the rate that the field may hide there."""
+class GyroAtRest:
+    """The gyro in the still seconds.
+
+    rate_rad_s: (3,) its mean reading;  unseen_rad_s: rate that the field does not exclude there
+    """
 
     rate_rad_s: Array
     unseen_rad_s: float
 
 
-def rate_at_rest(track: Track) -> Rest | None:
-    """What the gyro reads in the still seconds, None where fewer than a fifth are still.
+def rate_at_rest(track: Track) -> GyroAtRest | None:
+    """The gyro's reading in the still seconds, None if less than a fifth of the seconds are still.
 
-    Still: neither the readings' scatter within the second nor the magnetometer's mean against the
-    second before is more than their noise.  What turns slower than that is unseen in one second;
-    in all of them together it is what their steps have beyond the noise, and twice its deviation.
+    Still means: neither the scatter of the readings within a second nor the change of the
+    magnetometer's mean since the second before exceeds the noise.  A slower turn is not visible in
+    one second.  In all of them together, it is bounded by the excess of their changes over the
+    noise plus two deviations.
     """
     mag_noise, gyro_noise = noise_of_differences(track)
     rows = max(8, round(1.0 / max(track.step_s, 1e-6)))
@@ -273,25 +284,27 @@ def rate_at_rest(track: Track) -> Rest | None:
         return None
     mag = track.mag_b_gauss[:whole].reshape(-1, rows, 3)
     gyro = track.gyro_b_rad_s[:whole].reshape(-1, rows, 3)
-    moved = np.linalg.norm(np.diff(mag.mean(axis=1), axis=0, prepend=np.nan), axis=1)
+    change_gauss = np.linalg.norm(np.diff(mag.mean(axis=1), axis=0, prepend=np.nan), axis=1)
     still = (
         (np.max(gyro.std(axis=1), axis=1) < 2 * gyro_noise)
         & (np.max(mag.std(axis=1), axis=1) < 2 * mag_noise)
-        & (moved < 6 * mag_noise / np.sqrt(rows) + 1e-4)
+        & (change_gauss < 6 * mag_noise / np.sqrt(rows) + 1e-4)
     )
     if np.count_nonzero(still) < 0.2 * len(still):
         return None
-    steps = np.square(moved[still & np.isfinite(moved)])
+    steps = np.square(change_gauss[still & np.isfinite(change_gauss)])
     by_noise = 6.0 * mag_noise**2 / rows
     beyond = max(float(np.mean(steps)) - by_noise, 0.0)
-    unseen = beyond + 2.0 * by_noise * np.sqrt(2.0 / (3.0 * len(steps)))
+    unseen_square = beyond + 2.0 * by_noise * np.sqrt(2.0 / (3.0 * len(steps)))
     rate = np.median(gyro[still].mean(axis=1), axis=0)
     size_gauss = max(track.usual_gauss, 1e-12)
-    return Rest(np.asarray(rate), float(np.sqrt(unseen)) / (size_gauss * rows * track.step_s))
+    return GyroAtRest(
+        np.asarray(rate), float(np.sqrt(unseen_square)) / (size_gauss * rows * track.step_s)
+    )
 
 
-def turned(mag: Array) -> float:
-    """Scatter of the field (N, 3) over its size; 0 where there is no field."""
+def field_scatter(mag: Array) -> float:
+    """Scatter of the field (N, 3) relative to its size; 0 if there is no field."""
     seen = mag[np.isfinite(mag).all(axis=1)]
     if not len(seen):
         return 0.0
@@ -299,8 +312,8 @@ def turned(mag: Array) -> float:
     return float(np.linalg.norm(np.std(seen, axis=0))) / max(size, 1e-12)
 
 
-def sphere_centre(mag: Array) -> Array:
-    """Centre of the sphere |m - b| = r, |m|^2 = 2 m.b + c, drawn to 0 where the motion is poor."""
+def fit_sphere_centre(mag: Array) -> Array:
+    """Centre of the sphere |m - b| = r, by |m|^2 = 2 m.b + c, shrunk to 0 if the motion is poor."""
     if not len(mag):
         return np.zeros(3)
     square = np.sum(mag**2, axis=1)
@@ -310,11 +323,11 @@ def sphere_centre(mag: Array) -> Array:
     return np.asarray(np.linalg.solve(gram, weight * off.T @ (square - square.mean())))
 
 
-def ellipsoid(mag: Array) -> tuple[Array, Array] | None:
+def fit_ellipsoid(mag: Array) -> tuple[Array, Array] | None:
     """Soft iron of trace 3 and hard iron (gauss) of the ellipsoid through the readings (N, 3).
 
-    |m|^2 + q.(m^T T m) = 2 m.u + c with the traceless directions T of a quadric I + q.T, least
-    squares: exact where the magnetometer has no noise, drawn to nothing.  None where it is open.
+    |m|^2 + q.(m^T T m) = 2 m.u + c with the traceless directions T of a quadric I + q.T, by least
+    squares without a prior: exact if the magnetometer has no noise.  None if the quadric is open.
     """
     middle = mag.mean(axis=0)
     m = mag - middle
@@ -329,11 +342,11 @@ def ellipsoid(mag: Array) -> tuple[Array, Array] | None:
     return A * 3.0 / np.trace(A), middle + np.linalg.solve(quadric, found[5:8])
 
 
-def repetition_of(done: Filtered) -> float:
-    """How many times larger the variance of the scores is than if the innovations were white.
+def score_variance_ratio(done: Filtered) -> float:
+    """Ratio of the variance of the scores to that for white innovations.
 
-    A misfit that lasts makes the data look surer than they are: of the sum of a block's scores
-    white innovations have the block's information as variance.  1 on a null.
+    A misfit that lasts makes the data look more certain than they are.  For white innovations, the
+    sum of the scores in a block has the information of the block as its variance.  1 for a null.
     """
     X = sensitivities(done, nuisance_columns(done))
     score = np.einsum("nia,ni->na", X, done.whitened)
@@ -349,10 +362,10 @@ def repetition_of(done: Filtered) -> float:
 class NullFit:
     """A fitted calibration.
 
-    covariance: (11, 11) of [soft iron (TRACELESS), hard iron, gyro bias], for noise as estimated
-    terms_mag, terms_gyro: (N, 3) what was taken out of the readings before it; None for nothing
-    cost:       half the sum of squares, priors included, at the end
-    made:       what was built from the fit, once
+    covariance: (11, 11) of [soft iron (TRACELESS), hard iron, gyro bias], for the estimated noise
+    terms_mag, terms_gyro: (N, 3) terms subtracted from the readings before the fit; None for none
+    cost:       half the sum of squares at the end, including the prior
+    made:       cache of what was built from the fit
     """
 
     model: NullModel
@@ -374,10 +387,10 @@ class NullFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitProblem:
-    """What a descent is of: a track, and the prior of the calibration."""
+    """What a descent fits: a track, and the prior of the calibration."""
 
     track: Track
-    prior: Prior
+    prior: CalibrationPrior
 
     @property
     def weight(self) -> Array:
@@ -385,8 +398,8 @@ class FitProblem:
         return np.asarray(1.0 / self.prior.deviation**2)
 
 
-def descended(problem: FitProblem, model: NullModel, steps: int) -> NullFit:
-    """The fit after at most so many steps from a model, fewer where nothing is lower.
+def descend(problem: FitProblem, model: NullModel, steps: int) -> NullFit:
+    """The fit after at most `steps` steps from a model, fewer if no step lowers the cost.
 
     The noise stays that of the model.
     """
@@ -397,32 +410,35 @@ def descended(problem: FitProblem, model: NullModel, steps: int) -> NullFit:
     covariance: Array = np.zeros((11, 11))
     while count < steps and not converged:
         count += 1
-        gradient, data, prior = _normal(problem, point)
+        gradient, data, prior = _normal_equations(problem, point)
         covariance = np.asarray(np.linalg.inv(data + np.diag(prior)), dtype=np.float64)
-        if not np.all(np.diag(covariance) > 0.0):  # singular to rounding: no step is to be trusted
+        if not np.all(np.diag(covariance) > 0.0):  # singular to rounding: no step can be trusted
             break
         step = covariance @ gradient
         largest = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
-        new = _taken(problem, point, step, cost, largest < _NEAR)
+        new = _take_step(problem, point, step, cost, largest < _GAINS_HELD)
         if new is None:
-            converged = True  # nothing lower: the noise of the linearisation is reached
+            converged = True  # no lower cost: the accuracy of the linearisation is reached
             break
-        gained = cost - _cost(problem, new)
-        point, cost = new, cost - gained
+        decrease = cost - _cost(problem, new)
+        point, cost = new, cost - decrease
         repetition = problem.prior.repetition
-        converged = bool(largest < _DONE * np.sqrt(repetition) or gained < _DONE**2 * repetition)
+        converged = bool(
+            largest < _CONVERGED * np.sqrt(repetition) or decrease < _CONVERGED**2 * repetition
+        )
     return NullFit(point.model, point, converged, covariance, cost=cost)
 
 
-def _normal(problem: FitProblem, point: Filtered) -> tuple[Array, Array, Array]:
-    """Gradient (11,) downhill, information of the data (11, 11), of the prior (11,)."""
+def _normal_equations(problem: FitProblem, point: Filtered) -> tuple[Array, Array, Array]:
+    """Negative gradient (11,), information of the data (11, 11) and of the prior (11,)."""
     flat = sensitivities(point, nuisance_columns(point)).reshape(-1, 11)
     prior = problem.weight
-    gradient = flat.T @ point.whitened.ravel() - prior * _from_prior(problem, point.model)
+    gradient = flat.T @ point.whitened.ravel() - prior * _offset_from_prior(problem, point.model)
     return gradient, flat.T @ flat, prior
 
 
-def _from_prior(problem: FitProblem, model: NullModel) -> Array:
+def _offset_from_prior(problem: FitProblem, model: NullModel) -> Array:
+    """(11,) parameters of a model less the mean of the prior."""
     off = np.asarray(model.soft_iron) - np.eye(3)
     soft = [off[0, 0], off[1, 1], off[0, 1], off[0, 2], off[1, 2]]
     here = np.concatenate([soft, model.hard_iron_gauss, model.gyro_bias_rad_s])
@@ -430,20 +446,21 @@ def _from_prior(problem: FitProblem, model: NullModel) -> Array:
 
 
 def _cost(problem: FitProblem, point: Filtered) -> float:
-    prior = float(np.sum(problem.weight * _from_prior(problem, point.model) ** 2))
+    """Half the sum of squares of the whitened innovations and of the prior."""
+    prior = float(np.sum(problem.weight * _offset_from_prior(problem, point.model) ** 2))
     return 0.5 * (float(np.sum(point.whitened**2)) + prior)
 
 
-def _taken(
+def _take_step(
     problem: FitProblem, point: Filtered, step: Array, cost: float, near: bool
 ) -> Filtered | None:
-    """The longest of step, step / 4 and step / 16 that lowers the cost; None where none does.
+    """The longest of step, step / 4 and step / 16 that lowers the cost; None if none does.
 
-    near: the step is so short that the gains stay as they are
+    near: the step is so short that the gains are held
     """
     for halving in range(_HALVINGS):
         part = step / 4**halving
-        model = _moved(point.model, part)
+        model = _add_step(point.model, part)
         if not np.isfinite(part).all():
             continue
         if np.linalg.eigvalsh(model.soft_iron)[0] < _SMALLEST_EIGENVALUE:
@@ -457,8 +474,8 @@ def _taken(
     return None
 
 
-def _moved(model: NullModel, step: Array) -> NullModel:
-    """A model with the 11 numbers of its calibration changed by step (11,)."""
+def _add_step(model: NullModel, step: Array) -> NullModel:
+    """A model with a step (11,) added to its calibration."""
     return replace(
         model,
         soft_iron=model.soft_iron + np.einsum("a,aij->ij", step[:5], TRACELESS),

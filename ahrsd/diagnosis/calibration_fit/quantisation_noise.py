@@ -1,9 +1,10 @@
-"""How large the noise is of readings that come in coarse steps.
+"""The noise level of readings that come in coarse steps.
 
-Of coarse steps the loudness is mostly the steps' own, a twelfth of their square.  How often a
-reading differs from the one before is the noise's, where the motion is slow.  So simulations with
-noise of several sizes, rounded to the steps, are held against the recording in both (the method of
-simulated moments): each counts by how much it scatters from simulation to simulation.
+With coarse steps the variance of the readings' noise is mostly that of rounding, a twelfth of the
+step squared.  The noise itself determines how often a reading differs from the one before, if the
+motion is slow.  So simulations with noise of several sizes, rounded to the steps, are compared with
+the recording in both statistics (the method of simulated moments).  Each is weighted by its scatter
+between simulations.
 """
 
 from __future__ import annotations
@@ -21,32 +22,33 @@ from ahrsd.diagnosis.model import Noise
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
-#: sizes that are tried, in parts of the first guess; simulations that tell the scatter
-_TRIED = np.geomspace(0.25, 4.0, 9)
+#: sizes that are tried, relative to the first guess; simulations that show the scatter
+_SIZES_TRIED = np.geomspace(0.25, 4.0, 9)
 _COPIES = 8
-_FINE = 400  # sizes between those
-_LEAST = 1e-8  # of a moment's variance: readings that never differ do not scatter
-_QUIETEST = 0.1  # of the noise that is seen: the first guess is that at least
+_FINE_SIZES = 400  # interpolated between those
+_LEAST_VARIANCE = 1e-8  # variance of a moment: readings that never differ have no scatter
+_LEAST_SHARE = 0.1  # of the noise including rounding: the first guess at least
 
 
-def before_rounding(
+def noise_before_rounding(
     fit: NullFit,
     seen: Noise,
     step_gauss: float,
     simulate: Callable[[Noise, int], tuple[Array, Array]],
 ) -> Noise:
-    """The noise of readings before they were rounded to such steps.
+    """The noise of readings before they were rounded to steps of that size.
 
-    seen: with what rounding adds, which has bounds, and a colour that follows the motion: it is
-    simulated, not drawn.
-    simulate: readings (N, 3) and whitened innovations (N, 3) with a noise law and a seed; with the
-              fit's own calibration where that is 0, else with one that it may as well have found
+    seen: noise including what rounding adds.  Rounding errors are bounded, and their spectrum
+          follows
+    the motion: they are simulated, not drawn.
+    simulate: readings (N, 3) and whitened innovations (N, 3) for a noise law and a seed; with the
+              fit's own calibration if the seed is 0, otherwise with one drawn from its uncertainty
     """
     done = fit.filtered
     usual = np.ones(len(done.track)) if seen.level is None else seen.level
-    loud = float(np.sqrt(np.mean(usual**2)))
-    left = 1.0 - step_gauss**2 / 12 / (seen.mag_gauss * loud) ** 2
-    guess = float(np.sqrt(max(left, _QUIETEST**2)))
+    rms_level = float(np.sqrt(np.mean(usual**2)))
+    remaining_share = 1.0 - step_gauss**2 / 12 / (seen.mag_gauss * rms_level) ** 2
+    guess = float(np.sqrt(max(remaining_share, _LEAST_SHARE**2)))
 
     def law(size: float) -> Noise:
         return replace(seen, level=size * usual)
@@ -55,19 +57,25 @@ def before_rounding(
         mag, whitened = simulate(law(size), seed)
         return _moments(mag, whitened[done.used], step_gauss)
 
-    sizes = guess * _TRIED
+    sizes = guess * _SIZES_TRIED
     found = np.array([moments(size, 0) for size in sizes])
     wanted = _moments(done.track.mag_b_gauss, done.whitened[done.used], step_gauss)
-    fine = np.geomspace(sizes[0], sizes[-1], _FINE)
-    first = fine[int(np.argmin(_distance(_between(fine, sizes, found) - wanted, np.eye(2))))]
+    fine = np.geomspace(sizes[0], sizes[-1], _FINE_SIZES)
+    first = fine[
+        int(
+            np.argmin(
+                _squared_distances(_interpolate_moments(fine, sizes, found) - wanted, np.eye(2))
+            )
+        )
+    ]
     copies = np.array([moments(first, 1 + k) for k in range(_COPIES)])
-    scatter = np.cov(copies.T) + _LEAST * np.eye(2)
-    off = _between(fine, sizes, found) - wanted
-    return law(float(fine[int(np.argmin(_distance(off, scatter)))]))
+    scatter = np.cov(copies.T) + _LEAST_VARIANCE * np.eye(2)
+    off = _interpolate_moments(fine, sizes, found) - wanted
+    return law(float(fine[int(np.argmin(_squared_distances(off, scatter)))]))
 
 
 def calibration_covariance(fit: NullFit) -> Array:
-    """(11, 11) of the fit's own calibration, in noise of the colour that it leaves."""
+    """(11, 11) of the fit's own calibration, for noise with the spectrum of its residual."""
     seen = sensitivities(fit.filtered, nuisance_columns(fit.filtered))
     flat = seen.reshape(-1, seen.shape[2])
     power = spectral_peak(fit.filtered.whitened, 1.0 / fit.filtered.track.step_s)
@@ -76,10 +84,10 @@ def calibration_covariance(fit: NullFit) -> Array:
 
 
 def readings_of_drawn_calibration(truth: Readings, covariance: Array, seed: int) -> Readings:
-    """Readings of a calibration that the fit may as well have found.
+    """Readings for a calibration drawn from the uncertainty of the fit.
 
-    What a filter sees of it is linear and taken out again; where on their steps the readings lie
-    is not.
+    The filter sees a linear effect of it, which is removed again; but the positions of the readings
+    relative to their quantisation steps differ.
     """
     dice = np.random.default_rng([seed, 3])
     zero = np.zeros(len(covariance))
@@ -90,17 +98,17 @@ def readings_of_drawn_calibration(truth: Readings, covariance: Array, seed: int)
 
 
 def _moments(mag_b_gauss: Array, whitened: Array, step_gauss: float) -> Array:
-    """(2,) logarithms of the loudness and of how often a reading differs from the one before."""
+    """(2,) logarithms of the mean square and of how often a reading differs from the one before."""
     differ = np.abs(np.diff(mag_b_gauss, axis=0)) > step_gauss / 2
     return np.log([float(np.mean(whitened**2)), float(np.mean(differ)) + 1e-6])
 
 
-def _between(fine: Array, sizes: Array, found: Array) -> Array:
-    """(F, 2) moments (S, 2) at sizes in between, straight in the logarithm."""
+def _interpolate_moments(fine: Array, sizes: Array, found: Array) -> Array:
+    """(F, 2) moments at sizes between those of (S, 2), linear in the logarithm of the size."""
     at = np.log(fine), np.log(sizes)
     return np.column_stack([np.interp(*at, column) for column in found.T])
 
 
-def _distance(off: Array, scatter: Array) -> Array:
-    """(F,) Mahalanobis squares of differences (F, 2)."""
+def _squared_distances(off: Array, scatter: Array) -> Array:
+    """(F,) squared Mahalanobis distances of differences (F, 2)."""
     return np.asarray(np.sum(off * np.linalg.solve(scatter, off.T).T, axis=1))

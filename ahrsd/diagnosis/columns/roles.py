@@ -1,8 +1,9 @@
-"""What the further columns of a recording are: roles by name and unit, and which can be used.
+"""What the further columns of a recording are: roles by name and unit, and which are usable.
 
-A column that cannot be used is refused with a sentence, never silently: `prepared` returns them.
+A column that cannot be used is refused with a sentence, never silently: `prepare_columns` returns
+these sentences.
 
-Whatever a file calls its columns, a person is shown one short line (`shown`).
+Whatever a file calls its columns, a person sees one short line (`label`).
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
 _ATTITUDE = re.compile(r"^(ref_q[wxyz]|vn_|ref_|est_)")
-# an attitude measured by others: the motion, and the cause of nothing that is read
+# attitude from another system: it describes the motion and causes no reading
 _REFERENCE = re.compile(r"^ref_q[wxyz]$")
-# what the sensor itself makes of the same readings: it moves with every error and causes none
+# computed by the sensor from the same readings: it follows every error and causes none
 _OWN_OUTPUT = re.compile(
     r"^(vn_|est_|dcm|q(uat)?(ernion)?_?[wxyz0-3]|uncomp|delta_|lin_?acc|(mag|gyro|accel)_(?!temp)"
     r"|(yaw|pitch|roll)(_?(angle|rate|std|sigma|uncertainty))?(_(deg|rad)(_s)?)?$)"
 )
-#: characters of a name that are shown
-SHOWN_CHARACTERS = 48
+#: largest number of characters of a displayed name
+LABEL_CHARACTERS = 48
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +38,10 @@ class Role:
     """A kind of covariate.
 
     pattern:   of the column's name
-    zero:      where its effect counts as zero: at 0, or at the recording's mean
-    limits:    of believable values in its unit;  beyond: what the column looks like outside
-    constant:  it is of use even if it never changes
+    zero:      value at which its effect counts as zero: 0, or the mean of the recording
+    limits:    of plausible values in its unit;  beyond: what the column is likely to be outside
+               them
+    constant:  whether it is useful even if it never changes
     """
 
     words: str
@@ -61,7 +63,7 @@ ROLES: Mapping[str, Role] = {
         "mean",
         (-1e6, 1e6),
         "another unit",
-        constant=True,  # a straight leg along one axis
+        constant=True,  # along one axis, on a straight leg
     ),
     "altitude": Role(
         "altitude, height or depth, m",
@@ -100,12 +102,12 @@ ROLES: Mapping[str, Role] = {
     "throttle": Role("throttle or duty", r"throttle|pwm|duty", "zero", (-1e4, 1e4), "another unit"),
     "voltage": Role("voltage, V", r"voltage|_v$", "mean", (-1e3, 1e3), "millivolt"),
 }
-#: What effects may need that is no covariate's role.
+#: What effects may need in addition to covariates.
 SENSORS = ("accel",)
 
 
 def role_of(name: str, values: Array) -> str | None:
-    """The role of a column, None where it has none that an effect knows."""
+    """The role of a column, None if no effect uses such a column."""
     lower = name.lower()
     if _ATTITUDE.match(lower):
         return None
@@ -114,7 +116,7 @@ def role_of(name: str, values: Array) -> str | None:
         return named
     known = values[np.isfinite(values)]
     if len(known) and np.isin(known, (0.0, 1.0)).all() and known.any():
-        return "switch" if _longest_on(known) > priors.SWITCH_ROWS else "ping"
+        return "switch" if _longest_nonzero_interval(known) > priors.SWITCH_ROWS else "ping"
     return None
 
 
@@ -123,86 +125,90 @@ def _role_by_name(lower: str) -> str | None:
     return next((role for role, row in ROLES.items() if re.search(row.pattern, lower)), None)
 
 
-def named(covariates: Mapping[str, Array], role: str) -> tuple[str, ...]:
-    """The columns of that role that can be used, in the order of the recording."""
+def usable_columns(covariates: Mapping[str, Array], role: str) -> tuple[str, ...]:
+    """The usable columns of a role, in the order of the recording."""
     return tuple(
         name
         for name, values in covariates.items()
-        if role_of(name, values) == role and not fault(name, values)
+        if role_of(name, values) == role and not refusal_reason(name, values)
     )
 
 
-def reference(role: str, values: Array) -> float:
-    """Where the effect of that column counts as zero: calibration and term refer to it."""
+def zero_reference(role: str, values: Array) -> float:
+    """Value at which the effect of that column counts as zero, for calibration and term alike."""
     return float(np.mean(values)) if ROLES[role].zero == "mean" else 0.0
 
 
-def fault(name: str, values: Array) -> str:
-    """Why a filled column cannot be used, in one sentence; empty where it can."""
+def refusal_reason(name: str, values: Array) -> str:
+    """Why a column without gaps cannot be used, in one sentence; empty if it can."""
     role = role_of(name, values)
     if role is None:
         return ""
     row = ROLES[role]
     missing = np.count_nonzero(~np.isfinite(values))
     if missing:
-        return f"column {shown(name)} was left out: {missing} of {len(values)} values are missing"
+        return f"column {label(name)} was left out: {missing} of {len(values)} values are missing"
     low, high = float(np.min(values)), float(np.max(values))
     if low < row.limits[0] or high > row.limits[1]:
         return (
-            f"column {shown(name)} was left out: {low:g} to {high:g} is no {row.words}; it looks "
+            f"column {label(name)} was left out: {low:g} to {high:g} is no {row.words}; it looks "
             f"like {row.beyond}"
         )
     if role == "angle" and name.endswith("_rad") and high - low > 50.0:
-        return f"column {shown(name)} was left out: {low:g} to {high:g} rad looks like degrees"
+        return f"column {label(name)} was left out: {low:g} to {high:g} rad looks like degrees"
     if not row.constant and high - low <= 1e-9 * max(abs(low), abs(high), 1e-9):
-        return f"column {shown(name)} was left out: it is {low:g} throughout, so nothing follows it"
+        return f"column {label(name)} was left out: it is {low:g} throughout, so nothing follows it"
     return ""
 
 
-def prepared(track: Track) -> tuple[Track, tuple[str, ...]]:
-    """The track with usable covariates only, short holes filled, and a sentence per refusal.
+def prepare_columns(track: Track) -> tuple[Track, tuple[str, ...]]:
+    """The track with usable covariates only, short gaps filled, and a sentence for each refusal.
 
-    Columns without a role are kept where they are complete: they serve to look for courses; not
-    so the sensor's own outputs, which are made of the readings that are being explained, and a
-    reference attitude: that it is there must not change what is said of the sensor.
+    Complete columns without a role are kept: they are compared with time series of the residual.
+    Not kept are the sensor's own outputs, which are computed from the readings that are to be
+    explained, and a reference attitude, whose presence must not change what is reported about the
+    sensor.
     """
     kept: dict[str, Array] = {}
     notes: list[str] = []
     for name, values in track.covariates.items():
         if _OWN_OUTPUT.match(name.lower()) or _REFERENCE.match(name.lower()):
             continue
-        filled, note = _filled(name, values, track.time_s)
-        note = note or fault(name, filled)
+        filled, note = _fill_gaps(name, values, track.time_s)
+        note = note or refusal_reason(name, filled)
         if note:
             notes.append(note)
         elif np.isfinite(filled).all():
             kept[name] = filled
         else:
             notes.append(
-                f"column {shown(name)} was left out: its values are no numbers to compute with"
+                f"column {label(name)} was left out: its values are no numbers to compute with"
             )
     return replace(track, covariates=kept), tuple(notes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Holed:
-    """A column with long holes: values (N,) drawn across them;  missing (N,) rows inside them."""
+class ColumnWithGaps:
+    """A column with long gaps.
+
+    values: (N,) interpolated across them;  missing: (N,) rows inside them;  words: a note on them
+    """
 
     values: Array
     missing: NDArray[np.bool]
     words: str
 
 
-def holed(track: Track) -> dict[str, Holed]:
-    """Columns that could be a cause but for holes that are too long to guess what is in them."""
+def find_columns_with_gaps(track: Track) -> dict[str, ColumnWithGaps]:
+    """Columns that could be a cause, apart from gaps too long to interpolate."""
     out = {}
     for name, values in track.covariates.items():
         good, time_s = np.isfinite(values), track.time_s
         share = 1.0 - np.count_nonzero(good) / max(len(values), 1)
-        if not _filled(name, values, time_s)[1] or share > priors.COLUMN_HOLES:
+        if not _fill_gaps(name, values, time_s)[1] or share > priors.COLUMN_HOLES:
             continue
         filled = np.interp(time_s, time_s[good], values[good])
-        if role_of(name, filled) is None or fault(name, filled):
+        if role_of(name, filled) is None or refusal_reason(name, filled):
             continue
         before = np.maximum.accumulate(np.where(good, time_s, -np.inf))
         after = np.minimum.accumulate(np.where(good, time_s, np.inf)[::-1])[::-1]
@@ -211,54 +217,59 @@ def holed(track: Track) -> dict[str, Holed]:
             continue
         first = int(np.argmax(missing))
         words = (
-            f"column {shown(name)} has no values in "
+            f"column {label(name)} has no values in "
             f"{np.count_nonzero(missing) * track.step_s:.1f} s, first at "
             f"{time_s[first]:.1f} s: readings without it were not used"
         )
-        out[name] = Holed(filled, missing, words)
+        out[name] = ColumnWithGaps(filled, missing, words)
     return out
 
 
-def _filled(name: str, values: Array, time_s: Array) -> tuple[Array, str]:
-    """The column with holes of at most two seconds interpolated, or a sentence."""
+def _fill_gaps(name: str, values: Array, time_s: Array) -> tuple[Array, str]:
+    """The column with short gaps filled, or the reason for its refusal.
+
+    Gaps of at most COLUMN_GAP_S are interpolated; a column of 0 and 1 keeps its last value.
+    """
     good = np.isfinite(values)
     if good.all():
         return values, ""
     share = 1.0 - np.count_nonzero(good) / max(len(values), 1)
     if share > priors.COLUMN_MISSING:
-        return values, f"column {shown(name)} was left out: {share:.0%} of its values are missing"
+        return values, f"column {label(name)} was left out: {share:.0%} of its values are missing"
     known_s = np.concatenate([time_s[:1], time_s[good], time_s[-1:]])
     widest = int(np.argmax(np.diff(known_s)))
     hole_s = float(known_s[widest + 1] - known_s[widest])
     usual_s = float(np.median(np.diff(time_s)))
-    if hole_s > priors.COLUMN_GAP_S + usual_s and not _same_hole(time_s, known_s[widest], hole_s):
+    if hole_s > priors.COLUMN_GAP_S + usual_s and not _samples_pause(
+        time_s, known_s[widest], hole_s
+    ):
         return values, (
-            f"column {shown(name)} was left out: no values from {known_s[widest]:.1f} to "
+            f"column {label(name)} was left out: no values from {known_s[widest]:.1f} to "
             f"{known_s[widest + 1]:.1f} s; holes of more than {priors.COLUMN_GAP_S:g} s are not "
             "guessed"
         )
-    nearest = _longest_on(values[good]) and np.isin(values[good], (0.0, 1.0)).all()
+    nearest = _longest_nonzero_interval(values[good]) and np.isin(values[good], (0.0, 1.0)).all()
     if nearest:  # a switch is on or off, never half
         before = np.maximum.accumulate(np.where(good, np.arange(len(values)), -1))
         return values[np.where(before < 0, int(np.argmax(good)), before)], ""
     return np.interp(time_s, time_s[good], values[good]), ""
 
 
-def _same_hole(time_s: Array, from_s: float, hole_s: float) -> bool:
-    """Whether the samples themselves pause there, so that nothing is missing."""
+def _samples_pause(time_s: Array, from_s: float, hole_s: float) -> bool:
+    """Whether there are no samples in the gap, so that no value is missing."""
     inside = (time_s > from_s) & (time_s < from_s + hole_s)
     return not bool(inside.any())
 
 
-def _longest_on(values: Array) -> int:
-    """The longest stretch of rows that are not 0."""
+def _longest_nonzero_interval(values: Array) -> int:
+    """Number of rows in the longest interval without 0."""
     edges = np.diff(np.concatenate([[0], (values != 0).astype(np.int64), [0]]))
     lengths = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
     return int(lengths.max()) if len(lengths) else 0
 
 
-def shown(name: str) -> str:
-    """The name with what is not printable as its escape, and its middle left out if it is long."""
-    if len(name) > SHOWN_CHARACTERS:
-        name = f"{name[: SHOWN_CHARACTERS - 13]}...{name[-10:]}"
+def label(name: str) -> str:
+    """The name with unprintable characters escaped; if it is long, without its middle."""
+    if len(name) > LABEL_CHARACTERS:
+        name = f"{name[: LABEL_CHARACTERS - 13]}...{name[-10:]}"
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in name)

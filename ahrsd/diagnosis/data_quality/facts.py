@@ -1,4 +1,4 @@
-"""A fact about a recording that needs no physics: found by counting, told before any fit."""
+"""A fact about a recording: found by counting, without physics and before any fit."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding, Unexplained, Value, Where
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.model import Term
+from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
 
@@ -20,15 +21,15 @@ from ahrsd.samples import Array
 class Fact:
     """One thing that is wrong with a recording.
 
-    effect:     identifier of the contract;  words: one line that says it with its numbers
-    confidence: of the name, 0..1
-    parameters: as the effect's table row
+    effect:     identifier of the contract;  words: one line that describes it, with its numbers
+    confidence: probability of the effect, 0..1
+    parameters: as in the effect's table row
     setting:    what else the effect needs (axes, signs, onset, ...), JSON-able
-    bad:        (N,) rows whose magnetometer reading is not one, None where all are
-    turned:     (N,) how many times as far as the gyro says the sensor turned in the step that ends
-                at the row, nan where nobody knows; None where the gyro is right
-    unseen:     (N,) how many steps are expected to be lost beyond those, in the mean put right too
-    stops:      nothing that is fitted before it is put right means anything
+    bad:        (N,) rows whose magnetometer reading is invalid; None if all are valid
+    turned:     (N,) ratio of the sensor's turn to the gyro's in the step that ends at the row, nan
+                where it is unknown; None if the gyro is right
+    unseen:     (N,) expected number of further lost steps, corrected on average as well
+    stops:      no fit means anything before it is corrected
     """
 
     effect: str
@@ -43,13 +44,13 @@ class Fact:
     stops: bool = False
 
 
-def matters(fact: Fact) -> bool:
-    """Whether the fact is a finding; else it is worth a note."""
+def is_finding(fact: Fact) -> bool:
+    """Whether the fact is a finding; otherwise it deserves a note only."""
     if fact.effect == "dropped_samples" and not fact.setting:
         return fact.parameters[0].value > priors.MISSING_FINDING_SHARE
     if fact.effect == "stuck_magnetometer":
         return fact.parameters[0].value >= priors.STUCK_FINDING_S
-    if fact.effect == "stuck_gyro":  # no name of the library
+    if fact.effect == "stuck_gyro":  # not an effect of the library
         return False
     if fact.effect == "timestamp_jitter" and not fact.stops:
         return fact.parameters[0].value > priors.JITTER_FINDING_SHARE * float(
@@ -58,23 +59,23 @@ def matters(fact: Fact) -> bool:
     return True
 
 
-def around(burst: Fact, moments: Sequence[tuple[float, float]]) -> bool:
-    """Whether every span of a burst of noise has one of these in it: then it is what that leaves.
+def burst_is_explained(burst: Fact, moments: Sequence[tuple[float, float]]) -> bool:
+    """Whether each interval of a noise burst contains one of these moments, which then explain it.
 
-    moments: seconds, of lost turns and of names that show for a moment only
+    moments: intervals in seconds of lost turns and of short effects
     """
     spans = burst.where.intervals_s if burst.effect == "noise_burst" else ()
-    beside = [any(a <= end and begin <= b for begin, end in moments) for a, b in spans]
-    return bool(beside) and all(beside)
+    explained = [any(a <= end and begin <= b for begin, end in moments) for a, b in spans]
+    return bool(explained) and all(explained)
 
 
-def lost_at(facts: Sequence[Fact]) -> list[tuple[float, float]]:
-    """Where turns were lost, seconds."""
+def lost_turn_intervals(facts: Sequence[Fact]) -> list[tuple[float, float]]:
+    """Intervals in which turns were lost, seconds."""
     return [span for fact in facts if fact.turned is not None for span in fact.where.intervals_s]
 
 
 def rounding(facts: Sequence[Fact]) -> tuple[Term, ...]:
-    """The coarse steps of the readings, where they were counted, as a term of the model."""
+    """The quantisation steps of the readings, if they were found, as a term of the model."""
     return tuple(
         Term(
             fact.effect,
@@ -86,8 +87,13 @@ def rounding(facts: Sequence[Fact]) -> tuple[Term, ...]:
     )
 
 
-def spans_of(rows: NDArray[np.bool], gap: int = 0) -> list[tuple[int, int]]:
-    """First row and row behind the last of each stretch of true rows; gaps up to `gap` closed."""
+def whole_recording(track: Track) -> tuple[tuple[float, float], ...]:
+    """The interval of the whole recording, seconds."""
+    return ((float(track.time_s[0]), float(track.time_s[-1])),)
+
+
+def row_intervals(rows: NDArray[np.bool], gap: int = 0) -> list[tuple[int, int]]:
+    """First row and last row + 1 of each interval of true rows; gaps up to `gap` are closed."""
     at = np.flatnonzero(rows)
     if not len(at):
         return []
@@ -97,8 +103,8 @@ def spans_of(rows: NDArray[np.bool], gap: int = 0) -> list[tuple[int, int]]:
     return list(zip(firsts.tolist(), lasts.tolist(), strict=True))
 
 
-def of_fact(fact: Fact, library: Mapping[str, Effect]) -> Finding:
-    """A fact that was counted, not fitted, as a finding; nothing is held out, nothing moves."""
+def as_finding(fact: Fact, library: Mapping[str, Effect]) -> Finding:
+    """A counted fact as a finding: without held-out gain and without effect on the calibration."""
     effect = library.get(fact.effect)
     return Finding(
         effect=fact.effect,
@@ -115,16 +121,16 @@ def of_fact(fact: Fact, library: Mapping[str, Effect]) -> Finding:
     )
 
 
-def stopped(
+def stopped_diagnosis(
     recording: str, facts: Sequence[Fact], library: Mapping[str, Effect], notes: tuple[str, ...]
 ) -> Diagnosis:
-    """The answer where nothing that is fitted would mean anything, for these facts."""
+    """The diagnosis if these facts make any fit meaningless."""
     return Diagnosis(
         recording=recording,
         baseline=None,
         mismatch=True,
         p_value=0.0,
-        findings=tuple(of_fact(fact, library) for fact in facts),
+        findings=tuple(as_finding(fact, library) for fact in facts),
         unexplained=Unexplained(False),
         posterior_predictive={},
         notes=(*notes, *(fact.words for fact in facts), "put this right first, then ask again"),

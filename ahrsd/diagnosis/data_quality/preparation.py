@@ -1,12 +1,12 @@
-"""A recording as it is diagnosed: columns in their roles, one clock, and what was counted in it.
+"""A recording as it is diagnosed: columns in their roles, one clock, and the facts counted in it.
 
-Before any physics: what is wrong with the recording itself (`facts_of`), by counting and comparing
-only, no calibration: repeated and doubled readings, limits, coarse steps, the clock, units, and
-whether gyro and magnetometer mean the same axes.  It is told before any fit, and `put_right` gives
-the track as it would be without it; what stops a fit is an answer.
+Before any physics, `find_facts` finds what is wrong with the recording itself, by counting and
+comparing only, without a calibration: repeated and doubled readings, limits, coarse steps, the
+clock, units, and whether gyro and magnetometer use the same axes.  `correct_track` gives the track
+without these faults.  A fact that makes a fit impossible is the whole answer.
 
-What a column with holes can still say is asked first (`with_holes`); it counts only if an effect is
-named by it.  Else the answer is the one that the recording gives without it.
+Columns with gaps are used first (`diagnose_with_gaps`); that diagnosis counts only if one of its
+effects depends on such a column.  Otherwise the recording is diagnosed without them.
 """
 
 from __future__ import annotations
@@ -20,81 +20,94 @@ from numpy.typing import NDArray
 from ahrsd.diagnosis import priors, time_series
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
-from ahrsd.diagnosis.calibration_fit.null_fit import unusable
+from ahrsd.diagnosis.calibration_fit.null_fit import unusable_reason
 from ahrsd.diagnosis.columns import roles
-from ahrsd.diagnosis.data_quality.axes_and_units import as_recorded, ranked, windows
-from ahrsd.diagnosis.data_quality.facts import Fact, matters, of_fact, stopped
-from ahrsd.diagnosis.data_quality.range_and_resolution import clipping, quantisation
-from ahrsd.diagnosis.data_quality.stuck import dead, repeats, stuck_axes, stuck_gyro
-from ahrsd.diagnosis.data_quality.timestamps import regular, stamps, without_jumps
+from ahrsd.diagnosis.data_quality.axes_and_units import (
+    axis_and_unit_errors,
+    rank_frames,
+    window_equations,
+)
+from ahrsd.diagnosis.data_quality.facts import Fact, as_finding, is_finding, stopped_diagnosis
+from ahrsd.diagnosis.data_quality.range_and_resolution import find_clipping, find_quantisation
+from ahrsd.diagnosis.data_quality.stuck import (
+    dead_sensor_reason,
+    find_repeated_readings,
+    find_stuck_axes,
+    find_stuck_gyro,
+)
+from ahrsd.diagnosis.data_quality.timestamps import (
+    find_clock_faults,
+    regular_stamps,
+    without_clock_jumps,
+)
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 
-#: a diagnosis of a track and what is known of the sensor
-Ask = Callable[[Track, Spec | None], Diagnosis]
+#: diagnoses a track, given what is known of the sensor
+Diagnose = Callable[[Track, Spec | None], Diagnosis]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prepared:
+class PreparedRecording:
     """A recording before any fit.
 
-    track: as it was recorded, but for the clock's jumps;  facts: found by counting
-    notes: what a person should know of how it was read
+    track: as it was recorded, without the jumps of its clock;  facts: found by counting
+    notes: what a person should know about how it was read
     """
 
     track: Track
     facts: tuple[Fact, ...]
     notes: tuple[str, ...]
 
-    def stopped(self, recording: str, library: Mapping[str, Effect]) -> Diagnosis | None:
-        """The answer where nothing that is fitted would mean anything; else None."""
+    def stopped_diagnosis(self, recording: str, library: Mapping[str, Effect]) -> Diagnosis | None:
+        """The diagnosis if a fact makes any fit meaningless; otherwise None."""
         stops = [fact for fact in self.facts if fact.stops]
-        return stopped(recording, stops, library, self.notes) if stops else None
+        return stopped_diagnosis(recording, stops, library, self.notes) if stops else None
 
-    def with_facts(self, more: Sequence[Fact]) -> Prepared:
-        """The same with what was counted later: turns that were lost."""
+    def with_facts(self, more: Sequence[Fact]) -> PreparedRecording:
+        """The same with facts that were found later: lost turns."""
         return replace(self, facts=(*self.facts, *more))
 
-    def put_right(self) -> Track:
-        """The track without what its facts say is wrong."""
-        return put_right(self.track, self.facts)
+    def corrected_track(self) -> Track:
+        """The track without the faults that its facts describe."""
+        return correct_track(self.track, self.facts)
 
-    def told(self, library: Mapping[str, Effect]) -> tuple[Finding, ...]:
+    def findings(self, library: Mapping[str, Effect]) -> tuple[Finding, ...]:
         """The facts that are findings."""
-        return tuple(of_fact(fact, library) for fact in self.facts if matters(fact))
+        return tuple(as_finding(fact, library) for fact in self.facts if is_finding(fact))
 
     @property
-    def lesser(self) -> tuple[str, ...]:
-        """The others, which are worth a note."""
-        return tuple(fact.words for fact in self.facts if not matters(fact))
+    def minor_notes(self) -> tuple[str, ...]:
+        """The other facts, which deserve a note only."""
+        return tuple(fact.words for fact in self.facts if not is_finding(fact))
 
 
-def prepared(track: Track) -> Prepared:
-    """A recording ready to be fitted.  NothingToFit, one line, where nothing can be."""
-    track, notes = roles.prepared(track)
-    track, jumped = without_jumps(track)
-    if why := unusable(track) or dead(track):
+def prepare(track: Track) -> PreparedRecording:
+    """A recording ready for a fit.  NothingToFit, with one line, if no fit is possible."""
+    track, notes = roles.prepare_columns(track)
+    track, jumped = without_clock_jumps(track)
+    if why := unusable_reason(track) or dead_sensor_reason(track):
         raise NothingToFit(why)
-    return Prepared(track, facts_of(track), (*jumped, *notes))
+    return PreparedRecording(track, find_facts(track), (*jumped, *notes))
 
 
-def facts_of(track: Track) -> tuple[Fact, ...]:
-    """Everything that is found, what stops first."""
-    wrong = as_recorded(track)
-    limits = clipping(track)
+def find_facts(track: Track) -> tuple[Fact, ...]:
+    """All facts of a track, those that stop a fit first."""
+    axis_errors = axis_and_unit_errors(track)
+    limits = find_clipping(track)
     clipped = next((fact.bad for fact in limits if fact.bad is not None), None)
-    again = repeats(track, clipped) + stuck_gyro(track)
-    known = [fact.bad for fact in again + limits if fact.bad is not None]
-    again += stuck_axes(track, np.any([np.zeros(len(track), bool), *known], axis=0))
-    rest = again + limits + quantisation(track) + stamps(track)
-    return tuple(sorted(wrong + rest, key=lambda fact: not fact.stops))
+    repeated = find_repeated_readings(track, clipped) + find_stuck_gyro(track)
+    known = [fact.bad for fact in repeated + limits if fact.bad is not None]
+    repeated += find_stuck_axes(track, np.any([np.zeros(len(track), bool), *known], axis=0))
+    others = repeated + limits + find_quantisation(track) + find_clock_faults(track)
+    return tuple(sorted(axis_errors + others, key=lambda fact: not fact.stops))
 
 
-def put_right(track: Track, facts: Sequence[Fact]) -> Track:
-    """The track without what the facts say: frames and units undone, false readings nan.
+def correct_track(track: Track, facts: Sequence[Fact]) -> Track:
+    """The track without the faults: frames and units corrected, invalid readings nan.
 
-    Jittering stamps are put on their regular clock, the turn of lost samples is put back, and
-    where the turn is not known a run ends.  Rows stay as they are in number and order.
+    Jittering stamps are replaced by their regular clock, and the turn of lost samples is restored.
+    Where that turn is unknown, a run ends.  The number and order of rows do not change.
     """
     mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
     time_s, dt_s, unseen = track.time_s, track.dt_s, track.lost_turns
@@ -108,7 +121,7 @@ def put_right(track: Track, facts: Sequence[Fact]) -> Track:
             else:
                 mag = mag * factor
         elif fact.effect == "timestamp_jitter" and not fact.stops:
-            time_s = regular(track)
+            time_s = regular_stamps(track)
             dt_s = np.where(np.isnan(dt_s), np.nan, np.diff(time_s, prepend=np.nan))
         if fact.turned is not None:
             known = np.isfinite(fact.turned)
@@ -129,12 +142,12 @@ def put_right(track: Track, facts: Sequence[Fact]) -> Track:
     )
 
 
-def would_have_shown(track: Track) -> tuple[str, ...]:
-    """What the checks would have shown here, one line each."""
+def detectable_faults(track: Track) -> tuple[str, ...]:
+    """The smallest faults that the checks would have found in this recording, one line each."""
     mag, gyro = noise_of_differences(track)
     step = track.step_s
-    found = windows(track)
-    shown = [
+    equations = window_equations(track)
+    faults = [
         "a magnetometer stuck while the field turns by "
         f"{1e3 * priors.STUCK_TURNED_NOISE * mag:.2g} mG",
         f"readings in steps above {1e3 * priors.COARSE_STEPS * mag:.2g} mG "
@@ -143,39 +156,43 @@ def would_have_shown(track: Track) -> tuple[str, ...]:
         f"1 sample in {1.0 / priors.MISSING_SHARE:.0f} missing",
     ]
     axes = "swapped, negated or left-handed axes, wrong units of the gyro"
-    turned = found is not None and ranked(found) and ranked(found)[0].cost < priors.FRAME_EXPLAINED
+    turned = (
+        equations is not None
+        and rank_frames(equations)
+        and rank_frames(equations)[0].cost < priors.FRAME_EXPLAINED
+    )
     if turned:
-        shown.append(axes)
-    said = f"would also have been seen: {'; '.join(shown)}"
-    return (said,) if turned else (said, f"would not have been seen, it hardly turned: {axes}")
+        faults.append(axes)
+    line = f"would also have been seen: {'; '.join(faults)}"
+    return (line,) if turned else (line, f"would not have been seen, it hardly turned: {axes}")
 
 
-def with_holes(track: Track, spec: Spec | None, ask: Ask) -> Diagnosis:
-    """An answer, with columns that have holes where an effect is named by one."""
-    holed = roles.holed(track)
-    if holed:
+def diagnose_with_gaps(track: Track, spec: Spec | None, diagnose: Diagnose) -> Diagnosis:
+    """The diagnosis, with columns that have gaps if one of its effects depends on them."""
+    gappy = roles.find_columns_with_gaps(track)
+    if gappy:
         filled = track.with_columns(
-            {**track.covariates, **{k: one.values for k, one in holed.items()}}
+            {**track.covariates, **{k: one.values for k, one in gappy.items()}}
         )
         missing = np.zeros(len(track), dtype=bool)
-        for one in holed.values():
+        for one in gappy.values():
             missing |= one.missing
-        found = ask(_blind(filled, missing), spec)
-        used = [name for name in holed if name in _causes(found)]
+        answer = diagnose(_without_magnetometer(filled, missing), spec)
+        used = [name for name in gappy if name in _cause_columns(answer)]
         if used:
-            notes = tuple(holed[name].words for name in used)
-            return replace(found, notes=(*notes, *found.notes))
-    return ask(track, spec)
+            notes = tuple(gappy[name].words for name in used)
+            return replace(answer, notes=(*notes, *answer.notes))
+    return diagnose(track, spec)
 
 
-def _causes(found: Diagnosis) -> tuple[str, ...]:
-    """Columns by which effects are named."""
-    names = (one.setting.get("covariate") for one in found.findings)
-    by_place = any(one.effect in ("field_gradient", "field_anomaly") for one in found.findings)
+def _cause_columns(answer: Diagnosis) -> tuple[str, ...]:
+    """Columns on which the effects of a diagnosis depend."""
+    names = (one.setting.get("covariate") for one in answer.findings)
+    by_place = any(one.effect in ("field_gradient", "field_anomaly") for one in answer.findings)
     position = ("position_north_m", "position_east_m", "position_down_m") if by_place else ()
     return (*(name for name in names if isinstance(name, str)), *position)
 
 
-def _blind(track: Track, rows: NDArray[np.bool]) -> Track:
-    """The track without the magnetometer's readings of these rows."""
+def _without_magnetometer(track: Track, rows: NDArray[np.bool]) -> Track:
+    """The track without the magnetometer's readings in these rows."""
     return replace(track, mag_b_gauss=np.where(rows[:, None], np.nan, track.mag_b_gauss))

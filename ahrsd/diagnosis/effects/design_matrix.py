@@ -81,8 +81,12 @@ def turned_by(vectors: Array) -> Array:
 def per_covariate(readings: Readings, role: str, **more: object) -> tuple[Setting, ...]:
     """One setting per column of that role, with the value at which its effect counts as zero."""
     return tuple(
-        {"covariate": name, "reference": roles.reference(role, readings.covariates[name]), **more}
-        for name in roles.named(readings.covariates, role)
+        {
+            "covariate": name,
+            "reference": roles.zero_reference(role, readings.covariates[name]),
+            **more,
+        }
+        for name in roles.usable_columns(readings.covariates, role)
     )
 
 

@@ -449,7 +449,7 @@ class VibrationRectification(Linear):
             mean = float(np.mean(_shaking(readings, 1.0)))
             found.append({"covariate": "accel", "window_s": 1.0, "mean": mean})
         for role in ("current", "rpm"):
-            for name in roles.named(readings.covariates, role):
+            for name in roles.usable_columns(readings.covariates, role):
                 mean = float(np.mean(readings.covariates[name] ** 2))
                 found.append({"covariate": name, "mean": mean})
         return tuple(found)

@@ -244,11 +244,11 @@ class AltitudeField(Linear):
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """Straight in each height; as of something close below where the height is over ground."""
         found = list(design_matrix.per_covariate(readings, "altitude", shape="line"))
-        if "position_down_m" in roles.named(readings.covariates, "position"):
+        if "position_down_m" in roles.usable_columns(readings.covariates, "position"):
             depth = readings.covariates["position_down_m"]
             line = {"covariate": "position_down_m", "reference": float(depth.mean())}
             found += [{**line, "shape": "line"}] if float(np.ptp(depth)) > 0 else []
-        for name in roles.named(readings.covariates, "altitude"):
+        for name in roles.usable_columns(readings.covariates, "altitude"):
             lowest = float(np.min(readings.covariates[name]))
             if lowest > 0.1:
                 found.append({"covariate": name, "reference": lowest, "shape": "near"})
@@ -307,7 +307,7 @@ def position_m(readings: Readings) -> Array | None:
 
     None without north and east, or where the vehicle does not move.
     """
-    usable = roles.named(readings.covariates, "position")
+    usable = roles.usable_columns(readings.covariates, "position")
     if not {"position_north_m", "position_east_m"} <= set(usable):
         return None
     zero = np.zeros(len(readings.time_s))

@@ -14,11 +14,18 @@ from functools import partial
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
 from ahrsd.diagnosis.answer.null_simulations import Answered, beyond_chance
-from ahrsd.diagnosis.calibration_fit.gyro_at_rest import at_rest, resting, told_at_rest
+from ahrsd.diagnosis.calibration_fit.gyro_at_rest import (
+    effects_testable_at_rest,
+    field_hardly_turns,
+    find_bias_drift_at_rest,
+)
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null
-from ahrsd.diagnosis.calibration_fit.problem import Problem, problem_of
-from ahrsd.diagnosis.data_quality.dropped_samples import differ, lost_turns
-from ahrsd.diagnosis.data_quality.preparation import prepared, with_holes
+from ahrsd.diagnosis.calibration_fit.problem import Problem, build_problem
+from ahrsd.diagnosis.data_quality.dropped_samples import (
+    corrections_differ,
+    find_lost_turns_at_start,
+)
+from ahrsd.diagnosis.data_quality.preparation import diagnose_with_gaps, prepare
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.answer.whole_answer import whole_answer
@@ -31,7 +38,7 @@ from ahrsd.diagnosis.track import Spec, Track
 
 def begun(track: Track, spec: Spec) -> tuple[Problem, NullFit]:
     """A track that hygiene has put right at its working rate, and the fit of a null to it."""
-    problem, cold = problem_of(broken_where_unsampled(track), spec)
+    problem, cold = build_problem(broken_where_unsampled(track), spec)
     return problem, fit_null(problem.track, problem.spec, cold, walk=False)
 
 
@@ -40,7 +47,7 @@ def diagnose_logged(
 ) -> Diagnosis:
     """The same of columns with holes, as users have it."""
     ask = partial(diagnose, recording=recording, simulated=simulated)
-    return with_holes(track, spec, ask)
+    return diagnose_with_gaps(track, spec, ask)
 
 
 def diagnose(
@@ -68,30 +75,30 @@ def _answered(
 
     clocks: whether a column may run by another clock than the sensor
     """
-    asked = prepared(track)
-    if (nothing := asked.stopped("", library)) is not None:
+    asked = prepare(track)
+    if (nothing := asked.stopped_diagnosis("", library)) is not None:
         return Answered(nothing)
-    problem, start = begun(asked.put_right(), spec)
+    problem, start = begun(asked.corrected_track(), spec)
     came, counted = problem.recorded, asked
-    if lost := lost_turns(came, problem.cold):
+    if lost := find_lost_turns_at_start(came, problem.cold):
         asked = counted.with_facts(lost)
-        problem, start = begun(asked.put_right(), spec)
+        problem, start = begun(asked.corrected_track(), spec)
     richest = richest_model.fit_richest_model(problem, start.filtered, library)
     if clocks and (clock := find_wrong_clock(richest)) is not None:
         at_its_time = _answered(
-            clock.moved(asked.track), spec, library, simulated=simulated, clocks=False
+            clock.realigned_track(asked.track), spec, library, simulated=simulated, clocks=False
         )
         moved = at_its_time.found
         if any(one.setting.get("covariate") == clock.column for one in moved.findings):
             said = f"{clock.words}: its cause is judged at the sensor's time"
             return replace(at_its_time, found=replace(moved, notes=(said, *moved.notes)))
-    still = resting(start.context(), library) if at_rest(start) else ()
-    searched = told_at_rest(library, still) if at_rest(start) else library
+    still = find_bias_drift_at_rest(start.context(), library) if field_hardly_turns(start) else ()
+    searched = effects_testable_at_rest(library, still) if field_hardly_turns(start) else library
     found, fast = found_at_both_rates(problem, richest, start, searched)
     beside = lost_beside(came, found, fast, lost)
-    if differ(lost, beside):
+    if corrections_differ(lost, beside):
         other = counted.with_facts(beside)
-        otherwise, begin = begun(other.put_right(), spec)
+        otherwise, begin = begun(other.corrected_track(), spec)
         richest = richest_model.fit_richest_model(otherwise, begin.filtered, library)
         again, quickly = found_at_both_rates(otherwise, richest, begin, searched)
         if nats(again, beside) > nats(found, lost):

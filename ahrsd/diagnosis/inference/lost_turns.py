@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.data_quality.dropped_samples import missing_turns, price
+from ahrsd.diagnosis.data_quality.dropped_samples import correction_cost, find_lost_turns
 from ahrsd.diagnosis.data_quality.facts import Fact
 from ahrsd.diagnosis.inference.likelihood.linearisation import Point, step_to_maximum
 from ahrsd.diagnosis.inference.recorded_rate import Quick, at_recorded_rate
@@ -43,7 +43,7 @@ def lost_beside(came: Track, found: Searched, fast: Quick, lost: Sequence[Fact])
 
 def nats(found: Searched, lost: Sequence[Fact]) -> float:
     """How likely the readings are where these turns were put right, as nats that compare."""
-    return found.answer.best.score + found.all_sets.made.log_whitening - price(lost)
+    return found.answer.best.score + found.all_sets.made.log_whitening - correction_cost(lost)
 
 
 def broken_where_unsampled(track: Track) -> Track:
@@ -63,4 +63,4 @@ def broken_where_unsampled(track: Track) -> Track:
 
 def _turns(fast: Point) -> list[Fact]:
     done = fast.filtered
-    return missing_turns(done, done.track.gyro_b_rad_s - done.model.gyro_bias_rad_s)
+    return find_lost_turns(done, done.track.gyro_b_rad_s - done.model.gyro_bias_rad_s)

@@ -15,7 +15,7 @@ import numpy as np
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Unexplained
 from ahrsd.diagnosis.calibration_fit.delay import without_lag
-from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate
+from ahrsd.diagnosis.calibration_fit.problem import Problem, model_of_samples
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.components.component import Component
 from ahrsd.diagnosis.inference.components.effect_components import effect_component, form_component
@@ -176,7 +176,7 @@ def at_recorded_rate(slow: Point) -> Point:
         return np.column_stack([np.interp(time_s, at_s, column) for column in values.T])
 
     mag, gyro = drawn(slow.terms_mag), drawn(slow.terms_gyro)
-    filtered = run_filter(track, model_at_rate(slow.filtered.model, problem), mag, gyro)
+    filtered = run_filter(track, model_of_samples(slow.filtered.model, problem), mag, gyro)
     fast = replace(problem, track=track, thin=1, averaged=1.0)
     loud = noise_model.fit_noise_levels(filtered.whitened, filtered.used, fast.rate_hz)
     return Point(fast, filtered, {}, mag, gyro, loud)
@@ -192,4 +192,4 @@ def _without(fast: Problem, slow: Problem, made: Linearised, best: Hypothesis) -
     known = {key: made.seen[key].component for key in values}
     mag, _ = total_contribution(len(fast.track), known, values)
     recorded = replace(slow.recorded, mag_b_gauss=slow.recorded.mag_b_gauss - mag)
-    return replace(slow, recorded=recorded, instants=False).lagging(0.0)
+    return replace(slow, recorded=recorded, instants=False).with_lag(0.0)

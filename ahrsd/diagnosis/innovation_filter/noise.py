@@ -17,7 +17,7 @@ from scipy.linalg import solve_toeplitz
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Value, Where
-from ahrsd.diagnosis.data_quality.facts import Fact, spans_of
+from ahrsd.diagnosis.data_quality.facts import Fact, row_intervals
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered
 from ahrsd.diagnosis.innovation_filter.regression_statistics import student_log_density
 from ahrsd.samples import Array
@@ -252,7 +252,7 @@ def _loud_spans(
         loud, quiet = _sides(clipped, size, on)
     # a spell may begin in any of the blocks
     price = float(np.log(max(len(middle), 1)))
-    kept = [(a, b) for a, b in spans_of(on, 1) if float(np.sum(nats[a:b])) > price]
+    kept = [(a, b) for a, b in row_intervals(on, 1) if float(np.sum(nats[a:b])) > price]
     on = np.zeros(len(middle), dtype=bool)
     for a, b in kept:
         on[a:b] = True

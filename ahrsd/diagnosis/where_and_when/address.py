@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Where
-from ahrsd.diagnosis.columns.roles import shown
+from ahrsd.diagnosis.columns.roles import label
 from ahrsd.diagnosis.effects.effect import Setting
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.where_and_when.locate import segments
@@ -62,9 +62,9 @@ def _regime(track: Track, added: Array, setting: Setting) -> str | None:
     strong = values[size >= np.median(size)]
     low, high = float(np.min(strong)), float(np.max(strong))
     if low > float(np.median(values)) * 0.9:
-        return f"{shown(str(name))} > {low:.3g}"
+        return f"{label(str(name))} > {low:.3g}"
     below = high < float(np.median(values))
-    return f"{shown(str(name))} < {high:.3g}" if below else f"follows {shown(str(name))}"
+    return f"{label(str(name))} < {high:.3g}" if below else f"follows {label(str(name))}"
 
 
 def departures(edges_s: Array, course: Array, deviation: Array) -> list[tuple[float, float]]:

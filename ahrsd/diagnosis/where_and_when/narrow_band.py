@@ -11,7 +11,7 @@ import numpy as np
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Unexplained, Where
-from ahrsd.diagnosis.data_quality.facts import spans_of
+from ahrsd.diagnosis.data_quality.facts import row_intervals
 from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.where_and_when.locate import Frame
 from ahrsd.samples import Array
@@ -67,7 +67,7 @@ def loudest_band(
     out &= (edges[:-1] >= priors.BAND_LOWEST_HZ) & (edges[1:] <= highest_hz)
     ratio = np.where(out, bands / np.where(out, level, 1.0), 1.0)
     nats = 3.0 * bins * (ratio - 1.0 - np.log(ratio))
-    runs = spans_of(out)
+    runs = row_intervals(out)
     if not runs:
         return None
     a, b = max(runs, key=lambda run: float(nats[slice(*run)].sum()))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.columns.roles import shown
+from ahrsd.diagnosis.columns.roles import label
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
@@ -49,7 +49,7 @@ class Regime:
         parts = [
             f"{self.edges[a]:.3g} to {self.edges[b]:.3g}" for a, b in zip(starts, ends, strict=True)
         ]
-        return f"{shown(self.quantity)} {', '.join(parts)}" if parts else ""
+        return f"{label(self.quantity)} {', '.join(parts)}" if parts else ""
 
 
 def regimes(context: Context) -> tuple[Regime, ...]:

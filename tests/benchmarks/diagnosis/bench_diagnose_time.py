@@ -47,7 +47,7 @@ KINDS = {
 #: functions that are timed, in the order in which they run, and the modules that call them
 PHASES = {
     **dict.fromkeys(
-        ("prepared", "problem_of", "fit_null", "lost_turns", "find_wrong_clock"), engine
+        ("prepare", "build_problem", "fit_null", "find_lost_turns_at_start", "find_wrong_clock"), engine
     ),
     "fit_richest_model": richest_model,
     **dict.fromkeys(("answered", "quick"), both_rates),

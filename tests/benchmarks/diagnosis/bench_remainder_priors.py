@@ -27,7 +27,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.data_quality.preparation import prepared
+from ahrsd.diagnosis.data_quality.preparation import prepare
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.components.effect_components import LAG
@@ -64,7 +64,7 @@ def untouched(words: list[str]) -> Iterator[tuple[str, Path]]:
 
 def measured(path: Path) -> dict[str, Any]:
     """What a recording leaves: `profiles` of the remainder, `effects` that nobody put there."""
-    track = prepared(load_track(path)[0]).put_right()
+    track = prepare(load_track(path)[0]).corrected_track()
     problem, fit = begun(track, Spec())
     found = richest_model.fit_richest_model(problem, fit.filtered, EFFECTS)
     return {"profiles": profiles(found), "effects": sizes(found)}

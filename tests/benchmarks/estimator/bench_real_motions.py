@@ -24,7 +24,7 @@ from mismatch_trials import covariates
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
-from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.calibration_fit.problem import build_problem
 from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.diagnose import diagnose
@@ -112,7 +112,7 @@ def simulated(name: str, seed: int, effects: list[tuple[str, float]]) -> Track:
 
 def noise_over_truth(track: Track) -> tuple[float, float]:
     """The gyro's noise by its differences, and as it is worked with, both over the truth."""
-    problem, start = problem_of(track, Spec())
+    problem, start = build_problem(track, Spec())
     worked = start.sigma_gyro_rad_s * float(np.sqrt(problem.thin))
     return noise_of_differences(track)[1] / SIGMA_GYRO, worked / SIGMA_GYRO
 

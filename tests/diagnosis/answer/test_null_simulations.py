@@ -22,7 +22,7 @@ from ahrsd.diagnosis.answer.null_simulations import (
 )
 from ahrsd.diagnosis.answer.text import verdict
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
-from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.calibration_fit.problem import build_problem
 from ahrsd.diagnosis.repaired_model.forward import noise_of
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.simulation import Experiment
@@ -54,7 +54,7 @@ def _stepped() -> tuple[Track, Callable[[float], Answered]]:
     track = track_of(_made(1e-4, 5e-2, samples=1000))
     since = (np.arange(len(track)) >= 500)[:, None]
     track = replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS)
-    problem, cold = problem_of(track, Spec())
+    problem, cold = build_problem(track, Spec())
     start = fit_null(problem.track, problem.spec, cold)
     where = Where(((60.0, 120.0),), ("x", "y"), "sensor")
 
@@ -145,7 +145,7 @@ def test_the_noise_bends_a_calibration_that_the_motion_hardly_shows(
     scenario: str, is_bent: bool
 ) -> None:
     """Slow turns with a tilt of a few degrees; the same noise beside larger ones moves nothing."""
-    problem, cold = problem_of(track_of(_made(1e-3, 5e-3, scenario, 2)), Spec())
+    problem, cold = build_problem(track_of(_made(1e-3, 5e-3, scenario, 2)), Spec())
     moved = bent(fit_null(problem.track, problem.spec, cold, walk=False))
     assert moved == pytest.approx(0.62, abs=0.1) if is_bent else moved < 0.1
 

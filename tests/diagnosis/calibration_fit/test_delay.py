@@ -11,11 +11,11 @@ from tracks import experiment, track_of
 
 from ahrsd import so3
 from ahrsd.diagnosis.calibration_fit.delay import (
-    after_columns_begin,
-    beyond_the_lag,
     delayed_gyro,
-    of_magnetometer,
-    usual_step,
+    is_magnetometer_lag,
+    low_pass_beyond_delay,
+    regular_step,
+    without_early_readings,
     without_lag,
 )
 from ahrsd.diagnosis.track import Track
@@ -56,9 +56,9 @@ def test_steps_that_are_not_alike_have_no_half():
     """With one sample in seven missing half a step is no convention that a delay could be."""
     t = 0.025 * np.arange(4000)
     dt = np.diff(t, prepend=np.nan)
-    assert usual_step(dt) == pytest.approx(0.025)
+    assert regular_step(dt) == pytest.approx(0.025)
     kept = np.delete(t, np.arange(3, 4000, 7))
-    assert usual_step(np.diff(kept, prepend=np.nan)) is None
+    assert regular_step(np.diff(kept, prepend=np.nan)) is None
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_half_a_step_is_the_gyros_and_what_is_logged_stays_where_it_is(lag_s, la
         accel_b_m_s2=None,
         covariates={"motor_current_a": np.sin(time_s)},
     )
-    assert of_magnetometer(track, lag_s) is late
+    assert is_magnetometer_lag(track, lag_s) is late
     moved = without_lag(track, lag_s).covariates["motor_current_a"]
     wanted = np.sin(time_s - lag_s) if late else np.sin(time_s)
     np.testing.assert_allclose(moved[10:], wanted[10:], atol=2e-3 if late else 0.0)
@@ -99,7 +99,7 @@ def test_a_low_pass_does_half_beyond_a_delay_of_what_it_does_to_the_delayed_fiel
         model=replace(context.model, soft_iron=np.eye(3)),
     )
     expected = np.exp(1j * rate * t) / (1 + 1j * rate * tau) - late
-    found = beyond_the_lag(context, tau).mag
+    found = low_pass_beyond_delay(context, tau).mag
     assert found is not None
     inner = slice(5, -5)
     error = np.abs(found[inner, 0, 0] + 1j * found[inner, 1, 0] - expected[inner])
@@ -168,7 +168,7 @@ def test_readings_of_a_time_at_which_no_column_was_logged_yet_are_left_out():
     runs = (slice(0, 200), slice(200, 500))
     track = replace(track, dt_s=dt_s, runs=runs)
     for covariates, left_out in (({}, []), ({"lamp_on": np.ones(500)}, [0, 1, 2, 200, 201, 202])):
-        begun = after_columns_begin(replace(track, covariates=covariates))
+        begun = without_early_readings(replace(track, covariates=covariates))
         unread = np.flatnonzero(np.isnan(begun.mag_b_gauss).any(axis=1))
         assert unread.tolist() == left_out
 
@@ -180,4 +180,4 @@ def test_a_recording_in_short_bursts_keeps_all_of_its_readings():
     dt_s[::5] = np.nan
     runs = tuple(slice(k, k + 5) for k in range(0, 500, 5))
     burst = replace(track, dt_s=dt_s, runs=runs, covariates={"lamp_on": np.ones(500)})
-    np.testing.assert_array_equal(after_columns_begin(burst).mag_b_gauss, track.mag_b_gauss)
+    np.testing.assert_array_equal(without_early_readings(burst).mag_b_gauss, track.mag_b_gauss)

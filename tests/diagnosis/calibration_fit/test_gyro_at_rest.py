@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from odd_tracks import COUNT, RATE_HZ, standing, warming
 
-from ahrsd.diagnosis.calibration_fit.gyro_at_rest import resting
+from ahrsd.diagnosis.calibration_fit.gyro_at_rest import find_bias_drift_at_rest
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.track import Track
 
 
 def told(track: Track):
-    return resting(fit_null(track, walk=False).context(), EFFECTS)
+    return find_bias_drift_at_rest(fit_null(track, walk=False).context(), EFFECTS)
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,10 @@ from odd_tracks import shaking, wobbling
 from tracks import experiment, recorded, track_of
 
 from ahrsd import so3
-from ahrsd.diagnosis.calibration_fit.gyro_readings import shaken, with_delta_angles
+from ahrsd.diagnosis.calibration_fit.gyro_readings import is_shaken, with_delta_angles
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.calibration_fit.null_fit import cold_start
-from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.calibration_fit.problem import build_problem
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.samples import Array
 
@@ -93,13 +93,13 @@ def test_rates_that_do_not_follow_the_motion_are_left_alone() -> None:
 def test_smooth_motion_is_not_shaken(scenario: str, rate_hz: float) -> None:
     for seed in range(3):
         made = experiment(scenario, seed=seed, samples=4000, rate_hz=rate_hz)
-        assert not shaken(track_of(made))
+        assert not is_shaken(track_of(made))
 
 
 @pytest.mark.parametrize("name", ["broad/01_undisturbed_slow_rotation_A", "vn100/drive_2022_rahul"])
 @pytest.mark.recordings
 def test_real_motion_is_shaken(name: str) -> None:
-    assert shaken(recorded(name))
+    assert is_shaken(recorded(name))
 
 
 def test_what_else_is_wrong_is_not_taken_for_quiet() -> None:
@@ -107,7 +107,7 @@ def test_what_else_is_wrong_is_not_taken_for_quiet() -> None:
     track = shaking(4)
     mag = track.mag_b_gauss.copy()
     mag[:, 0] += 0.05 * np.sign(np.sin(2 * np.pi * track.time_s / 17.0))
-    problem, _ = problem_of(replace(track, mag_b_gauss=mag), Spec())
+    problem, _ = build_problem(replace(track, mag_b_gauss=mag), Spec())
     assert problem.spec.shaken_gyro_rad_s is None
 
 
@@ -122,7 +122,7 @@ def test_one_axis_that_a_propeller_shakes_says_nothing_of_the_gyro_s_noise() -> 
 
 def test_where_the_averaged_rows_differ_by_their_motion_the_noise_is_that_of_the_recorded() -> None:
     sigma_gyro = 3e-4
-    problem, _ = problem_of(wobbling(sigma_gyro), Spec())
+    problem, _ = build_problem(wobbling(sigma_gyro), Spec())
     assert problem.thin > 1
     of_row = sigma_gyro / np.sqrt(problem.thin)
     assert noise_of_differences(problem.track)[1] > 2 * of_row

@@ -11,7 +11,7 @@ from tracks import experiment, recorded, track_of, true_model
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null, rate_at_rest
-from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.calibration_fit.problem import build_problem
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.samples import Array
@@ -51,7 +51,7 @@ def test_a_cold_start_finds_the_truth(scenario: str, motion: str, sigma_gyro: fl
 def test_a_valley_from_which_no_start_comes_is_left() -> None:
     """Of low angular movement: each of three starts ended 0.26 gauss off, 208 nats above this."""
     run = simulate(ScenarioSettings("lam", "slow", 9700, 10_000, 25.0, 1e-3, 5e-3))
-    asked, cold = problem_of(track_of(run), Spec())
+    asked, cold = build_problem(track_of(run), Spec())
     fit = fit_null(asked.track, asked.spec, cold, walk=False)
     assert np.linalg.norm(fit.model.hard_iron_gauss - run.truth.hard_iron_gauss) < 0.03
     assert abs(fit.filtered.normalised_innovation - 1) < 0.01

@@ -10,9 +10,9 @@ from tracks import experiment, track_of, true_model
 
 from ahrsd import so3
 from ahrsd.diagnosis.calibration_fit.resampling import (
-    decimated,
+    average_groups,
+    decimate,
     thin_factor,
-    thinned,
     working_factor,
 )
 from ahrsd.diagnosis.model import NullModel
@@ -46,7 +46,7 @@ def model(hard_iron: list[float]) -> NullModel:
 @pytest.mark.parametrize("m", [2, 3, 4, 5, 6, 7])
 def test_turns_and_readings_are_those_of_the_middle_samples(m):
     track, R_nb = turning()
-    thin = thinned(track, m, model([0.05, -0.02, 0.1]))
+    thin = average_groups(track, m, model([0.05, -0.02, 0.1]))
     middle = np.arange(len(thin)) * m + m // 2
     np.testing.assert_allclose(thin.time_s, track.time_s[middle], atol=1e-12)
     centre = track.time_s[middle] - (0.0 if m % 2 else track.time_s[1] / 2)
@@ -60,7 +60,9 @@ def test_turns_and_readings_are_those_of_the_middle_samples(m):
 
 def test_a_wrong_hard_iron_matters_little():
     track, _ = turning()
-    right, wrong = (thinned(track, 3, model(b)) for b in ([0.05, -0.02, 0.1], [0.06, -0.02, 0.1]))
+    right, wrong = (
+        average_groups(track, 3, model(b)) for b in ([0.05, -0.02, 0.1], [0.06, -0.02, 0.1])
+    )
     error = np.abs(wrong.mag_b_gauss - right.mag_b_gauss).max()
     assert 0 < error < 0.01 * 0.01  # a hundredth of the hard iron's error
 
@@ -79,7 +81,7 @@ def test_rate_is_kept_above_what_is_wanted():
 
 def test_a_factor_below_one_is_refused():
     with pytest.raises(ValueError, match="thinning by 0"):
-        thinned(turning()[0], 0, model([0.0, 0.0, 0.0]))
+        average_groups(turning()[0], 0, model([0.0, 0.0, 0.0]))
 
 
 def test_what_disturbs_the_readings_is_averaged_as_its_column_is():
@@ -93,7 +95,7 @@ def test_what_disturbs_the_readings_is_averaged_as_its_column_is():
         covariates={"current_a": current},
     )
     for m in (3, 4):
-        thin = thinned(still, m, model([0.05, -0.02, 0.1]))
+        thin = average_groups(still, m, model([0.05, -0.02, 0.1]))
         expected = np.outer(thin.covariates["current_a"], [0.01, 0.02, -0.01]) + FIELD
         np.testing.assert_allclose(thin.mag_b_gauss, expected, atol=1e-12)
 
@@ -101,11 +103,11 @@ def test_what_disturbs_the_readings_is_averaged_as_its_column_is():
 def test_lost_turns_are_added_up_and_each_is_a_smaller_part_of_the_step():
     track, _ = turning()
     lost = np.linspace(0.0, 0.02, len(track))
-    thin = thinned(replace(track, lost_turns=lost), 3, model([0.05, -0.02, 0.1]))
+    thin = average_groups(replace(track, lost_turns=lost), 3, model([0.05, -0.02, 0.1]))
     assert thin.step_share == pytest.approx(1 / 3)
     middle = np.arange(1, len(thin)) * 3 + 1
     np.testing.assert_allclose(thin.lost_turns[1:], 3 * (lost[middle] - lost[1]), atol=1e-12)
-    assert thinned(track, 3, model([0.05, -0.02, 0.1])).lost_turns is None
+    assert average_groups(track, 3, model([0.05, -0.02, 0.1])).lost_turns is None
 
 
 @pytest.mark.parametrize(("sigma_gyro", "samples"), [(5e-3, 3), (8e-3, 2), (5e-2, 1)])
@@ -120,7 +122,7 @@ def test_rows_are_of_so_many_samples_as_stay_white(sigma_gyro: float, samples: i
 
 def test_thinning_composes_rotations_exactly() -> None:
     track = track_of(experiment("wam", samples=400))
-    coarse = decimated(track, 5)
+    coarse = decimate(track, 5)
     assert len(coarse) == 80
     by_one = np.eye(3)
     for k in range(5, 10):
@@ -134,7 +136,7 @@ def test_a_track_with_holes_is_thinned_at_its_readings() -> None:
     track = track_of(experiment("wam", samples=400))
     mag = track.mag_b_gauss.copy()
     mag[np.arange(400) % 4 != 1] = np.nan
-    coarse = decimated(replace(track, mag_b_gauss=mag), 5)
+    coarse = decimate(replace(track, mag_b_gauss=mag), 5)
     assert np.isfinite(coarse.mag_b_gauss).all()
     # whatever the groups, the whole turn stays
     whole, composed = np.eye(3), np.eye(3)

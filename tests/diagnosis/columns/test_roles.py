@@ -60,20 +60,20 @@ def test_two_valued_columns_are_switches_or_pulses():
 
 
 def test_the_reference_is_zero_or_the_mean():
-    assert roles.reference("current", RAMP) == 0.0
-    assert roles.reference("temperature", RAMP) == pytest.approx(3.0)
+    assert roles.zero_reference("current", RAMP) == 0.0
+    assert roles.zero_reference("temperature", RAMP) == pytest.approx(3.0)
 
 
 def test_usable_columns_are_named_in_order():
     columns = {"b_a": RAMP, "a_a": RAMP, "temperature_c": 0 * RAMP, "x_a": RAMP * np.nan}
-    assert roles.named(columns, "current") == ("b_a", "a_a")
-    assert roles.named(columns, "temperature") == ()
+    assert roles.usable_columns(columns, "current") == ("b_a", "a_a")
+    assert roles.usable_columns(columns, "temperature") == ()
 
 
 def test_short_holes_are_filled():
     holed = RAMP.copy()
     holed[50:65] = np.nan
-    found, notes = roles.prepared(track(motor_current_a=holed))
+    found, notes = roles.prepare_columns(track(motor_current_a=holed))
     assert notes == ()
     assert found.covariates["motor_current_a"] == pytest.approx(RAMP)
 
@@ -81,7 +81,7 @@ def test_short_holes_are_filled():
 def test_a_slow_logger_is_filled_and_a_switch_holds_its_value():
     slow, bits = np.full(200, np.nan), np.full(200, np.nan)
     slow[::10], bits[::10] = RAMP[::10], BITS[::10]
-    found, notes = roles.prepared(track(temperature_c=slow, lamp_on=bits))
+    found, notes = roles.prepare_columns(track(temperature_c=slow, lamp_on=bits))
     assert notes == ()
     assert found.covariates["temperature_c"][:191] == pytest.approx(RAMP[:191])
     assert set(np.unique(found.covariates["lamp_on"])) == {0.0, 1.0}
@@ -100,7 +100,7 @@ def test_a_slow_logger_is_filled_and_a_switch_holds_its_value():
     ],
 )
 def test_what_cannot_be_used_is_refused_with_a_sentence(name, values, said):
-    found, (note,) = roles.prepared(track(**{name: values, "depth_m": RAMP}))
+    found, (note,) = roles.prepare_columns(track(**{name: values, "depth_m": RAMP}))
     assert said in note
     assert note.startswith(f"column {name} was left out: ")
     assert list(found.covariates) == ["depth_m"]
@@ -112,20 +112,20 @@ def test_a_hole_of_the_samples_themselves_is_none_of_the_column():
     values = RAMP.copy()
     values[20] = np.nan
     moved = Track(time_s, base.dt_s, base.mag_b_gauss, base.gyro_b_rad_s, None, {"x_a": values})
-    found, notes = roles.prepared(moved)
+    found, notes = roles.prepare_columns(moved)
     assert notes == ()
     assert found.covariates["x_a"] == pytest.approx(RAMP)
 
 
 def test_columns_without_a_role_are_kept():
-    found, notes = roles.prepared(track(hdop=RAMP))
+    found, notes = roles.prepare_columns(track(hdop=RAMP))
     assert list(found.covariates) == ["hdop"]
     assert notes == ()
 
 
 def test_a_reference_attitude_is_no_cause() -> None:
     """What it adds to a recording must not change what is said of the sensor."""
-    found, notes = roles.prepared(track(ref_qw=RAMP, ref_qz=RAMP, hdop=RAMP))
+    found, notes = roles.prepare_columns(track(ref_qw=RAMP, ref_qz=RAMP, hdop=RAMP))
     assert list(found.covariates) == ["hdop"]
     assert notes == ()
 
@@ -133,14 +133,14 @@ def test_a_reference_attitude_is_no_cause() -> None:
 def test_what_the_sensor_makes_of_its_own_readings_is_no_cause():
     own = {"vn_yaw_deg": RAMP, "dcm_01": RAMP, "mag_n_d_gauss": RAMP, "pitch_rad": RAMP}
     own |= {"yaw": RAMP, "roll_rate_rad_s": RAMP, "yaw_angle_deg": RAMP}
-    found, notes = roles.prepared(track(**own, linkage_m=RAMP))
+    found, notes = roles.prepare_columns(track(**own, linkage_m=RAMP))
     assert list(found.covariates) == ["linkage_m"]
     assert notes == ()
 
 
 @pytest.mark.parametrize("name", ["yaw_motor_current_a", "pitch_servo_a", "gyro_temperature_c"])
 def test_a_cause_may_be_named_after_what_it_turns_or_warms(name):
-    found, notes = roles.prepared(track(**{name: RAMP}))
+    found, notes = roles.prepare_columns(track(**{name: RAMP}))
     assert list(found.covariates) == [name]
     assert notes == ()
 
@@ -150,7 +150,7 @@ def test_a_cause_may_be_named_after_what_it_turns_or_warms(name):
     st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=5, max_size=5),
 )
 def test_no_column_is_kept_that_is_not_finite(name, values):
-    found, notes = roles.prepared(track(5, **{f"x{name}": np.array(values)}))
+    found, notes = roles.prepare_columns(track(5, **{f"x{name}": np.array(values)}))
     assert all(np.isfinite(column).all() for column in found.covariates.values())
     if not np.isfinite(values).all() and np.isfinite(values).any():
         assert len(found.covariates) + len(notes) == 1

@@ -11,8 +11,12 @@ from told_facts import only, value
 from tracks import experiment, track_of
 
 from ahrsd import so3
-from ahrsd.diagnosis.data_quality.axes_and_units import as_recorded, ranked, windows
-from ahrsd.diagnosis.data_quality.preparation import facts_of, put_right, would_have_shown
+from ahrsd.diagnosis.data_quality.axes_and_units import (
+    axis_and_unit_errors,
+    rank_frames,
+    window_equations,
+)
+from ahrsd.diagnosis.data_quality.preparation import correct_track, detectable_faults, find_facts
 from ahrsd.diagnosis.track import Track
 
 MIRRORED = [[1, 0, 0], [0, -1, 0], [0, 0, 1]]
@@ -32,11 +36,11 @@ QUARTER = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
 )
 def test_a_wrong_frame_is_named_and_undone(track: Track, axes: list[int], signs: list[int]) -> None:
     wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s[:, axes] * np.array(signs))
-    fact = only(facts_of(wrong))
+    fact = only(find_facts(wrong))
     assert fact.effect == "frame_error"
     assert fact.stops
     assert fact.confidence > 0.9
-    assert np.array_equal(put_right(wrong, (fact,)).gyro_b_rad_s, track.gyro_b_rad_s)
+    assert np.array_equal(correct_track(wrong, (fact,)).gyro_b_rad_s, track.gyro_b_rad_s)
 
 
 def test_a_turn_at_a_constant_rate_says_nothing_of_axes_and_unit() -> None:
@@ -51,13 +55,13 @@ def test_a_turn_at_a_constant_rate_says_nothing_of_axes_and_unit() -> None:
     dt_s = np.full(len(h), 1 / 40.0)
     dt_s[0] = np.nan
     spin = Track(time_s, dt_s, mag, gyro, None, {}, (slice(0, len(h)),))
-    assert [fact.words for fact in facts_of(spin)] == []
-    assert any("would not have been seen" in line for line in would_have_shown(spin))
+    assert [fact.words for fact in find_facts(spin)] == []
+    assert any("would not have been seen" in line for line in detectable_faults(spin))
 
 
 def test_left_handed_axes_are_called_so(track: Track) -> None:
     wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s * np.array([1.0, 1.0, -1.0]))
-    assert "left-handed" in only(facts_of(wrong)).words
+    assert "left-handed" in only(find_facts(wrong)).words
 
 
 @pytest.mark.parametrize(
@@ -73,7 +77,7 @@ def test_a_mirrored_magnetometer_is_no_turned_gyro(read: list[list[int]], words:
     """By gyro and field alone m and -m are the same; gravity tells, or every heading is off."""
     made = track_of(experiment("wam", samples=3000))
     wrong = replace(made, mag_b_gauss=made.mag_b_gauss @ np.array(read, float).T)
-    fact = only(facts_of(wrong))
+    fact = only(find_facts(wrong))
     assert fact.effect == "frame_error"
     assert words in fact.words
     assert fact.where.frame == "sensor"
@@ -84,7 +88,7 @@ def test_a_mirrored_magnetometer_is_no_turned_gyro(read: list[list[int]], words:
 def test_without_gravity_nobody_is_told_to_turn_a_sensor() -> None:
     made = track_of(experiment("wam", samples=3000))
     wrong = replace(made, mag_b_gauss=made.mag_b_gauss * np.array([1.0, -1.0, 1.0]))
-    words = only(facts_of(replace(wrong, accel_b_m_s2=None))).words
+    words = only(find_facts(replace(wrong, accel_b_m_s2=None))).words
     assert "or the magnetometer is left-handed (negate its y)" in words
     assert "180 deg" in words
 
@@ -92,7 +96,7 @@ def test_without_gravity_nobody_is_told_to_turn_a_sensor() -> None:
 def test_a_turned_gyro_is_told_by_the_accelerometer() -> None:
     made = track_of(experiment("wam", samples=3000))
     wrong = replace(made, gyro_b_rad_s=made.gyro_b_rad_s * np.array([-1.0, 1.0, -1.0]))
-    fact = only(facts_of(wrong))
+    fact = only(find_facts(wrong))
     assert fact.words == "the gyro's x y z are the magnetometer's -x y -z and the accelerometer's"
     assert fact.where.frame == "gyro"
 
@@ -113,7 +117,7 @@ def test_a_magnetometer_that_is_askew_is_told_with_its_angle(
     whole = track_of(experiment("mam", samples=6000, seed=3))
     R_mg = so3.exp(np.radians([turn_deg]))[0]
     turned = replace(whole, mag_b_gauss=whole.mag_b_gauss @ R_mg.T)
-    fact = only(facts_of(turned))
+    fact = only(find_facts(turned))
     assert fact.effect == "mag_gyro_misalignment"
     assert fact.stops
     found = np.degrees([value.value for value in fact.parameters])
@@ -131,39 +135,39 @@ def test_without_gravity_either_sensor_may_be_askew() -> None:
     whole = track_of(experiment("mam", samples=6000, seed=3))
     R_mg = so3.exp(np.radians([[0.0, 0.0, 45.0]]))[0]
     turned = replace(whole, mag_b_gauss=whole.mag_b_gauss @ R_mg.T, accel_b_m_s2=None)
-    assert "or the gyro is the one that is turned" in only(facts_of(turned)).words
+    assert "or the gyro is the one that is turned" in only(find_facts(turned)).words
 
 
 def test_a_crooked_mount_of_five_degrees_is_no_wrong_frame() -> None:
     """The search names it with its deviation, and what is fitted beside it means something."""
     whole = track_of(experiment("mam", samples=6000, seed=3))
     R_mg = so3.exp(np.radians([[0.0, 5.0, 0.0]]))[0]
-    assert as_recorded(replace(whole, mag_b_gauss=whole.mag_b_gauss @ R_mg.T)) == []
+    assert axis_and_unit_errors(replace(whole, mag_b_gauss=whole.mag_b_gauss @ R_mg.T)) == []
 
 
 def test_iron_that_deforms_favours_no_other_frame() -> None:
     """A slow turn of half a period; the frames' fit leaves out iron that deforms by a fifth."""
     made = experiment("wam", motion="slow", seed=0, samples=10_000, rate_hz=100.0, sigma_gyro=5e-3)
-    assert facts_of(track_of(made)) == ()
+    assert find_facts(track_of(made)) == ()
 
 
 def test_degrees_and_swapped_axes_together(track: Track) -> None:
     wrong = replace(track, gyro_b_rad_s=np.degrees(track.gyro_b_rad_s[:, [1, 0, 2]]))
-    facts = facts_of(wrong)
+    facts = find_facts(wrong)
     assert {fact.effect for fact in facts} == {"frame_error", "unit_error"}
     unit = next(fact for fact in facts if fact.effect == "unit_error")
     assert abs(value(unit) / (180 / np.pi - 1) - 1) < 1e-9
     assert "deg/s" in unit.words
-    assert np.abs(put_right(wrong, facts).gyro_b_rad_s - track.gyro_b_rad_s).max() < 1e-12
+    assert np.abs(correct_track(wrong, facts).gyro_b_rad_s - track.gyro_b_rad_s).max() < 1e-12
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("uT", 100.0), ("mG", 1e3), ("nT", 1e5), ("T", 1e-4)])
 def test_the_magnetometers_unit_by_the_earths_field(track: Track, unit: str, factor: float) -> None:
     wrong = replace(track, mag_b_gauss=track.mag_b_gauss * factor)
-    facts = [fact for fact in facts_of(wrong) if fact.effect == "unit_error"]
+    facts = [fact for fact in find_facts(wrong) if fact.effect == "unit_error"]
     fact = only(tuple(facts))
     assert fact.setting == {"sensor": "mag", "unit": unit}
-    right = put_right(wrong, facts).mag_b_gauss
+    right = correct_track(wrong, facts).mag_b_gauss
     assert np.abs(right / track.mag_b_gauss - 1).max() < 1e-12
 
 
@@ -176,15 +180,15 @@ def test_a_quiet_motion_does_not_tell_the_frame() -> None:
         mag_b_gauss=np.array([0.2, 0.1, 0.4]) + 1e-3 * rng.standard_normal((2000, 3)),
         gyro_b_rad_s=1e-3 * rng.standard_normal((2000, 3)),
     )
-    assert facts_of(at_rest) == ()
-    assert "hardly turned" in would_have_shown(at_rest)[-1]
-    assert "left-handed" in would_have_shown(track_of(made))[-1]
+    assert find_facts(at_rest) == ()
+    assert "hardly turned" in detectable_faults(at_rest)[-1]
+    assert "left-handed" in detectable_faults(track_of(made))[-1]
 
 
 def test_frames_are_ranked_with_their_scale(track: Track) -> None:
-    found = windows(track)
+    found = window_equations(track)
     assert found is not None
-    order = ranked(found)
+    order = rank_frames(found)
     assert len(order) == 24  # of each frame and its negative one has a positive scale
     assert order[0].is_identity
     assert 0.7 < order[0].scale < 1.3
@@ -197,10 +201,10 @@ def test_degrees_are_told_where_noise_hides_most_of_the_turns() -> None:
     noise = 0.06 * np.random.default_rng(1).standard_normal((len(track), 3))
     loud = replace(track, mag_b_gauss=track.mag_b_gauss + noise)
     degrees = replace(loud, gyro_b_rad_s=np.degrees(loud.gyro_b_rad_s))
-    assert 0.6 < ranked(windows(degrees))[0].cost < 0.95
-    found = [fact for fact in as_recorded(degrees) if fact.effect == "unit_error"]
+    assert 0.6 < rank_frames(window_equations(degrees))[0].cost < 0.95
+    found = [fact for fact in axis_and_unit_errors(degrees) if fact.effect == "unit_error"]
     assert [fact.setting for fact in found] == [{"sensor": "gyro", "unit": "deg/s"}]
-    assert as_recorded(loud) == []
+    assert axis_and_unit_errors(loud) == []
 
 
 @pytest.mark.parametrize("factor", [25.0, 1 / 25.0, 3.0])
@@ -208,10 +212,10 @@ def test_rates_that_are_off_by_the_factor_of_no_unit_may_be_the_time(
     track: Track, factor: float
 ) -> None:
     wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s * factor)
-    fact = only(tuple(facts_of(wrong)))
+    fact = only(tuple(find_facts(wrong)))
     assert fact.effect == "unit_error"
     assert "in another unit, or the time is" in fact.words
-    right = put_right(wrong, [fact]).gyro_b_rad_s
+    right = correct_track(wrong, [fact]).gyro_b_rad_s
     assert np.abs(right / track.gyro_b_rad_s - 1).max() < 0.1
 
 
@@ -221,8 +225,8 @@ def test_a_magnet_that_is_put_on_and_off_is_no_unit_of_the_gyro(track: Track) ->
     middle, end = 0.4 * t[-1], 0.7 * t[-1]
     put = np.clip((t - middle) / 2.0, 0.0, 1.0) - np.clip((t - end) / 2.0, 0.0, 1.0)
     near = replace(track, mag_b_gauss=track.mag_b_gauss + 3.0 * put[:, None] * [0.6, -0.64, 0.48])
-    assert not 0.5 < ranked(windows(near))[0].scale < 2.0
-    assert [one for one in facts_of(near) if one.effect == "unit_error"] == []
+    assert not 0.5 < rank_frames(window_equations(near))[0].scale < 2.0
+    assert [one for one in find_facts(near) if one.effect == "unit_error"] == []
 
 
 def test_a_turn_about_one_axis_tells_that_axes_are_wrong_and_not_which() -> None:
@@ -240,8 +244,8 @@ def test_a_turn_about_one_axis_tells_that_axes_are_wrong_and_not_which() -> None
         usual, time_s=t, dt_s=dt_s, mag_b_gauss=field, gyro_b_rad_s=gyro, accel_b_m_s2=None,
         covariates={}, runs=(slice(0, 2400),),
     )  # fmt: skip
-    assert as_recorded(plain) == []
-    fact = only(tuple(as_recorded(replace(plain, mag_b_gauss=field[:, [1, 0, 2]]))))
+    assert axis_and_unit_errors(plain) == []
+    fact = only(tuple(axis_and_unit_errors(replace(plain, mag_b_gauss=field[:, [1, 0, 2]]))))
     assert fact.effect == "frame_error"
     assert fact.confidence == 0.99
     assert fact.words.startswith("the gyro's x y z are the magnetometer's x y -z (left-handed)")

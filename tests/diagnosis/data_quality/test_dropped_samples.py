@@ -10,16 +10,16 @@ from tracks import experiment, track_of, true_model
 
 from ahrsd.diagnosis.data_quality.dropped_samples import (
     UNSEEN,
-    Means,
-    _JumpsOfRows,
-    _put_right,
-    missing_turns,
-    recovered,
-    some_lost,
-    surplus,
-    whole_nats,
+    JumpMeans,
+    _apply_jumps,
+    _RowJumps,
+    count_from_all_jumps,
+    find_lost_turns,
+    forward_excess_evidence,
+    recover_lost_steps,
+    whole_step_evidence,
 )
-from ahrsd.diagnosis.data_quality.preparation import put_right
+from ahrsd.diagnosis.data_quality.preparation import correct_track
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 
 GYRO_RAD_S = 2e-4  # of a filter that believes its gyro: what is lost stays with it for long
@@ -53,7 +53,7 @@ def near(rows: np.ndarray, others: np.ndarray, within: int) -> int:
 @pytest.mark.parametrize(("motion", "share"), [("mam", 0.01), ("lam", 0.004)])
 def test_what_the_first_ones_hid_is_found_where_it_was_lost(motion: str, share: float) -> None:
     done, rate, lost = lossy(motion, share, 3e-4)
-    found = recovered(done, rate, np.zeros(len(lost), dtype=np.int64))
+    found = recover_lost_steps(done, rate, np.zeros(len(lost), dtype=np.int64))
     rows, truth = np.flatnonzero(found.lost), np.flatnonzero(lost)
     seen = truth[found.missed[truth] < 0.5]
     assert near(rows, truth, 2) >= 0.96 * len(rows)  # 83 of 86 and 33 of 34 here
@@ -65,7 +65,7 @@ def test_what_the_first_ones_hid_is_found_where_it_was_lost(motion: str, share: 
 def test_nothing_is_lost_where_nothing_was() -> None:
     done, rate, lost = lossy("mam", 0.0, 3e-4)
     assert not lost.any()
-    assert not recovered(done, rate, np.zeros(len(lost), dtype=np.int64)).lost.any()
+    assert not recover_lost_steps(done, rate, np.zeros(len(lost), dtype=np.int64)).lost.any()
 
 
 def test_rows_without_a_reading_say_nothing_and_hide_none_elsewhere() -> None:
@@ -73,7 +73,7 @@ def test_rows_without_a_reading_say_nothing_and_hide_none_elsewhere() -> None:
     mag = done.track.mag_b_gauss.copy()
     mag[4000:4200] = np.nan
     blind = run_filter(replace(done.track, mag_b_gauss=mag), done.model)
-    found = recovered(blind, rate, np.zeros(len(lost), dtype=np.int64))
+    found = recover_lost_steps(blind, rate, np.zeros(len(lost), dtype=np.int64))
     assert not found.lost[4000:4200].any()
     assert (found.missed[4000:4200] == 1.0).all()
     seen = np.flatnonzero(lost[:3900])
@@ -83,7 +83,7 @@ def test_rows_without_a_reading_say_nothing_and_hide_none_elsewhere() -> None:
 @pytest.mark.parametrize("motion", ["mam", "lam", "wam"])
 def test_turns_of_which_none_stands_out_are_known_by_all_together(motion: str) -> None:
     done, rate, lost = lossy(motion, 0.004, 3e-3)
-    (fact,) = missing_turns(done, rate)
+    (fact,) = find_lost_turns(done, rate)
     assert UNSEEN in fact.setting
     assert "by all jumps together" in fact.words
     (part,) = fact.parameters
@@ -96,8 +96,8 @@ def test_a_gyro_that_reads_too_little_has_lost_nothing(motion: str, sigma_gauss:
     done, rate, _ = lossy(motion, 0.0, sigma_gauss)
     gyro = done.model.gyro_bias_rad_s + 0.98 * rate
     slow = run_filter(replace(done.track, gyro_b_rad_s=gyro), done.model)
-    assert some_lost(done, rate) == 0.0
-    assert some_lost(slow, 0.98 * rate) == 0.0
+    assert count_from_all_jumps(done, rate) == 0.0
+    assert count_from_all_jumps(slow, 0.98 * rate) == 0.0
 
 
 def jumps_at(starts: list[int], step: float) -> float:
@@ -106,7 +106,7 @@ def jumps_at(starts: list[int], step: float) -> float:
     for start in starts:
         near[start - 24 : start + 24] = 1.0 - np.abs(np.arange(-24, 24)) / 24.0
     z = step * size * near + np.sqrt(size) * np.random.default_rng(4).normal(size=9000)
-    return surplus(Means(24, np.arange(9000), z, size, np.full(9000, 2.0)))[0]
+    return forward_excess_evidence(JumpMeans(24, np.arange(9000), z, size, np.full(9000, 2.0)))[0]
 
 
 def test_many_jumps_of_one_step_ahead_are_lost_turns_and_others_are_not() -> None:
@@ -120,11 +120,11 @@ def test_many_jumps_of_one_step_ahead_are_lost_turns_and_others_are_not() -> Non
 
 def test_a_step_that_was_counted_twice_is_taken_back_and_none_that_was_lost() -> None:
     done, rate, lost = lossy("mam", 0.004, 3e-4)
-    right = recovered(done, rate, np.zeros(len(lost), dtype=np.int64))
+    right = recover_lost_steps(done, rate, np.zeros(len(lost), dtype=np.int64))
     rows = np.flatnonzero(right.lost)
     twice = right.lost.copy()
     twice[rows[5:25:5] + 1] += 1
-    again = recovered(done, rate, twice)
+    again = recover_lost_steps(done, rate, twice)
     assert np.array_equal(again.lost[rows], right.lost[rows])
     others = np.setdiff1d(np.flatnonzero(again.lost), rows)  # one, of a slow turn, here
     assert len(others) <= 1
@@ -146,7 +146,7 @@ def test_what_may_have_been_missed_is_noise_of_the_turn() -> None:
 
 def test_a_fact_says_how_many_it_expects_beyond_those_it_found() -> None:
     done, rate, lost = lossy("wam", 0.004, 1e-3)
-    (fact,) = missing_turns(done, rate)
+    (fact,) = find_lost_turns(done, rate)
     found = np.round(fact.turned) - 1
     assert (fact.unseen[found > 0] == 0.0).all()
     assert (fact.unseen >= 0.0).all()
@@ -156,8 +156,8 @@ def test_a_fact_says_how_many_it_expects_beyond_those_it_found() -> None:
 def test_a_step_is_not_taken_back_twice() -> None:
     lost = np.array([0, 0, 1, 0, 0])
     none = np.zeros(5)
-    found = _JumpsOfRows(np.full(5, -1), none, np.ones(5, dtype=np.int64), none)
-    assert _put_right(lost, found, np.array([1, 3])).tolist() == [0, 0, 0, 0, 0]
+    found = _RowJumps(np.full(5, -1), none, np.ones(5, dtype=np.int64), none)
+    assert _apply_jumps(lost, found, np.array([1, 3])).tolist() == [0, 0, 0, 0, 0]
 
 
 def test_the_tail_of_noise_is_no_whole_step() -> None:
@@ -167,9 +167,9 @@ def test_the_tail_of_noise_is_no_whole_step() -> None:
     noise = 0.18 * rng.standard_normal(400_000)
     tail = noise[noise > 0.7][:9]
     assert len(tail) == 9
-    assert whole_nats(whole, scatter) > 12.0
-    assert whole_nats(tail, scatter) < 0.0
-    assert whole_nats(np.array([2.0, 1.0]), np.full(2, 0.1)) > whole_nats(
+    assert whole_step_evidence(whole, scatter) > 12.0
+    assert whole_step_evidence(tail, scatter) < 0.0
+    assert whole_step_evidence(np.array([2.0, 1.0]), np.full(2, 0.1)) > whole_step_evidence(
         np.array([0.75, 0.8]), np.full(2, 0.1)
     )
 
@@ -180,15 +180,15 @@ def test_missing_samples_without_a_gap_in_the_stamps() -> None:
     model = replace(true_model(made), sigma_mag_gauss=5e-4)
     keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.01)
     cut = without_rows(track, keep, restamp=True)
-    facts = missing_turns(run_filter(cut, model), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
+    facts = find_lost_turns(run_filter(cut, model), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
     fact = only(tuple(facts))
     assert fact.effect == "dropped_samples"
     assert 0.004 < value(fact) < 0.02
-    right = put_right(cut, (fact,))
+    right = correct_track(cut, (fact,))
     turned = np.linalg.norm(right.gyro_b_rad_s, axis=1) / np.linalg.norm(cut.gyro_b_rad_s, axis=1)
     assert np.count_nonzero(turned > 1.9) == len(fact.where.intervals_s)
     rate = track.gyro_b_rad_s - model.gyro_bias_rad_s
-    assert missing_turns(run_filter(track, model), rate) == []
+    assert find_lost_turns(run_filter(track, model), rate) == []
 
 
 def test_missing_samples_of_a_slow_motion_are_seen_over_more_samples() -> None:
@@ -197,7 +197,7 @@ def test_missing_samples_of_a_slow_motion_are_seen_over_more_samples() -> None:
     model = replace(true_model(made), sigma_mag_gauss=3e-4)
     keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.015)
     cut = without_rows(track, keep, restamp=True)
-    facts = missing_turns(run_filter(cut, model), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
+    facts = find_lost_turns(run_filter(cut, model), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
     assert abs(value(only(tuple(facts))) - 0.015) < 0.008
 
 
@@ -213,7 +213,7 @@ def test_missing_samples_are_seen_where_whole_seconds_are_missing_too() -> None:
     cut = without_rows(track, np.flatnonzero(kept), restamp=True)
     # as slow as a filter is that believes its gyro
     slow = replace(model, sigma_gyro_rad_s=1e-4)
-    facts = missing_turns(run_filter(cut, slow), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
+    facts = find_lost_turns(run_filter(cut, slow), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
     fact = only(tuple(facts))
     assert fact.effect == "dropped_samples"
     assert 4 <= fact.setting["long"] <= 10
@@ -231,7 +231,7 @@ def test_three_lost_samples_are_told_where_they_are(motion: str) -> None:
             rows.append(row)
     cut = without_rows(track, np.delete(np.arange(len(track)), rows), restamp=True)
     slow = replace(model, sigma_gyro_rad_s=GYRO_RAD_S)
-    facts = missing_turns(run_filter(cut, slow), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
+    facts = find_lost_turns(run_filter(cut, slow), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
     fact = only(tuple(facts))
     told_s = [end for _, end in fact.where.intervals_s]
     at_s = [cut.time_s[row - k] for k, row in enumerate(sorted(rows))]

@@ -5,15 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Where
-from ahrsd.diagnosis.data_quality.facts import Fact, around, lost_at, spans_of
+from ahrsd.diagnosis.data_quality.facts import (
+    Fact,
+    burst_is_explained,
+    lost_turn_intervals,
+    row_intervals,
+)
 from ahrsd.samples import Array
 
 
 def test_spans() -> None:
     rows = np.array([0, 1, 1, 0, 1, 0, 0, 1], dtype=bool)
-    assert spans_of(rows) == [(1, 3), (4, 5), (7, 8)]
-    assert spans_of(rows, 1) == [(1, 5), (7, 8)]
-    assert spans_of(rows[:1]) == []
+    assert row_intervals(rows) == [(1, 3), (4, 5), (7, 8)]
+    assert row_intervals(rows, 1) == [(1, 5), (7, 8)]
+    assert row_intervals(rows[:1]) == []
 
 
 def test_a_burst_around_a_lost_turn_is_what_that_leaves() -> None:
@@ -21,10 +26,10 @@ def test_a_burst_around_a_lost_turn_is_what_that_leaves() -> None:
         return Fact(effect, "", Where(spans, ("x",), "link"), 1.0, turned=turned)
 
     lost = told("dropped_samples", (20.0, 20.04), (313.1, 313.14), turned=np.ones(3))
-    moments = lost_at([lost])
+    moments = lost_turn_intervals([lost])
     assert moments == [(20.0, 20.04), (313.1, 313.14)]
-    assert around(told("noise_burst", (313.0, 314.0)), moments)
-    assert not around(told("noise_burst", (313.0, 314.0), (400.0, 402.0)), moments)
-    assert not around(told("noise_level", (0.0, 400.0)), moments)
+    assert burst_is_explained(told("noise_burst", (313.0, 314.0)), moments)
+    assert not burst_is_explained(told("noise_burst", (313.0, 314.0), (400.0, 402.0)), moments)
+    assert not burst_is_explained(told("noise_level", (0.0, 400.0)), moments)
     stuck = told("stuck_magnetometer", (313.0, 314.0))
-    assert not around(told("noise_burst", (313.0, 314.0)), lost_at([stuck]))
+    assert not burst_is_explained(told("noise_burst", (313.0, 314.0)), lost_turn_intervals([stuck]))

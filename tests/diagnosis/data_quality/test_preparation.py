@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from tracks import experiment, recorded, track_of
 
-from ahrsd.diagnosis.data_quality.facts import matters
-from ahrsd.diagnosis.data_quality.preparation import facts_of
+from ahrsd.diagnosis.data_quality.facts import is_finding
+from ahrsd.diagnosis.data_quality.preparation import find_facts
 
 CLEAN = (
     "broad/01_undisturbed_slow_rotation_A",
@@ -26,10 +26,10 @@ CLEAN = (
 def test_nothing_on_simulated_nulls(scenario: str, motion: str, sigma: float) -> None:
     for seed in range(6):
         made = experiment(scenario, motion=motion, seed=seed, samples=5000, sigma_gyro=sigma)
-        assert facts_of(track_of(made)) == ()
+        assert find_facts(track_of(made)) == ()
 
 
 @pytest.mark.parametrize("name", CLEAN)
 @pytest.mark.recordings
 def test_nothing_that_matters_on_clean_recordings(name: str) -> None:
-    assert [fact.words for fact in facts_of(recorded(name)) if matters(fact)] == []
+    assert [fact.words for fact in find_facts(recorded(name)) if is_finding(fact)] == []

@@ -9,8 +9,12 @@ import pytest
 from told_facts import only, value
 
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
-from ahrsd.diagnosis.data_quality.preparation import facts_of, put_right
-from ahrsd.diagnosis.data_quality.range_and_resolution import clipping, quantisation, step_of
+from ahrsd.diagnosis.data_quality.preparation import correct_track, find_facts
+from ahrsd.diagnosis.data_quality.range_and_resolution import (
+    find_clipping,
+    find_quantisation,
+    quantisation_step,
+)
 from ahrsd.diagnosis.track import Track
 
 
@@ -20,17 +24,17 @@ def test_a_limit_that_the_sensor_stays_near_for_long(track: Track) -> None:
     mag = 0.3 + 0.02 * np.sin(0.02 * track.time_s)[:, None] * np.array([1.0, 0.6, -0.4])
     mag += 5e-4 * rng.standard_normal(mag.shape)
     slow = replace(track, mag_b_gauss=mag, gyro_b_rad_s=1e-4 * rng.standard_normal(mag.shape))
-    assert clipping(slow) == []
+    assert find_clipping(slow) == []
     ends = mag.copy()
     ends[:, 0] = np.minimum(mag[:, 0], np.quantile(mag[:, 0], 0.97))
-    (fact,) = clipping(replace(slow, mag_b_gauss=ends))
+    (fact,) = find_clipping(replace(slow, mag_b_gauss=ends))
     assert fact.effect == "mag_saturation"
     assert value(fact) == ends[:, 0].max()
     assert fact.where.axes == ("x",)
     stuck = mag.copy()
     at = int(np.argmax(mag[:, 0]))
     stuck[at : at + 40] = mag[at]
-    assert clipping(replace(slow, mag_b_gauss=stuck)) == []
+    assert find_clipping(replace(slow, mag_b_gauss=stuck)) == []
 
 
 def test_noise_that_is_added_behind_a_limit_hides_none_of_what_stands_there(track: Track) -> None:
@@ -38,7 +42,7 @@ def test_noise_that_is_added_behind_a_limit_hides_none_of_what_stands_there(trac
     rng = np.random.default_rng(6)
     clean = np.clip(track.mag_b_gauss, -0.3, 0.3)
     mag = np.clip(clean + 8e-4 * rng.standard_normal(clean.shape), -0.3, 0.3)
-    (fact,) = clipping(replace(track, mag_b_gauss=mag))
+    (fact,) = find_clipping(replace(track, mag_b_gauss=mag))
     at_limit = (np.abs(clean) == 0.3).any(axis=1)
     assert np.count_nonzero(at_limit) > 500
     assert fact.bad is not None
@@ -48,19 +52,19 @@ def test_noise_that_is_added_behind_a_limit_hides_none_of_what_stands_there(trac
 
 def test_saturation_of_both_sensors(track: Track) -> None:
     mag = np.clip(track.mag_b_gauss, -np.inf, 0.3)
-    fact = only(facts_of(replace(track, mag_b_gauss=mag)))
+    fact = only(find_facts(replace(track, mag_b_gauss=mag)))
     assert fact.effect == "mag_saturation"
     assert value(fact) == 0.3
     assert fact.bad is not None
     assert fact.bad[(mag == 0.3).any(axis=1)].all()
     assert not fact.bad[(np.abs(mag) < 0.29).all(axis=1)].any()
     top = 0.7 * float(np.abs(track.gyro_b_rad_s).max())
-    fact = only(facts_of(replace(track, gyro_b_rad_s=np.clip(track.gyro_b_rad_s, -top, top))))
+    fact = only(find_facts(replace(track, gyro_b_rad_s=np.clip(track.gyro_b_rad_s, -top, top))))
     assert fact.effect == "gyro_saturation"
     assert fact.turned is not None
     clipped = np.max(np.abs(track.gyro_b_rad_s), axis=1) >= top
     assert np.isnan(fact.turned[clipped]).all()
-    right = put_right(track, (fact,))
+    right = correct_track(track, (fact,))
     assert np.isnan(right.dt_s[clipped]).all()
     assert sum(run.stop - run.start for run in right.runs) == len(track)
     assert len(right.runs) > 2
@@ -69,11 +73,11 @@ def test_saturation_of_both_sensors(track: Track) -> None:
 
 def test_coarse_steps(track: Track) -> None:
     coarse = replace(track, mag_b_gauss=np.round(track.mag_b_gauss / 0.01) * 0.01)
-    fact = only(facts_of(coarse))  # neither a limit nor a stuck sensor, though readings repeat
+    fact = only(find_facts(coarse))  # neither a limit nor a stuck sensor, though readings repeat
     assert fact.effect == "mag_quantisation"
     assert abs(value(fact) / 0.01 - 1) < 1e-6
     fine = replace(track, mag_b_gauss=np.round(track.mag_b_gauss / 1e-4) * 1e-4)
-    assert facts_of(fine) == ()
+    assert find_facts(fine) == ()
 
 
 def test_steps_so_coarse_that_most_seconds_show_no_change(track: Track) -> None:
@@ -82,24 +86,24 @@ def test_steps_so_coarse_that_most_seconds_show_no_change(track: Track) -> None:
     slow += np.random.default_rng(6).normal(0, 5e-4, slow.shape)
     coarse = replace(track, mag_b_gauss=np.round(slow / 0.02) * 0.02)
     assert noise_of_differences(coarse)[0] == 0.0
-    [fact] = quantisation(coarse)
+    [fact] = find_quantisation(coarse)
     assert abs(value(fact) / 0.02 - 1) < 1e-6
     # a sensor that stands for three seconds each has no change either, but then it jumps
     stood = np.random.default_rng(7).integers(100, 200, (len(track) // 120 + 1, 3))
     stuck = replace(track, mag_b_gauss=np.repeat(1e-3 * stood, 120, axis=0)[: len(track)])
     assert noise_of_differences(stuck)[0] == 0.0
-    assert abs(step_of(stuck.mag_b_gauss[:, 1]) / 1e-3 - 1) < 1e-6
-    assert quantisation(stuck) == []
+    assert abs(quantisation_step(stuck.mag_b_gauss[:, 1]) / 1e-3 - 1) < 1e-6
+    assert find_quantisation(stuck) == []
 
 
 def test_a_gyro_s_limit_near_its_noise(track: Track) -> None:
     """Fine numbers repeat at a limit only."""
     rate = 0.02 * np.sin(track.time_s)[:, None] * np.array([1.0, 0.5, 0.2])
     noisy = rate + 0.005 * np.random.default_rng(4).standard_normal(rate.shape)
-    fact = only(clipping(replace(track, gyro_b_rad_s=np.clip(noisy, -0.024, 0.024))))
+    fact = only(find_clipping(replace(track, gyro_b_rad_s=np.clip(noisy, -0.024, 0.024))))
     assert fact.effect == "gyro_saturation"
     assert value(fact) == 0.024
-    assert clipping(replace(track, gyro_b_rad_s=noisy)) == []
+    assert find_clipping(replace(track, gyro_b_rad_s=noisy)) == []
 
 
 def test_a_limit_with_noise_behind_it(track: Track) -> None:
@@ -110,7 +114,7 @@ def test_a_limit_with_noise_behind_it(track: Track) -> None:
     noise = 3e-4 * rng.standard_normal(rate.shape)
     bias = np.array([1e-3, -5e-4, 2e-4])
     clipped = np.clip(rate, -top, top) + bias + noise
-    fact = only(clipping(replace(track, gyro_b_rad_s=clipped)))
+    fact = only(find_clipping(replace(track, gyro_b_rad_s=clipped)))
     assert fact.effect == "gyro_saturation"
     assert value(fact) == pytest.approx(top, abs=2e-3)
     assert fact.turned is not None
@@ -120,4 +124,4 @@ def test_a_limit_with_noise_behind_it(track: Track) -> None:
     # a vehicle that always turns at one rate, to either side
     turning = rate + bias + noise
     turning[:, 2] = np.clip(rate[:, 2], -top, top) + noise[:, 2]
-    assert clipping(replace(track, gyro_b_rad_s=turning)) == []
+    assert find_clipping(replace(track, gyro_b_rad_s=turning)) == []

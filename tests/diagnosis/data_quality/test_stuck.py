@@ -9,15 +9,15 @@ import pytest
 from told_facts import only, value
 from tracks import experiment, recorded, track_of
 
-from ahrsd.diagnosis.data_quality.facts import matters
-from ahrsd.diagnosis.data_quality.preparation import facts_of, put_right
+from ahrsd.diagnosis.data_quality.facts import is_finding
+from ahrsd.diagnosis.data_quality.preparation import correct_track, find_facts
 from ahrsd.diagnosis.data_quality.stuck import (
-    dead,
-    dead_axes,
-    stuck_axes,
-    stuck_gyro,
-    turned_gauss,
-    without_impossible,
+    dead_axis_notes,
+    dead_sensor_reason,
+    expected_change_gauss,
+    find_stuck_axes,
+    find_stuck_gyro,
+    without_impossible_readings,
 )
 from ahrsd.diagnosis.track import Track
 
@@ -28,14 +28,14 @@ def _no_rows(track: Track) -> np.ndarray:
 
 def test_a_magnetometer_that_never_changes_while_the_gyro_turns(track: Track) -> None:
     still = replace(track, mag_b_gauss=np.full_like(track.mag_b_gauss, 0.2))
-    why = dead(still)
+    why = dead_sensor_reason(still)
     assert why is not None
     assert "the magnetometer reads 0.2 0.2 0.2 gauss in every row while the gyro turns by" in why
 
 
 def test_neither_ever_changes(track: Track) -> None:
     same = np.ones_like(track.mag_b_gauss)
-    why = dead(replace(track, mag_b_gauss=0.2 * same, gyro_b_rad_s=0.0 * same))
+    why = dead_sensor_reason(replace(track, mag_b_gauss=0.2 * same, gyro_b_rad_s=0.0 * same))
     assert why is not None
     assert "reads 0.2 0.2 0.2 gauss and the gyro 0 0 0 rad/s in every row" in why
 
@@ -46,9 +46,9 @@ def test_one_axis_that_never_changes_while_it_turns_is_said(scenario: str, axis:
     track = track_of(experiment(scenario, samples=6000, seed=axis))
     gyro, mag = track.gyro_b_rad_s.copy(), track.mag_b_gauss.copy()
     gyro[:, axis], mag[:, axis] = 0.0, 0.1
-    why = dead(replace(track, gyro_b_rad_s=gyro)) or ""
+    why = dead_sensor_reason(replace(track, gyro_b_rad_s=gyro)) or ""
     assert why.startswith(f"the gyro's {'xyz'[axis]} reads 0 rad/s in every row while the field")
-    why = dead(replace(track, mag_b_gauss=mag)) or ""
+    why = dead_sensor_reason(replace(track, mag_b_gauss=mag)) or ""
     assert why.startswith(f"the magnetometer's {'xyz'[axis]} reads 0.1 gauss in every row")
 
 
@@ -67,11 +67,11 @@ def test_an_axis_that_has_nothing_to_say_may_be_still(iron: float) -> None:
         gyro_b_rad_s=np.column_stack([0.0 * t, 0.0 * t, rate]),
         accel_b_m_s2=None,
     )
-    assert dead(still) is None
+    assert dead_sensor_reason(still) is None
 
 
 def test_a_field_in_no_unit(track: Track) -> None:
-    why = dead(replace(track, mag_b_gauss=1e30 * track.mag_b_gauss))
+    why = dead_sensor_reason(replace(track, mag_b_gauss=1e30 * track.mag_b_gauss))
     assert why is not None
     assert "a field in no unit" in why
 
@@ -85,23 +85,23 @@ def test_a_field_in_no_unit(track: Track) -> None:
 @pytest.mark.recordings
 def test_nothing_is_said_of_sensors_that_work(name: str) -> None:
     real = recorded(name)
-    assert dead(real) is None
-    assert dead_axes(real) == ()
-    assert without_impossible(real) == (real, ())
-    assert stuck_gyro(real) == []
-    assert stuck_axes(real, _no_rows(real)) == []
+    assert dead_sensor_reason(real) is None
+    assert dead_axis_notes(real) == ()
+    assert without_impossible_readings(real) == (real, ())
+    assert find_stuck_gyro(real) == []
+    assert find_stuck_axes(real, _no_rows(real)) == []
 
 
 def test_a_dead_axis_is_said(track: Track) -> None:
     gyro = track.gyro_b_rad_s * np.array([1.0, 1.0, 0.0])
-    (line,) = dead_axes(replace(track, gyro_b_rad_s=gyro))
+    (line,) = dead_axis_notes(replace(track, gyro_b_rad_s=gyro))
     assert line.startswith("the gyro's z reads 0 in every row")
 
 
 def test_an_axis_that_is_stuck_for_a_while_is_not_used(track: Track) -> None:
     mag = track.mag_b_gauss.copy()
     mag[2000:3000, 1] = mag[2000, 1]
-    (fact,) = facts_of(replace(track, mag_b_gauss=mag))
+    (fact,) = find_facts(replace(track, mag_b_gauss=mag))
     assert fact.effect == "stuck_magnetometer"
     assert fact.where.axes == ("y",)
     assert fact.bad is not None
@@ -112,10 +112,10 @@ def test_a_gyro_that_is_stuck_for_a_while_ends_the_run(track: Track) -> None:
     gyro = track.gyro_b_rad_s.copy()
     gyro[2000:3000] = gyro[2000]
     wrong = replace(track, gyro_b_rad_s=gyro)
-    (fact,) = facts_of(wrong)
-    assert not matters(fact)
+    (fact,) = find_facts(wrong)
+    assert not is_finding(fact)
     assert "the gyro repeats one reading while the field turns" in fact.words
-    right = put_right(wrong, (fact,))
+    right = correct_track(wrong, (fact,))
     assert np.isnan(right.dt_s[2001:3000]).all()
     assert np.isfinite(right.dt_s[3000:]).all()
 
@@ -123,7 +123,7 @@ def test_a_gyro_that_is_stuck_for_a_while_ends_the_run(track: Track) -> None:
 def test_readings_of_zero_are_none(track: Track) -> None:
     mag = track.mag_b_gauss.copy()
     mag[3000:] = 0.0
-    (fact,) = facts_of(replace(track, mag_b_gauss=mag))
+    (fact,) = find_facts(replace(track, mag_b_gauss=mag))
     assert fact.effect == "stuck_magnetometer"
     assert fact.bad is not None
     assert fact.bad[3000:].all()
@@ -132,7 +132,7 @@ def test_readings_of_zero_are_none(track: Track) -> None:
 def test_readings_that_no_sensor_gives_are_left_out(track: Track) -> None:
     mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
     mag[50, 0], gyro[70:72, 1] = 1e300, 1e9
-    clean, notes = without_impossible(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro))
+    clean, notes = without_impossible_readings(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro))
     assert [note.split(" beyond")[0] for note in notes] == [
         "1 reading of the magnetometer",
         "2 rates",
@@ -146,20 +146,20 @@ def test_a_stuck_magnetometer(track: Track) -> None:
     mag = track.mag_b_gauss.copy()
     mag[2000:2125] = mag[2000]
     stuck = replace(track, mag_b_gauss=mag)
-    fact = only(facts_of(stuck))
+    fact = only(find_facts(stuck))
     assert fact.effect == "stuck_magnetometer"
     assert abs(value(fact) - 124 * 0.04) < 0.05
     begin, end = fact.where.intervals_s[0]
     assert abs(begin - track.time_s[2000]) < 0.05
     assert abs(end - track.time_s[2124]) < 0.05
-    right = put_right(stuck, (fact,))
+    right = correct_track(stuck, (fact,))
     assert np.isnan(right.mag_b_gauss[2001:2125]).all()
     assert np.isfinite(right.mag_b_gauss[2000]).all()
 
 
 def test_a_held_magnetometer(track: Track) -> None:
     at = np.arange(len(track)) // 4 * 4
-    fact = only(facts_of(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
+    fact = only(find_facts(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
     assert fact.effect == "mag_sample_hold"
     assert fact.setting["hold"] == 4
     assert fact.bad is not None
@@ -172,7 +172,7 @@ def test_a_magnetometer_that_is_read_a_little_more_often_than_it_measures(
 ) -> None:
     count = np.arange(len(track))
     at = np.ceil(np.floor(count / rows + 1e-9) * rows - 1e-9).astype(int)
-    fact = only(facts_of(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
+    fact = only(find_facts(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
     assert fact.effect == "mag_sample_hold"
     assert abs(fact.setting["hold"] - rows) < 0.01
     assert f"only every {fact.setting['hold']:.4g} samples" in fact.words
@@ -184,7 +184,7 @@ def test_numbers_that_repeat_by_chance_are_not_held(track: Track) -> None:
     """As often as of a magnetometer that is held for 1.34 rows."""
     again = np.random.default_rng(3).random(len(track)) < 0.25
     at = np.maximum.accumulate(np.where(again, 0, np.arange(len(track))))
-    assert not facts_of(replace(track, mag_b_gauss=track.mag_b_gauss[at]))
+    assert not find_facts(replace(track, mag_b_gauss=track.mag_b_gauss[at]))
 
 
 @pytest.mark.parametrize("share", [0.005, 0.01, 0.02, 0.05])
@@ -194,7 +194,7 @@ def test_the_few_that_repeat_by_chance_are_no_clock(track: Track, share: float) 
     for seed in range(25):
         again = np.random.default_rng(seed).random(len(track)) < share
         at = np.maximum.accumulate(np.where(again, 0, np.arange(len(track))))
-        told += facts_of(replace(track, mag_b_gauss=track.mag_b_gauss[at]))
+        told += find_facts(replace(track, mag_b_gauss=track.mag_b_gauss[at]))
     assert [fact.words for fact in told] == []
 
 
@@ -202,7 +202,7 @@ def test_a_clock_that_repeats_seldom_is_told(track: Track) -> None:
     """39.2 readings a second in 40 rows."""
     count = np.arange(len(track))
     at = np.ceil(np.floor(count / 1.02 + 1e-9) * 1.02 - 1e-9).astype(int)
-    fact = only(facts_of(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
+    fact = only(find_facts(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
     assert fact.effect == "mag_sample_hold"
     assert "only every 1.02 samples" in fact.words
 
@@ -219,7 +219,7 @@ def test_a_rate_of_its_own_above_100_hz_is_ordinary(track: Track) -> None:
         gyro_b_rad_s=track.gyro_b_rad_s * 400.0 * float(np.nanmedian(track.dt_s)),
         mag_b_gauss=track.mag_b_gauss[at],
     )
-    assert [fact.effect for fact in facts_of(fast)] == []
+    assert [fact.effect for fact in find_facts(fast)] == []
 
 
 def test_doubled_samples(track: Track) -> None:
@@ -227,7 +227,7 @@ def test_doubled_samples(track: Track) -> None:
     doubled = replace(
         track, mag_b_gauss=track.mag_b_gauss[order], gyro_b_rad_s=track.gyro_b_rad_s[order]
     )
-    fact = only(facts_of(doubled))
+    fact = only(find_facts(doubled))
     assert fact.effect == "dropped_samples"
     assert fact.setting == {"doubled": True}
     assert abs(value(fact) - 100 / 6000) < 2e-3
@@ -249,7 +249,7 @@ def test_coarse_numbers_of_a_vehicle_that_turns_about_one_axis_came_once() -> No
     spin = Track(time_s, dt_s, mag, gyro, None, {}, (slice(0, len(h)),))
     again = np.all(mag[1:] == mag[:-1], axis=1) & np.all(gyro[1:] == gyro[:-1], axis=1)
     assert np.count_nonzero(again) > 2e-3 * len(h)
-    assert "dropped_samples" not in [fact.effect for fact in facts_of(spin)]
+    assert "dropped_samples" not in [fact.effect for fact in find_facts(spin)]
 
 
 def test_a_short_stop_of_the_magnetometer_and_another_one_that_no_turn_shows(track: Track) -> None:
@@ -257,7 +257,7 @@ def test_a_short_stop_of_the_magnetometer_and_another_one_that_no_turn_shows(tra
     mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
     mag[2000:2012], mag[3000:3012] = mag[2000], mag[3000]
     gyro[3000:3012] = np.median(gyro, axis=0)
-    fact = only(facts_of(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro)))
+    fact = only(find_facts(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro)))
     assert fact.effect == "stuck_magnetometer"
     assert [begin for begin, _ in fact.where.intervals_s] == [
         track.time_s[2000],
@@ -265,7 +265,7 @@ def test_a_short_stop_of_the_magnetometer_and_another_one_that_no_turn_shows(tra
     ]
     at_rest = track.mag_b_gauss.copy()
     at_rest[3000:3012] = at_rest[3000]
-    assert facts_of(replace(track, mag_b_gauss=at_rest, gyro_b_rad_s=gyro)) == ()
+    assert find_facts(replace(track, mag_b_gauss=at_rest, gyro_b_rad_s=gyro)) == ()
 
 
 @pytest.mark.parametrize(("rate_hz", "rows", "found"), [(286.0, 9, False), (40.0, 12, True)])
@@ -276,9 +276,9 @@ def test_a_reading_that_came_late_is_no_stuck_magnetometer(
     made = track_of(experiment("wam", samples=4000, rate_hz=rate_hz, sigma_mag=5e-5))
     mag = made.mag_b_gauss.copy()
     mag[2000 : 2000 + rows] = mag[2000]
-    facts = facts_of(replace(made, mag_b_gauss=mag))
+    facts = find_facts(replace(made, mag_b_gauss=mag))
     assert [fact.effect for fact in facts] == ["stuck_magnetometer"]
-    assert matters(facts[0]) is found
+    assert is_finding(facts[0]) is found
     assert facts[0].bad is not None
     assert facts[0].bad[2001 : 2000 + rows].all()
 
@@ -289,10 +289,10 @@ def test_readings_that_came_late_again_and_again_are_a_stuck_magnetometer() -> N
     mag = made.mag_b_gauss.copy()
     for first in (1000, 3000, 5000, 7000):
         mag[first : first + 20] = mag[first]
-    (fact,) = facts_of(replace(made, mag_b_gauss=mag))
+    (fact,) = find_facts(replace(made, mag_b_gauss=mag))
     assert fact.effect == "stuck_magnetometer"
     assert fact.parameters[0].value == pytest.approx(0.38, abs=0.006)
-    assert matters(fact)
+    assert is_finding(fact)
 
 
 def test_a_turn_about_the_field_moves_no_reading_however_large_the_hard_iron(track: Track) -> None:
@@ -306,5 +306,5 @@ def test_a_turn_about_the_field_moves_no_reading_however_large_the_hard_iron(tra
         gyro_b_rad_s=rate,
     )
     seconds = 100 * track.step_s
-    assert turned_gauss(still, centre, 100, 200) == pytest.approx(0.0, abs=1e-12)
-    assert turned_gauss(still, np.zeros(3), 100, 200) == pytest.approx(0.4 * seconds)
+    assert expected_change_gauss(still, centre, 100, 200) == pytest.approx(0.0, abs=1e-12)
+    assert expected_change_gauss(still, np.zeros(3), 100, 200) == pytest.approx(0.4 * seconds)

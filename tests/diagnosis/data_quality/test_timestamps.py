@@ -15,9 +15,13 @@ from tracks import experiment, track_of
 
 from ahrsd import so3
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.data_quality.facts import matters
-from ahrsd.diagnosis.data_quality.preparation import facts_of, put_right
-from ahrsd.diagnosis.data_quality.timestamps import regular, stamps, without_jumps
+from ahrsd.diagnosis.data_quality.facts import is_finding
+from ahrsd.diagnosis.data_quality.preparation import correct_track, find_facts
+from ahrsd.diagnosis.data_quality.timestamps import (
+    find_clock_faults,
+    regular_stamps,
+    without_clock_jumps,
+)
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
@@ -54,12 +58,14 @@ def _track(
 @pytest.mark.parametrize("unit", [1.0, 57.29578])
 def test_samples_taken_unevenly_and_stamped_well_are_no_jitter(unit: float) -> None:
     taken = _uneven(1)
-    assert stamps(_track(taken, taken, unit=unit)) == []
+    assert find_clock_faults(_track(taken, taken, unit=unit)) == []
 
 
 @pytest.mark.parametrize("unit", [1.0, 57.29578])
 def test_samples_of_a_regular_clock_stamped_unevenly_are(unit: float) -> None:
-    (fact,) = stamps(_track(np.arange(_SAMPLES, dtype=np.float64) * _STEP_S, _uneven(1), unit=unit))
+    (fact,) = find_clock_faults(
+        _track(np.arange(_SAMPLES, dtype=np.float64) * _STEP_S, _uneven(1), unit=unit)
+    )
     assert fact.effect == "timestamp_jitter"
     assert fact.parameters[0].value == pytest.approx(0.1 * _STEP_S, rel=0.05)
 
@@ -70,13 +76,13 @@ def test_jitter_too_small_to_be_told_is_put_right_where_the_field_shows_it() -> 
     even = np.arange(_SAMPLES, dtype=np.float64) * _STEP_S
     stamped = even + np.random.default_rng(1).normal(0, 0.01 * _STEP_S, _SAMPLES)
     track = _track(even, stamped, **quick)
-    (fact,) = stamps(track)
+    (fact,) = find_clock_faults(track)
     assert fact.parameters[0].value == pytest.approx(0.01 * _STEP_S, rel=0.05)
-    assert not matters(fact)
-    right = put_right(track, (fact,)).dt_s[1:]
+    assert not is_finding(fact)
+    right = correct_track(track, (fact,)).dt_s[1:]
     assert np.max(np.abs(right - _STEP_S)) < 1e-4 * _STEP_S
     # taken at those times and stamped well: left as it is
-    assert stamps(_track(stamped, stamped, **quick)) == []
+    assert find_clock_faults(_track(stamped, stamped, **quick)) == []
 
 
 def _jumping(by_s: float, samples: int = 1000) -> Track:
@@ -92,20 +98,20 @@ def _jumping(by_s: float, samples: int = 1000) -> Track:
 @pytest.mark.parametrize("by_s", [1.7471e9, 3600.0, -2.0, -1e6])
 def test_a_jump_is_a_short_break(by_s: float) -> None:
     track = _jumping(by_s)
-    done, (words,) = without_jumps(track)
+    done, (words,) = without_clock_jumps(track)
     assert done.time_s[500] - done.time_s[499] == pytest.approx(priors.BREAK_LEFT_S)
     assert np.diff(done.time_s).min() > 0.0
     assert words.startswith(f"the clock jumps by {by_s + 0.04:+.6g} s behind 20 s")
-    assert without_jumps(done) == (done, ())
+    assert without_clock_jumps(done) == (done, ())
     epoch = replace(track, time_s=track.time_s + 1.7e9 + 0.125)
-    assert "behind 1700000020.125 s" in without_jumps(epoch)[1][0]
+    assert "behind 1700000020.125 s" in without_clock_jumps(epoch)[1][0]
 
 
 def test_a_break_that_may_be_one_stays() -> None:
     track = _jumping(30.0)
-    assert without_jumps(track) == (track, ())
+    assert without_clock_jumps(track) == (track, ())
     whole = replace(track, runs=track.runs[:1])
-    assert without_jumps(whole) == (whole, ())
+    assert without_clock_jumps(whole) == (whole, ())
 
 
 def test_a_clock_that_is_set_while_it_records_is_diagnosed() -> None:
@@ -118,7 +124,7 @@ def test_a_clock_that_is_set_while_it_records_is_diagnosed() -> None:
 @pytest.mark.parametrize("missing", [0.02, 0.3])
 def test_missing_samples_by_their_stamps(track: Track, missing: float) -> None:
     keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > missing)
-    fact = only(facts_of(without_rows(track, keep, restamp=False)))
+    fact = only(find_facts(without_rows(track, keep, restamp=False)))
     assert fact.effect == "dropped_samples"
     assert abs(value(fact) - (1 - len(keep) / len(track))) < 1e-3
 
@@ -127,11 +133,11 @@ def test_jittering_stamps_and_their_regular_clock(track: Track) -> None:
     rng = np.random.default_rng(2)
     stamped = track.time_s + 3e-3 * rng.standard_normal(len(track))
     jittered = replace(track, time_s=stamped, dt_s=np.diff(stamped, prepend=np.nan))
-    fact = only(facts_of(jittered))
+    fact = only(find_facts(jittered))
     assert fact.effect == "timestamp_jitter"
     assert abs(value(fact) / 3e-3 - 1) < 0.1
-    assert np.abs(regular(jittered) - track.time_s).max() < 3e-4
-    assert np.abs(np.diff(put_right(jittered, (fact,)).time_s) - 0.04).max() < 1e-4
+    assert np.abs(regular_stamps(jittered) - track.time_s).max() < 3e-4
+    assert np.abs(np.diff(correct_track(jittered, (fact,)).time_s) - 0.04).max() < 1e-4
 
 
 def test_stamps_in_bunches_scatter_about_the_clock_and_not_within_a_bunch() -> None:
@@ -142,26 +148,26 @@ def test_stamps_in_bunches_scatter_about_the_clock_and_not_within_a_bunch() -> N
     dt_s = np.diff(stamps_s, prepend=np.nan)
     fact = next(
         one
-        for one in facts_of(replace(track, time_s=stamps_s, dt_s=dt_s))
+        for one in find_facts(replace(track, time_s=stamps_s, dt_s=dt_s))
         if one.effect == "timestamp_jitter"
     )
     assert value(fact) == pytest.approx(np.sqrt(2 / 3) * 0.005, rel=0.1)
     assert fact.setting["step_s"] == pytest.approx(0.005, rel=0.01)
-    assert matters(fact)
+    assert is_finding(fact)
 
 
 def test_time_that_goes_back_stops_everything(track: Track) -> None:
     stamped = track.time_s.copy()
     stamped[700] -= 1.0
-    facts = facts_of(replace(track, time_s=stamped))
+    facts = find_facts(replace(track, time_s=stamped))
     assert facts[0].stops
     assert "row 700" in facts[0].words
 
 
 def test_two_clocks(track: Track) -> None:
     other = 5.0 + track.time_s * 1.002
-    fact = only(facts_of(replace(track, covariates={"host_time_s": other})))
+    fact = only(find_facts(replace(track, covariates={"host_time_s": other})))
     assert fact.effect == "clock_rate"
     assert abs(value(fact) - 2e-3) < 1e-6
     same = replace(track, covariates={"host_time_s": track.time_s + 3.0})
-    assert facts_of(same) == ()
+    assert find_facts(same) == ()

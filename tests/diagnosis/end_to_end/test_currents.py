@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 from tracks import experiment, track_of, true_model
 
-from ahrsd.diagnosis.calibration_fit.resampling import thinned
+from ahrsd.diagnosis.calibration_fit.resampling import average_groups
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.model import Noise, Term
 from ahrsd.diagnosis.repaired_model.forward import simulated
@@ -81,7 +81,8 @@ def test_what_rides_with_the_sensor_is_averaged_as_it_is() -> None:
     loud = replace(track, mag_b_gauss=track.mag_b_gauss + riding)
     model = true_model(made)
     pure, told, untold = (
-        thinned(*given) for given in ((track, 2, model), (loud, 2, model, riding), (loud, 2, model))
+        average_groups(*given)
+        for given in ((track, 2, model), (loud, 2, model, riding), (loud, 2, model))
     )
     means = riding.reshape(-1, 2, 3).mean(axis=1)
     assert np.abs(told.mag_b_gauss - pure.mag_b_gauss - means).max() < 1e-9

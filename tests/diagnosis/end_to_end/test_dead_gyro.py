@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.data_quality.stuck import dead
+from ahrsd.diagnosis.data_quality.stuck import dead_sensor_reason
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 
@@ -21,7 +21,7 @@ def track() -> Track:
 @pytest.mark.parametrize("value", [0.0, 0.013])
 def test_a_gyro_that_never_changes_while_the_field_turns(track: Track, value: float) -> None:
     still = replace(track, gyro_b_rad_s=np.full_like(track.gyro_b_rad_s, value))
-    why = dead(still)
+    why = dead_sensor_reason(still)
     assert why is not None
     assert f"the gyro reads {value:g} {value:g} {value:g} rad/s in every row" in why
     assert "it is stuck or was not logged" in why

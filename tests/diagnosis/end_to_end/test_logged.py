@@ -119,7 +119,7 @@ def test_columns_with_holes(driven) -> None:
     short[100:110] = np.nan
     long[500:1000] = np.nan
     columns = {"a_a": nothing, "b_a": short, "c_a": long, "hdop": long}
-    found = roles.holed(track.with_columns(columns))
+    found = roles.find_columns_with_gaps(track.with_columns(columns))
     assert list(found) == ["c_a"]
     assert np.array_equal(np.flatnonzero(found["c_a"].missing), np.arange(500, 1000))
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from odd_tracks import SIGMA_GYRO, SIGMA_MAG, shaking
 
-from ahrsd.diagnosis.calibration_fit.gyro_readings import shaken
-from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.calibration_fit.gyro_readings import is_shaken
+from ahrsd.diagnosis.calibration_fit.problem import build_problem
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Spec
 
@@ -18,8 +18,8 @@ from ahrsd.diagnosis.track import Spec
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_noise_is_found_below_what_differences_say(seed: int) -> None:
     track = shaking(seed)
-    assert shaken(track)
-    problem, start = problem_of(track, Spec())
+    assert is_shaken(track)
+    problem, start = build_problem(track, Spec())
     assert problem.spec.shaken_gyro_rad_s is not None
     assert problem.spec.shaken_gyro_rad_s * np.sqrt(problem.thin) > 10 * SIGMA_GYRO
     assert 0.6 < start.sigma_gyro_rad_s * np.sqrt(problem.thin) / SIGMA_GYRO < 1.6

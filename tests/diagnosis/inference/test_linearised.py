@@ -11,7 +11,7 @@ from tracks import experiment, track_of
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
-from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.calibration_fit.problem import build_problem
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.components.component import Component, FixedLaw
 from ahrsd.diagnosis.inference.components.effect_components import (
@@ -44,7 +44,7 @@ from ahrsd.diagnosis.track import Spec, Track
 
 
 def richest(track: Track) -> richest_model.FittedPoint:
-    problem, cold = problem_of(track, Spec())
+    problem, cold = build_problem(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
     return richest_model.fit_richest_model(problem, fit.filtered, EFFECTS)
 
@@ -136,10 +136,10 @@ def test_a_logged_cause_is_the_same_component_at_every_point():
     track = track_of(experiment("wam", seed=4, samples=3000))
     warm = 15.0 + np.cumsum(np.random.default_rng(2).normal(size=len(track))) / 500.0
     track = replace(track, covariates={"temperature_c": warm})
-    problem, cold = problem_of(track, Spec())
+    problem, cold = build_problem(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
     keys = []
-    for one in (problem, problem.lagging(0.03)):
+    for one in (problem, problem.with_lag(0.03)):
         start = initial_point(one, run_filter(one.track, fit.filtered.model), (LAG,))
         keys.append(richest_model.build_base(start, EFFECTS, (), whole=False).whole)
     assert "gyro_bias_temperature as logged" in keys[0]
@@ -152,7 +152,7 @@ def test_what_a_point_takes_out_of_the_readings_is_what_it_puts_back():
     t = track.time_s - track.time_s[0]
     added = 0.04 * np.sin(2 * np.pi * t / 31.0)[:, None] * np.array([0.6, -0.7, 0.39])
     track = replace(track, mag_b_gauss=track.mag_b_gauss + added)
-    problem, cold = problem_of(track, Spec())
+    problem, cold = build_problem(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
     here = richest_model.fit_at_point(initial_point(problem, fit.filtered, (LAG,)), EFFECTS, ())
     there = richest_model.fit_at_point(
@@ -178,7 +178,7 @@ def test_a_run_ends_where_a_step_turns_too_far_to_be_told():
 
 def test_a_span_in_which_something_was_moved_is_unread_and_the_gyro_carries_the_field_across():
     track = track_of(experiment("wam", seed=8, samples=3000))
-    problem, cold = problem_of(track, Spec())
+    problem, cold = build_problem(track, Spec())
     point = initial_point(problem, fit_null(problem.track, problem.spec, cold).filtered, (LAG,))
     middle_s = float(np.median(track.time_s))
     silent = omit_readings(point, [(middle_s, middle_s + 6.0)])
@@ -194,7 +194,7 @@ def test_a_span_in_which_something_was_moved_is_unread_and_the_gyro_carries_the_
 def test_what_is_made_of_the_field_row_by_row_does_not_follow_that_rows_reading(name):
     """Beside a loud gyro the smooth field is nearly the reading, which then explains itself."""
     loud = track_of(experiment("wam", seed=31, samples=600, rate_hz=10.0, sigma_gyro=0.03))
-    problem, cold = problem_of(loud, Spec())
+    problem, cold = build_problem(loud, Spec())
     model = fit_null(problem.track, problem.spec, cold, walk=False).model
     row, off_gauss = 300, 1e-3
 

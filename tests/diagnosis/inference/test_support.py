@@ -13,7 +13,7 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.added_field import calibration_of, deviation, less_calibration
 from ahrsd.diagnosis.answer.diagnosis import Assumed, Finding, Heldout, OnPriors, Where
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
-from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.calibration_fit.problem import build_problem
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.answer.held_out import HeldOut, dealt
 from ahrsd.diagnosis.inference.answer.left_sizes import left_sizes
@@ -51,7 +51,7 @@ def with_current(track: Track, *, field: bool) -> Track:
 
 
 def sets_of(track: Track) -> tuple[Hypotheses, Space]:
-    problem, cold = problem_of(track, Spec())
+    problem, cold = build_problem(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
     return build_search_space(
         richest_model.fit_richest_model(problem, fit.filtered, EFFECTS), EFFECTS, ()
@@ -246,7 +246,7 @@ def test_what_follows_a_column_fails_before_and_not_after_it_is_named(driven):
 def test_a_source_that_is_in_no_set_fails_by_time_and_by_whiteness(track):
     t = track.time_s - track.time_s[0]
     pulse = ((t > 50.0) & (t < 75.0))[:, None] * np.array([4e-3, -3e-3, 2e-3])
-    problem, cold = problem_of(replace(track, mag_b_gauss=track.mag_b_gauss + pulse), Spec())
+    problem, cold = build_problem(replace(track, mag_b_gauss=track.mag_b_gauss + pulse), Spec())
     start = fit_null(problem.track, problem.spec, cold, walk=False)
     all_sets, _ = build_search_space(
         richest_model.fit_richest_model(problem, start.filtered, EFFECTS), EFFECTS, ()

@@ -10,7 +10,7 @@ from tracks import experiment, track_of
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
-from ahrsd.diagnosis.calibration_fit.problem import problem_of
+from ahrsd.diagnosis.calibration_fit.problem import build_problem
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.inference.likelihood import richest_model
@@ -86,7 +86,7 @@ def test_spells_are_found_to_a_second_and_what_was_tried_is_not_kept():
     on = np.any([(since_s >= a) & (since_s < b) for a, b in true], axis=0)
     lamp = on[:, None] * np.array([0.02, -0.015, 0.01])
     track = replace(track, mag_b_gauss=track.mag_b_gauss + lamp)
-    problem, cold = problem_of(track, Spec())
+    problem, cold = build_problem(track, Spec())
     fit = fit_null(problem.track, problem.spec, cold, walk=False)
     all_sets, _ = build_search_space(
         richest_model.fit_richest_model(problem, fit.filtered, EFFECTS), EFFECTS, ()

@@ -17,7 +17,12 @@ from ahrsd.diagnosis.answer.diagnosis import (
 )
 from ahrsd.diagnosis.answer.predictive_checks import usual_noise
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
-from ahrsd.diagnosis.data_quality.facts import Fact, around, lost_at, rounding
+from ahrsd.diagnosis.data_quality.facts import (
+    Fact,
+    burst_is_explained,
+    lost_turn_intervals,
+    rounding,
+)
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.components.effect_components import LAG
 from ahrsd.diagnosis.inference.likelihood.linearisation import (
@@ -78,6 +83,6 @@ def loud_facts(
         span for one in told if one.where.frame == "world" for span in one.where.intervals_s
         if span[1] - span[0] < priors.PASSING_S
     ]  # fmt: skip
-    moments = [*lost_at(facts), *short]
+    moments = [*lost_turn_intervals(facts), *short]
     levels = level_facts(fast.left.filtered, spec_given=spec_given)
-    return [fact for fact in levels if not around(fact, moments)]
+    return [fact for fact in levels if not burst_is_explained(fact, moments)]

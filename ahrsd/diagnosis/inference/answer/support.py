@@ -16,9 +16,9 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Unexplained,
     Validation,
 )
-from ahrsd.diagnosis.calibration_fit.gyro_at_rest import HARDLY_TURNED, at_rest
+from ahrsd.diagnosis.calibration_fit.gyro_at_rest import HARDLY_TURNED, field_hardly_turns
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
-from ahrsd.diagnosis.data_quality.preparation import Prepared, would_have_shown
+from ahrsd.diagnosis.data_quality.preparation import PreparedRecording, detectable_faults
 from ahrsd.diagnosis.inference.answer.held_out import HeldOut
 from ahrsd.diagnosis.inference.components.component import FixedLaw, Law, ScaledLaw
 from ahrsd.diagnosis.inference.components.effect_components import LAG, LAG_FORM
@@ -210,15 +210,20 @@ def _larger(law: Law, factor: float) -> Law:
 
 
 def notes(
-    asked: Prepared, start: NullFit, found: Searched, said: tuple[str, ...], *, something: bool
+    asked: PreparedRecording,
+    start: NullFit,
+    found: Searched,
+    said: tuple[str, ...],
+    *,
+    something: bool,
 ) -> tuple[str, ...]:
     """How the recording was read and what was left out of it, then what was said of the answer."""
     problem = found.all_sets.made.point.problem
-    seen = () if something else would_have_shown(problem.recorded)
-    how = (*asked.notes, *problem.notes, *((HARDLY_TURNED,) if at_rest(start) else ()))
+    seen = () if something else detectable_faults(problem.recorded)
+    how = (*asked.notes, *problem.notes, *((HARDLY_TURNED,) if field_hardly_turns(start) else ()))
     if problem.unread_s:
         when = ", ".join(f"{begin:.1f}-{end:.1f}" for begin, end in problem.unread_s)
         how = (*how, f"readings at {when} s were left out: something was being moved there")
     if found.all_sets.too_wide and found.answer.unknown:
         how = (*how, TOO_MANY)
-    return (*how, *said, *asked.lesser, *seen)
+    return (*how, *said, *asked.minor_notes, *seen)

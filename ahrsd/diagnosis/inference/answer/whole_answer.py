@@ -18,9 +18,9 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Finding,
     RegimeMap,
 )
-from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, baseline
-from ahrsd.diagnosis.data_quality.facts import Fact, of_fact, rounding
-from ahrsd.diagnosis.data_quality.preparation import Prepared
+from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, baseline_of
+from ahrsd.diagnosis.data_quality.facts import Fact, as_finding, rounding
+from ahrsd.diagnosis.data_quality.preparation import PreparedRecording
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.answer import pictures, residual_checks, support, visibility
 from ahrsd.diagnosis.inference.answer.held_out import HeldOut
@@ -38,7 +38,7 @@ Told = TypeVar("Told", Finding, Term)
 
 
 def whole_answer(
-    asked: Prepared,
+    asked: PreparedRecording,
     start: NullFit,
     found: Searched,
     fast: Quick,
@@ -69,7 +69,7 @@ def whole_answer(
     left = told_sizes(all_sets, answer, left, remainder_nats, simulated=simulated)
     left = max(left, fast.hum, key=lambda one: (one.detected, one.evidence_nats))
     loud = loud_facts(found, fast, asked.facts, told, spec_given=spec_given)
-    named = (*asked.told(library), *told, *(of_fact(fact, library) for fact in loud), *still)
+    named = (*asked.findings(library), *told, *(as_finding(fact, library) for fact in loud), *still)
     something = bool(named) or left.detected
     residuals = residual_checks.residuals_of(held.rows(answer.best.names))
     maps = residual_checks.regime_maps(residuals)
@@ -79,7 +79,7 @@ def whole_answer(
     said = support.doubts(told) if something else support.nearest(answer, all_sets)
     return Diagnosis(
         recording="",
-        baseline=baseline(start),
+        baseline=baseline_of(start),
         mismatch=something,
         p_value=0.0 if counted else float(np.exp(-max(odds))),
         findings=_as_recorded(named, found),

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.calibration_fit.delay import beyond_the_lag
+from ahrsd.diagnosis.calibration_fit.delay import low_pass_beyond_delay
 from ahrsd.diagnosis.effects.effect import ANGLES, SCALES, Effect, Setting
 from ahrsd.diagnosis.inference.components.component import (
     MOMENTS,
@@ -188,7 +188,7 @@ def delay_form(context: Context, lag_s: float) -> Component:
     Its coefficient is the share of the delay that the filter causes.
     """
     law = FixedLaw(np.array([priors.LAG_IS_FILTER**2]))
-    return Component(LAG_FORM, "sensor", beyond_the_lag(context, abs(lag_s)), law)
+    return Component(LAG_FORM, "sensor", low_pass_beyond_delay(context, abs(lag_s)), law)
 
 
 def component_key(identifier: str, setting: Setting) -> str:

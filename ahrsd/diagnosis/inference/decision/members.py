@@ -9,7 +9,7 @@ import numpy as np
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.added_field import heading_error_deg
 from ahrsd.diagnosis.answer.diagnosis import Cost
-from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
+from ahrsd.diagnosis.calibration_fit.null_fit import calibration_prior
 from ahrsd.diagnosis.inference.components.component import ScaledLaw
 from ahrsd.diagnosis.inference.components.effect_components import LAG
 from ahrsd.diagnosis.inference.components.ordinary_remainder import still_intervals
@@ -96,7 +96,7 @@ def nats_of_remainder(all_sets: Hypotheses, best: Hypothesis) -> float:
 def cost_if_left_out(all_sets: Hypotheses, best: Hypothesis, key: str) -> Cost:
     """How far off the calibration of the set would be without a member."""
     made = all_sets.made
-    prior_mean, current = prior_of(made.point.problem.track).mean, made.point.filtered.model
+    prior_mean, current = calibration_prior(made.point.problem.track).mean, made.point.filtered.model
     reduced = all_sets.judge(all_sets.without_member(best.names, key), best)
     model_without, model_with = (
         model_from_coefficients(coefficients(all_sets, one, CALIBRATION)[0] + prior_mean, current)

@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.calibration_fit.delay import usual_step
+from ahrsd.diagnosis.calibration_fit.delay import regular_step
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.components.effect_components import (
     LAG,
@@ -74,7 +74,7 @@ def _filter_log_odds(all_sets: Hypotheses, best: Hypothesis, delay_s: float) -> 
 
 def _half_step_s(all_sets: Hypotheses) -> float | None:
     """Half of the recording's time step; None if the steps differ."""
-    step_s = usual_step(all_sets.made.point.problem.recorded.dt_s)
+    step_s = regular_step(all_sets.made.point.problem.recorded.dt_s)
     return None if step_s is None else step_s / 2.0
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.columns.clocks import Late, at_clock, likeliest_clock, suspects
+from ahrsd.diagnosis.columns.clocks import ColumnClock, column_at_clock, most_probable_clock, find_shifted_columns
 from ahrsd.diagnosis.effects.design_matrix import on_axes
 from ahrsd.diagnosis.inference.components.component import Component, ScaledLaw
 from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
@@ -30,15 +30,15 @@ from ahrsd.diagnosis.where_and_when.locate import Located, segments
 _FREE_FIELD = FREE_PROCESSES[0]
 
 
-def find_wrong_clock(fitted: FittedPoint) -> Late | None:
+def find_wrong_clock(fitted: FittedPoint) -> ColumnClock | None:
     """The clock of the column that explains most of the richest model's free field, if wrong."""
     track = fitted.base.made.context.track
     if not track.covariates:
         return None
-    suspected = suspects(_free_field(fitted), track)
+    suspected = find_shifted_columns(_free_field(fitted), track)
     suspected = [one for one in suspected if abs(one[0]) > priors.ON_TIME_S]
     return (
-        likeliest_clock(_ClockEvidence(fitted, suspected[0][1]), suspected[0][0])
+        most_probable_clock(_ClockEvidence(fitted, suspected[0][1]), suspected[0][0])
         if suspected
         else None
     )
@@ -94,7 +94,7 @@ class _ClockEvidence:
         return [log_bayes_factors[one.key] for one in candidates]
 
     def _component(self, clock: tuple[float, float]) -> Component:
-        values = at_clock(self._made.context.track, self.column, clock, self.middle_s)
+        values = column_at_clock(self._made.context.track, self.column, clock, self.middle_s)
         scaled = values / max(float(np.std(values)), 1e-300)
         low, high = np.log(priors.EFFECT_SIZES)
         law = ScaledLaw(np.full(3, priors.COURSE_UNIT["sensor"]), np.array([low]), np.array([high]))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.fft import dct, idct, next_fast_len
 
 from ahrsd.diagnosis.calibration_fit import noise_fit
-from ahrsd.diagnosis.calibration_fit.null_fit import prior_of
+from ahrsd.diagnosis.calibration_fit.null_fit import calibration_prior
 from ahrsd.diagnosis.calibration_fit.problem import Problem
 from ahrsd.diagnosis.inference.components.component import Component, FixedLaw
 from ahrsd.diagnosis.inference.likelihood import noise_model
@@ -383,7 +383,7 @@ def omit_readings(point: Point, spans_s: Sequence[tuple[float, float]]) -> Point
         point.problem,
         recorded=replace(recorded, mag_b_gauss=mag),
         unread_s=_merge_intervals([*point.problem.unread_s, *spans_s]),
-    ).lagging(point.problem.lag_s)
+    ).with_lag(point.problem.lag_s)
     model = point.filtered.model
     filtered = run_filter(problem.track, model, point.terms_mag, point.terms_gyro)
     return replace(point, problem=problem, filtered=filtered)
@@ -405,7 +405,7 @@ def refit_filter_noise(point: Point) -> Point:
     problem, mag, gyro = point.problem, point.terms_mag, point.terms_gyro
     model = point.filtered.model
     filtered = run_filter(problem.track, model, mag, gyro)
-    refitted = _cap_noise(noise_fit.estimated(filtered, problem.spec, mag, gyro, walk=False), model)
+    refitted = _cap_noise(noise_fit.estimate_noise(filtered, problem.spec, mag, gyro, walk=False), model)
     return replace(point, filtered=run_filter(problem.track, refitted, mag, gyro))
 
 
@@ -434,7 +434,7 @@ def linearise(
         point, context, regressing_filter, edges, white, alone=alone, whitening=whitening
     )
     linearised.y = linearised.whiten_axes(white[:, None])[:, 0]
-    prior = prior_of(point.problem.track)
+    prior = calibration_prior(point.problem.track)
     law = FixedLaw(prior.deviation**2)
     linearised.add([Component(CALIBRATION, "sensor", nuisance_columns(regressing_filter), law)])
     linearised.add_back({CALIBRATION: calibration_coefficients(point.filtered.model) - prior.mean})
@@ -500,7 +500,7 @@ def step_to_maximum(
     }
     if not delayed:
         values |= {key: point.values.get(key, np.zeros(1)) for key in point.exact}
-    prior_mean = prior_of(problem.track).mean
+    prior_mean = calibration_prior(problem.track).mean
     here = calibration_coefficients(point.filtered.model) - prior_mean
     calibration = here + share * (coefficients_by_key(made, keys, at)[CALIBRATION] - here)
     model = model_from_coefficients(calibration + prior_mean, point.filtered.model)
@@ -543,7 +543,7 @@ def directed_noise_of_residual(
 
 def remaining_step(made: Linearised, keys: Sequence[str], at: ModelFit) -> tuple[Array, Array]:
     """Step from the point to the most probable calibration and delay, and its deviations."""
-    prior = prior_of(made.point.problem.track).mean
+    prior = calibration_prior(made.point.problem.track).mean
     before = {
         CALIBRATION: calibration_coefficients(made.point.filtered.model) - prior,
         **{key: made.point.values.get(key, np.zeros(1)) for key in made.point.exact},

@@ -18,8 +18,12 @@ from scipy.fft import dct, idct
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.calibration_fit.problem import Problem
-from ahrsd.diagnosis.columns.held_and_noisy import cleaned, drawn_between, held_columns
-from ahrsd.diagnosis.columns.roles import shown
+from ahrsd.diagnosis.columns.held_and_noisy import (
+    denoise_columns,
+    find_held_columns,
+    interpolate_held_columns,
+)
+from ahrsd.diagnosis.columns.roles import label
 from ahrsd.diagnosis.effects.effect import Effect, Setting
 from ahrsd.diagnosis.inference.components import effect_components
 from ahrsd.diagnosis.inference.components.effect_components import LATE_STEP_S
@@ -95,17 +99,19 @@ def clean_columns(problem: Problem, log_likelihood: LogLikelihood) -> Problem:
 
 def _interpolate_held(problem: Problem, name: str) -> Problem | None:
     """With a column interpolated linearly between its values, if these are rare; else None."""
-    held = tuple(one for one in held_columns(problem.recorded) if one.name == name)
+    held = tuple(one for one in find_held_columns(problem.recorded) if one.name == name)
     if not held:
         return None
-    note = f"column {shown(name)} comes {held[0].often}: drawn straight between its values"
-    return _replace_recorded(problem, drawn_between(problem.recorded, held), note)
+    note = (
+        f"column {label(name)} comes {held[0].interval_words}: drawn straight between its values"
+    )
+    return _replace_recorded(problem, interpolate_held_columns(problem.recorded, held), note)
 
 
 def _remove_noise(problem: Problem, name: str) -> Problem | None:
     """With a column without its logger's noise; None if that is not separable from the signal."""
-    clean = cleaned(problem.recorded, (name,))
-    note = f"column {shown(name)} has noise of its own: what follows it is judged without it"
+    clean = denoise_columns(problem.recorded, (name,))
+    note = f"column {label(name)} has noise of its own: what follows it is judged without it"
     return None if clean is None else _replace_recorded(problem, clean, note)
 
 
@@ -196,7 +202,7 @@ def _best_log_bayes_factors(
 
 def apply_logger_model(problem: Problem, logger: LoggerModel) -> Problem:
     """The problem with a column corrected for its logger."""
-    note = f"column {shown(logger.column)} is read as {logger.words}"
+    note = f"column {label(logger.column)} is read as {logger.words}"
     logged = {**problem.logged, logger.column: logger.setting}
     return replace(
         _replace_recorded(problem, logger.before_logging(problem.recorded), note), logged=logged

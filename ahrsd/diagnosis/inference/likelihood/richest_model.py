@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.calibration_fit.delay import of_magnetometer, usual_step
+from ahrsd.diagnosis.calibration_fit.delay import is_magnetometer_lag, regular_step
 from ahrsd.diagnosis.calibration_fit.problem import Problem
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.components.component import Component
@@ -169,10 +169,10 @@ def _instant_rate_delays(problem: Problem) -> tuple[float, ...]:
     Half a step alone and, if the delay is more than that, all of it, as then the magnetometer is
     late too.
     """
-    step_s = usual_step(problem.recorded.dt_s)
+    step_s = regular_step(problem.recorded.dt_s)
     if problem.lag_s <= 0.0 or step_s is None:
         return ()
-    exceeds_half_step = of_magnetometer(problem.recorded, problem.lag_s)
+    exceeds_half_step = is_magnetometer_lag(problem.recorded, problem.lag_s)
     return (step_s / 2, problem.lag_s) if exceeds_half_step else (step_s / 2,)
 
 
@@ -184,12 +184,12 @@ def _correct_columns(
     def log_likelihood(one: Problem) -> float:
         return _fit_at_delay(one, filtered, library, 0.0).nats
 
-    problem = clean_columns(problem, log_likelihood).lagging(problem.lag_s)
+    problem = clean_columns(problem, log_likelihood).with_lag(problem.lag_s)
     if not problem.recorded.covariates:
         return problem
     here = _fit_at_delay(problem, filtered, library, 0.0)
     for logger in find_mean_columns(here.base.made, here.base.whole, here.at, library):
-        corrected = apply_logger_model(problem, logger).lagging(problem.lag_s)
+        corrected = apply_logger_model(problem, logger).with_lag(problem.lag_s)
         found = _fit_at_delay(corrected, filtered, library, 0.0)
         if found.nats > here.nats + priors.ODDS_REAL:
             problem, here = corrected, found
@@ -200,7 +200,7 @@ def _fit_at_delay(
     problem: Problem, filtered: Filtered, library: Mapping[str, Effect], lag_s: float
 ) -> FittedPoint:
     """The small model at a delay."""
-    point = initial_point(problem.lagging(lag_s), filtered, (LAG,))
+    point = initial_point(problem.with_lag(lag_s), filtered, (LAG,))
     values = {} if lag_s == 0.0 else {LAG: np.array([lag_s])}
     return fit_at_point(replace(point, values=values), library, (), whole=False)
 
