@@ -43,16 +43,16 @@ from ahrsd.diagnosis.calibration_fit.problem import Problem, model_at_rate, prob
 from ahrsd.diagnosis.data_quality.preparation import would_have_shown
 from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.innovation_filter.context import (
-    Given,
+    UnfittedMotion,
     attitude,
     build_context,
     smoothed_rate,
 )
 from ahrsd.diagnosis.innovation_filter.innovation import (
-    bearings,
-    carried_along,
+    carried_orientation,
+    filtered_for_regression,
+    nominal_motion,
     nuisance_columns,
-    regressing,
     sensitivities,
 )
 from ahrsd.diagnosis.model import Noise, NullModel
@@ -171,7 +171,7 @@ def bent(start: NullFit) -> float:
     smoothed motion have none, and what they say otherwise at the fit is what that noise does.
     """
     done = start.filtered
-    smooth = regressing(done, start.context().rate_b_rad_s)
+    smooth = filtered_for_regression(done, start.context().rate_b_rad_s)
     noisy, clean = (sensitivities(one, nuisance_columns(one)) for one in (done, smooth))
     score = np.einsum("nia,ni->a", noisy - clean, done.whitened)
     known = start.covariance[: len(score), : len(score)]
@@ -180,10 +180,10 @@ def bent(start: NullFit) -> float:
 
 def motion_of(track: Track, model: NullModel) -> Readings:
     """Noise-free readings of a calibration along a track's motion without the gyro's noise."""
-    seen = bearings(track, model)
-    context = build_context(track, Given(seen))
+    seen = nominal_motion(track, model)
+    context = build_context(track, UnfittedMotion(seen))
     rate = _without_noise(track, model)
-    quiet = replace(seen, orientation=carried_along(track, rate))
+    quiet = replace(seen, orientation=carried_orientation(track, rate))
     R_nb, levelled = attitude(track, quiet)
     along = replace(
         context, R_nb=R_nb, world_levelled=levelled, rate_b_rad_s=rate, field_b=seen.nominal_b

@@ -33,7 +33,7 @@ from ahrsd.diagnosis.innovation_filter.innovation import (
     run_filter,
     sensitivities,
 )
-from ahrsd.diagnosis.innovation_filter.noise import colour_before_filter, colour_of, freedom_of
+from ahrsd.diagnosis.innovation_filter.noise import colour_before_filter, fit_colour, tail_freedom
 from ahrsd.diagnosis.innovation_filter.regression_statistics import student_quantile
 from ahrsd.diagnosis.model import Context, Noise, Term
 from ahrsd.diagnosis.repaired_model import forward
@@ -136,7 +136,7 @@ def noise_law(
     law = replace(law, level=level)
     if done.track.lost_turns is None:  # else what is lost makes the tails, and is simulated
         law = replace(
-            law, freedom=freedom_of(replace(done, whitened=done.whitened / level[:, None]))
+            law, freedom=tail_freedom(replace(done, whitened=done.whitened / level[:, None]))
         )
     if not law.colour:
         return law
@@ -144,8 +144,8 @@ def noise_law(
     made = _innovations(fit, law, terms, library, tried, _TRIAL_SEED)
     seen = [_quick(fit, e) if done is quick else replace(done, whitened=e) for e in made]
     stacked = np.concatenate([one.whitened for one in seen])
-    found = colour_of(replace(done, whitened=stacked, used=np.tile(done.used, len(seen))))
-    colour, louder = colour_before_filter(colour_of(done), found)
+    found = fit_colour(replace(done, whitened=stacked, used=np.tile(done.used, len(seen))))
+    colour, louder = colour_before_filter(fit_colour(done), found)
     return replace(law, colour=tuple(colour.coefficients.tolist()), level=level * louder)
 
 
@@ -196,7 +196,7 @@ def _quick(fit: NullFit, whitened: Array) -> Filtered:
 
 def _slow_power(quick: Filtered, segment: NDArray[np.intp]) -> float:
     """Mean square that the means over segments take of noise of this colour, in both frames."""
-    colour = colour_of(quick)
+    colour = fit_colour(quick)
     density = colour.variance / max(1.0 - float(colour.coefficients.sum()), _LEAST) ** 2
     return 2.0 * density * len(np.unique(segment)) / max(int(np.count_nonzero(quick.used)), 1)
 
@@ -350,7 +350,7 @@ def _filtered(tracks: Sequence[Track], fit: NullFit) -> Array:
     blind = np.tile(np.isnan(fit.filtered.track.mag_b_gauss).any(axis=1), count)
     joined = _joined(tracks)
     joined.mag_b_gauss[blind] = np.nan
-    return run_filter(joined, fit.model, mag, gyro, sensitive=False).whitened
+    return run_filter(joined, fit.model, mag, gyro, with_sensitivities=False).whitened
 
 
 def _joined(tracks: Sequence[Track]) -> Track:

@@ -123,7 +123,9 @@ def quieter(
     level = model.sigma_gyro_rad_s
     known = replace(spec, shaken_gyro_rad_s=level)
     for turn in range(_TURNS):
-        again = noise_fit.estimated(run_filter(work, model, sensitive=False), known, walk=False)
+        again = noise_fit.estimated(
+            run_filter(work, model, with_sensitivities=False), known, walk=False
+        )
         if noise_fit.alike(again, model):
             break
         if turn > 0 and again.sigma_mag_gauss > most_gauss:

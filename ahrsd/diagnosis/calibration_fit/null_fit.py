@@ -86,7 +86,7 @@ def fit_null(
     problem = FitProblem(track, prior_of(track))
     if start is None:
         start = noise_fit.estimated(
-            run_filter(track, cold_start(track, known), sensitive=False), known, walk=walk
+            run_filter(track, cold_start(track, known), with_sensitivities=False), known, walk=walk
         )
     fit = descended(problem, start, _STEPS)
     prior = problem.prior.sharper(repetition_of(fit.filtered))
@@ -449,7 +449,7 @@ def _taken(
         if np.linalg.eigvalsh(model.soft_iron)[0] < _SMALLEST_EIGENVALUE:
             continue
         try:
-            new = run_filter(problem.track, model, held=point if near else None)
+            new = run_filter(problem.track, model, gains_from=point if near else None)
         except np.linalg.LinAlgError:  # a step too far
             continue
         if _cost(problem, new) <= cost * (1 + 1e-9):

@@ -60,7 +60,7 @@ QUARTER = 0.3186
 
 def lost_turns(track: Track, model: NullModel) -> list[Fact]:
     """`missing_turns` of a recording at its own rate, with the calibration that it starts from."""
-    done = run_filter(track, model, sensitive=False)
+    done = run_filter(track, model, with_sensitivities=False)
     return missing_turns(done, track.gyro_b_rad_s - model.gyro_bias_rad_s)
 
 
@@ -272,7 +272,7 @@ def recovered(
     for _ in range(_ROUNDS):
         gyro = model.gyro_bias_rad_s + rate_b_rad_s * (1 + lost)[:, None]
         track = replace(done.track, mag_b_gauss=mag, gyro_b_rad_s=gyro)
-        seen = run_filter(track, model, sensitive=False)
+        seen = run_filter(track, model, with_sensitivities=False)
         likelihood = float(np.sum(seen.log_likelihood[seen.used]))
         if likelihood > most:
             found = _jumps_of_rows(seen, rate_b_rad_s, max(float(lost.sum()), expected), lost)

@@ -22,9 +22,9 @@ from ahrsd import so3
 from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.effects.effect import Effect, Readings, readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.innovation_filter.context import Given, build_context
-from ahrsd.diagnosis.innovation_filter.innovation import Filtered, bearings
-from ahrsd.diagnosis.innovation_filter.noise import colour_of
+from ahrsd.diagnosis.innovation_filter.context import UnfittedMotion, build_context
+from ahrsd.diagnosis.innovation_filter.innovation import Filtered, nominal_motion
+from ahrsd.diagnosis.innovation_filter.noise import fit_colour
 from ahrsd.diagnosis.model import Context, Noise, NullModel, Term
 from ahrsd.diagnosis.time_series import autoregression, both_ways
 from ahrsd.diagnosis.track import Track
@@ -40,7 +40,7 @@ def noise_of(model: NullModel, filtered: Filtered | None = None) -> Noise:
     Where the filter remembers more than a sample or two its innovations are nearly the
     magnetometer's noise, so their colour is given to that.
     """
-    colour = () if filtered is None else tuple(colour_of(filtered).coefficients.tolist())
+    colour = () if filtered is None else tuple(fit_colour(filtered).coefficients.tolist())
     return Noise(
         model.sigma_mag_gauss, model.sigma_gyro_rad_s, model.gyro_walk_rad_s_sqrt_s, colour
     )
@@ -61,12 +61,12 @@ def context_along(
         missing = term.setting.get("covariate")
         if missing not in (None, "accel", *track.covariates):
             raise ValueError(f"{term.identifier} needs the column {missing}")
-    context = build_context(track, Given(bearings(track, model)))
+    context = build_context(track, UnfittedMotion(nominal_motion(track, model)))
     added = [term for term in terms if library[term.identifier].kind == "mean"]
     if not added:
         return context
     mag, gyro = contribution(context, added, library)
-    return build_context(track, Given(bearings(track, model, mag, gyro), gyro))
+    return build_context(track, UnfittedMotion(nominal_motion(track, model, mag, gyro), gyro))
 
 
 def contribution(

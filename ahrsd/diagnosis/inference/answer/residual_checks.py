@@ -27,8 +27,8 @@ from ahrsd.diagnosis.answer.predictive_checks import COPIES, bands, scene_of, st
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, Linearised, by_frequency
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
-from ahrsd.diagnosis.innovation_filter.innovation import batches, joined, sensitivities
-from ahrsd.diagnosis.innovation_filter.noise import freedom_of
+from ahrsd.diagnosis.innovation_filter.innovation import batch_columns, join_columns, sensitivities
+from ahrsd.diagnosis.innovation_filter.noise import tail_freedom
 from ahrsd.diagnosis.model import Columns
 from ahrsd.diagnosis.where_and_when.regime import regime_columns, regimes
 from ahrsd.samples import Array
@@ -115,7 +115,7 @@ def _compared(
 def _drawn(rng: np.random.Generator, found: Residuals, shape: tuple[int, int]) -> Array:
     """White noise of unit variance, its tails those of what is left."""
     filtered = found.rows.made.point.filtered
-    freedom = freedom_of(replace(filtered, whitened=found.whitened))
+    freedom = tail_freedom(replace(filtered, whitened=found.whitened))
     e = rng.standard_normal(shape)
     if np.isfinite(freedom):
         e *= np.sqrt((freedom - 2.0) / rng.chisquare(freedom, shape))
@@ -196,8 +196,8 @@ class WhiteRows:
     def passed(self, columns: Sequence[Columns]) -> Array:
         """(N, 3, p) columns of any kind as the filter and this noise leave them."""
         made, found = self.made, []
-        for batch in batches(columns, _BATCH):
-            cube = sensitivities(made.regressing, joined([columns[k] for k in batch]))
+        for batch in batch_columns(columns, _BATCH):
+            cube = sensitivities(made.regressing, join_columns([columns[k] for k in batch]))
             cube = made.as_loud(by_frequency(cube / made.point.loud.amplitude[:, None, None]))
             found.append((batch, self.like(cube)))
         cut = {

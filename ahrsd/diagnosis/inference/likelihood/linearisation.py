@@ -25,10 +25,10 @@ from ahrsd.diagnosis.inference.likelihood.evidence import At, Products
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import (
     Filtered,
-    batches,
-    joined,
+    batch_columns,
+    filtered_for_regression,
+    join_columns,
     nuisance_columns,
-    regressing,
     run_filter,
     sensitivities,
 )
@@ -129,8 +129,8 @@ class Linearised:
         new = list(reversed(first.values()))
         parts = [Columns(one.columns.mag, one.columns.gyro) for one in new]
         amplitude = self.point.loud.amplitude[:, None, None]
-        for batch in batches(parts, self._together()):
-            cube = sensitivities(self.regressing, joined([parts[k] for k in batch]))
+        for batch in batch_columns(parts, self._together()):
+            cube = sensitivities(self.regressing, join_columns([parts[k] for k in batch]))
             rows = by_frequency(np.divide(cube, amplitude, dtype=np.float32, casting="same_kind"))
             self.batches.append(self.as_loud(rows))
             at = 0
@@ -350,7 +350,9 @@ def as_columns_say(point: Point, components: Sequence[Component]) -> Point:
     if not out and point.terms_mag is None and point.terms_gyro is None:
         return point
     mag, gyro = added(len(point.filtered.track), known, out)
-    again = run_filter(point.problem.track, point.filtered.model, mag, gyro, held=point.filtered)
+    again = run_filter(
+        point.problem.track, point.filtered.model, mag, gyro, gains_from=point.filtered
+    )
     return replace(point, filtered=again, values=values, terms_mag=mag, terms_gyro=gyro)
 
 
@@ -400,7 +402,7 @@ def linearised(
 
     context: of which all columns are made;  band_hz: in which the noise may have any power
     """
-    smooth = regressing(point.filtered, context.rate_b_rad_s)
+    smooth = filtered_for_regression(point.filtered, context.rate_b_rad_s)
     count = length(len(point.filtered.whitened))
     scaled = point.filtered.whitened / point.loud.amplitude[:, None]
     white = by_frequency(scaled[:, :, None])[:, 0]
@@ -480,7 +482,7 @@ def moved(
     problem = problem.averaged_beside(
         added(len(made.context.track), known, riding)[0], model, lag_s
     )
-    filtered = run_filter(problem.track, model, mag, gyro, held=point.filtered)
+    filtered = run_filter(problem.track, model, mag, gyro, gains_from=point.filtered)
     named = {key: value for key, value in out.items() if known[key].effect is not None}
     _, misread = added(len(made.context.track), known, named)
     rest = point.loud, point.exact, misread, point.directed
