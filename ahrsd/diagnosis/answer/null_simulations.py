@@ -188,22 +188,22 @@ def motion_of(track: Track, model: NullModel) -> Readings:
     along = replace(
         context, R_nb=R_nb, world_levelled=levelled, rate_b_rad_s=rate, field_b=seen.nominal_b
     )
-    return forward.truth_along(along)
+    return forward.noise_free_readings(along)
 
 
 def _noises_of(model: NullModel, start: NullFit) -> list[Noise]:
     """The noise of a model; where the magnetometer has less than a fit believes at least, how much
     is not known: what the innovations say, and none."""
-    noise = forward.noise_of(model)
+    noise = forward.model_noise(model)
     if start.model.sigma_mag_gauss > priors.FLOOR_MAG_GAUSS:
         return [noise]
-    less = min(1.0, usual_noise(start).mag_gauss / forward.noise_of(start.model).mag_gauss)
+    less = min(1.0, usual_noise(start).mag_gauss / forward.model_noise(start.model).mag_gauss)
     return [replace(noise, mag_gauss=less * noise.mag_gauss), replace(noise, mag_gauss=0.0)]
 
 
 def copy_of(track: Track, truth: Readings, noise: Noise, seed: int) -> Track:
     """The track with other readings: those of the truth with noise."""
-    made = forward.simulated(truth, (), noise, seed)
+    made = forward.simulate_readings(truth, (), noise, seed)
     read = np.isfinite(track.mag_b_gauss)
     mag = np.where(read, made.mag_b_gauss, track.mag_b_gauss)
     return replace(track, mag_b_gauss=mag, gyro_b_rad_s=made.gyro_b_rad_s)
@@ -216,7 +216,7 @@ def _without_noise(track: Track, model: NullModel) -> Array:
     out = smoothed_rate(rate, runs, track.step_s, model.sigma_gyro_rad_s)
     for run in runs:
         if run.stop - run.start >= time_series.SPECTRUM_ROWS:
-            out[run] = time_series.denoised(rate[run])
+            out[run] = time_series.wiener_filter(rate[run])
     return out
 
 
@@ -343,7 +343,7 @@ def _agreeing(
         undecided=None if counted else undecided,
         notes=(*found.notes, said, *more),
         model=model,
-        noise=forward.noise_of(model),
+        noise=forward.model_noise(model),
         terms=terms,
         drawn=drawn,
         omnibus={k: replace(one, p_after=one.p_before) for k, one in found.omnibus.items()},

@@ -116,7 +116,7 @@ def noise_law(
     within = np.zeros(len(done.track), dtype=bool)
     for begin, end in loud:
         within |= (done.track.time_s >= begin) & (done.track.time_s <= end)
-    law = forward.noise_of(fit.model, done)
+    law = forward.model_noise(fit.model, done)
     steps = [float(term.value[0]) for term in terms if term.identifier == _ROUNDED]
     of_gyro = 0.0 if steps else _of_gyro(fit, law, terms, library, quick=done is quick)
     level = np.ones(len(within))
@@ -125,11 +125,13 @@ def noise_law(
             of_mag = float(np.mean(done.whitened[rows & done.used] ** 2)) - of_gyro
             level[rows] = np.sqrt(max(of_mag, _QUIETEST**2) / (1.0 - of_gyro))
     if steps:
-        truth, unsure = forward.truth_along(fit.context()), calibration_covariance(fit)
+        truth, unsure = forward.noise_free_readings(fit.context()), calibration_covariance(fit)
 
         def simulate(noise: Noise, seed: int) -> tuple[Array, Array]:
             known = readings_of_drawn_calibration(truth, unsure, seed) if seed else truth
-            made = forward.track_of(forward.simulated(known, terms, noise, seed, library))
+            made = forward.track_from_readings(
+                forward.simulate_readings(known, terms, noise, seed, library)
+            )
             return made.mag_b_gauss, _filtered([made], fit)
 
         return before_rounding(fit, replace(law, colour=(), level=level), steps[0], simulate)
@@ -210,14 +212,20 @@ def _innovations(
     seed: int,
 ) -> list[Array]:
     """Whitened innovations (N, 3) of simulations along the recording's motion."""
-    truth, track = forward.truth_along(fit.context()), fit.filtered.track
+    truth, track = forward.noise_free_readings(fit.context()), fit.filtered.track
     seeds = [1000 * seed + k for k in range(copies)]
     truths = [truth] * copies
     if any(term.identifier == _ROUNDED for term in terms):
         unsure = calibration_covariance(fit)
         truths = [readings_of_drawn_calibration(truth, unsure, one) for one in seeds]
     made = [
-        _losing(track, forward.track_of(forward.simulated(along, terms, noise, one, library)), one)
+        _losing(
+            track,
+            forward.track_from_readings(
+                forward.simulate_readings(along, terms, noise, one, library)
+            ),
+            one,
+        )
         for along, one in zip(truths, seeds, strict=True)
     ]
     whole = [track for track in made if len(track) == len(fit.filtered.track)]
@@ -367,7 +375,7 @@ def _joined(tracks: Sequence[Track]) -> Track:
         gyro_b_rad_s=np.vstack([track.gyro_b_rad_s for track in tracks]),
         accel_b_m_s2=None,
         covariates={},
-        runs=tuple(time_series.runs(dt_s)),
+        runs=tuple(time_series.gap_free_runs(dt_s)),
         lost_turns=np.concatenate(lost) if lost else None,
     )
 

@@ -59,7 +59,7 @@ def after_columns_begin(track: Track) -> Track:
     if not track.covariates:
         return track
     mag = track.mag_b_gauss.copy()
-    for run in time_series.runs(track.dt_s):
+    for run in time_series.gap_free_runs(track.dt_s):
         before = track.time_s[run] - track.time_s[run.start] < priors.BEGIN_S
         if np.mean(before) < priors.BEGIN_SHARE:
             mag[run][before] = np.nan
@@ -82,7 +82,7 @@ def usual_step(dt_s: Array) -> float | None:
 
 def earlier(track: Track, values: Array, ago_s: float) -> Array:
     """What was logged beside a track's samples, (N,) or (N, k), as it was `ago_s` before."""
-    return time_series.earlier(values, track.time_s, track.dt_s, ago_s)
+    return time_series.delayed_values(values, track.time_s, track.dt_s, ago_s)
 
 
 def delayed_gyro(track: Track, tau_s: float, *, instants: bool = False) -> Track:

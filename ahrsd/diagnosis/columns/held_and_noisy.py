@@ -27,7 +27,7 @@ from scipy import fft
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.columns.roles import role_of
-from ahrsd.diagnosis.time_series import SPECTRUM_ROWS, denoised
+from ahrsd.diagnosis.time_series import SPECTRUM_ROWS, wiener_filter
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
@@ -127,7 +127,7 @@ def without_noise(values: Array) -> Array | None:
     own = values[how.first :: how.rows]
     if len(own) < SPECTRUM_ROWS or not _is_noise(own):
         return None
-    course = denoised(own[:, None])[:, 0]
+    course = wiener_filter(own[:, None])[:, 0]
     if np.var(course) < priors.COLUMN_COURSE * np.var(own):
         return None
     return how.between(course, len(values))

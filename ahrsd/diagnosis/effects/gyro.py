@@ -257,7 +257,7 @@ class GyroTimeLag(Effect):
         """What the gyro would have read `value` seconds ago in place of the present."""
         lag_s = float(value[0])
         others = readings.gyro_b_rad_s - readings.rate_b_rad_s
-        others = time_series.earlier(others, readings.time_s, readings.dt_s, lag_s)
+        others = time_series.delayed_values(others, readings.time_s, readings.dt_s, lag_s)
         return replace(readings, gyro_b_rad_s=time_series.delayed_rate(readings, lag_s) + others)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:

@@ -184,7 +184,7 @@ class DroppedSamples(Discrete):
         """The rows that are left; never the first."""
         draw = np.random.default_rng(setting["seed"]).random(len(readings.time_s))
         draw[0] = 1.0
-        return time_series.kept(readings, draw >= float(value[0]))
+        return time_series.select_rows(readings, draw >= float(value[0]))
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """Two in a hundred."""

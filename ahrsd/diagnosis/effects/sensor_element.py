@@ -296,7 +296,7 @@ def lines(residual: Array, gyro_b_rad_s: Array, dt_s: Array) -> tuple[Setting, .
     None that keeps step with the samples: no source outside the device does.  None where the
     vehicle turns to and fro: whatever the model lacks returns at that rate.
     """
-    run = max(time_series.runs(dt_s), key=lambda r: int(r.stop - r.start))
+    run = max(time_series.gap_free_runs(dt_s), key=lambda r: int(r.stop - r.start))
     values, step_s = residual[run] - residual[run].mean(axis=0), time_series.median_step(dt_s[run])
     if len(values) < 64 or not np.any(values):
         return ()
@@ -314,7 +314,7 @@ def lines(residual: Array, gyro_b_rad_s: Array, dt_s: Array) -> tuple[Setting, .
     found: list[Setting] = []
     for _ in range(_LINES + len(_IN_STEP)):
         at = int(np.argmax(power))
-        best = float(frequency[at] + time_series.peak(power, at) * frequency[1])
+        best = float(frequency[at] + time_series.parabola_peak_offset(power, at) * frequency[1])
         mains = [f for f in _MAINS_HZ if abs(aliased(f, 1 / step_s) - best) < width + 5e-4 * f]
         if mains or min(abs(best * step_s - part) for part in _IN_STEP) > width * step_s / 4:
             found.append({"frequency_hz": best, "searched": len(values) // 2, "mains_hz": mains})
@@ -344,7 +344,7 @@ def _background(power: Array) -> Array:
 def _last_update(dt_s: Array, setting: Setting) -> Rows:
     """Row of the last update for each row, counted within runs."""
     out = np.empty(len(dt_s), dtype=np.intp)
-    for run in time_series.runs(dt_s):
+    for run in time_series.gap_free_runs(dt_s):
         row = np.arange(run.stop - run.start)
         back = (row - setting["phase"]) % setting["hold_samples"]
         out[run] = run.start + np.maximum(row - back, 0)

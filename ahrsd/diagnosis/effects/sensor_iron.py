@@ -154,7 +154,7 @@ class Hysteresis(Linear):
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """Between -1 and 1 per axis."""
         induced, radius = readings.field_b @ readings.soft_iron.T, setting["radius_gauss"]
-        gap = (time_series.play(induced, radius, setting.get("memory")) - induced) / radius
+        gap = (time_series.play_operator(induced, radius, setting.get("memory")) - induced) / radius
         return Columns(mag=np.asarray(gap[:, :, None] * np.eye(3)))
 
 

@@ -92,7 +92,7 @@ class MagTimeLag(Effect):
         delay_s = np.full(len(readings.time_s), lag_s)
         field = time_series.delayed_field(readings, delay_s) @ readings.soft_iron.T
         others = readings.mag_b_gauss - readings.field_b @ readings.soft_iron.T
-        others = time_series.earlier(others, readings.time_s, readings.dt_s, lag_s)
+        others = time_series.delayed_values(others, readings.time_s, readings.dt_s, lag_s)
         return replace(readings, mag_b_gauss=field + others)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
@@ -135,7 +135,7 @@ class MagLowPass(Linear):
         """What the filter takes away, per second of its time constant."""
         tau0 = setting["time_constant_s"]
         field_b, time_s, dt_s = readings.field_b, readings.time_s, readings.dt_s
-        change = time_series.low_pass_of_curves(field_b, time_s, dt_s, tau0) - field_b
+        change = time_series.low_pass_cubic(field_b, time_s, dt_s, tau0) - field_b
         others = readings.mag_b_gauss - field_b @ readings.soft_iron.T
         change = change @ readings.soft_iron.T + time_series.low_pass(others, dt_s, tau0) - others
         return Columns(mag=np.asarray(change / tau0)[:, :, None])

@@ -341,7 +341,7 @@ def _strongest_near(left: Array, phase: Array, time_s: Array) -> tuple[float, in
     sums, middle = np.add.reduceat(turned, starts), since[starts]
     power = np.sum(np.abs(np.exp(-2j * np.pi * np.outer(off_hz, middle)) @ sums) ** 2, axis=1)
     best = int(np.argmax(power))
-    return float(off_hz[best]) + time_series.peak(power, best) * float(
+    return float(off_hz[best]) + time_series.parabola_peak_offset(power, best) * float(
         off_hz[1] - off_hz[0]
     ), reach + 1
 

@@ -50,7 +50,12 @@ from ahrsd.diagnosis.innovation_filter.innovation import (
     predicted_field,
 )
 from ahrsd.diagnosis.model import Context
-from ahrsd.diagnosis.time_series import SPECTRUM_ROWS, both_ways, denoised, gaussian
+from ahrsd.diagnosis.time_series import (
+    SPECTRUM_ROWS,
+    gaussian_smooth,
+    two_sided_sums,
+    wiener_filter,
+)
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
@@ -186,8 +191,8 @@ def _low_pass(values: Array, width: float) -> Array:
     if len(values) < 3:
         return values.copy()
     centre = values.mean(axis=0)
-    once = gaussian(values - centre, width)
-    twice = gaussian(once, width)
+    once = gaussian_smooth(values - centre, width)
+    twice = gaussian_smooth(once, width)
     return np.asarray(2 * once - twice + centre)
 
 
@@ -205,8 +210,8 @@ def rate_without_own_row(rate: Array, smooth: Array, width: float) -> Array:
     impulse = np.zeros((2 * int(_REACH * width) + 3, 1))
     middle = len(impulse) // 2
     impulse[middle] = 1.0
-    once = gaussian(impulse, width)
-    own = float((2 * once - gaussian(once, width))[middle, 0])
+    once = gaussian_smooth(impulse, width)
+    own = float((2 * once - gaussian_smooth(once, width))[middle, 0])
     others = (smooth - own * rate) / (1.0 - own)
     # an axis that is its mean contains nothing of a single row
     return np.where(np.ptp(smooth, axis=0) > 0.0, others, smooth)
@@ -296,7 +301,7 @@ def _smoothed_in_carried_frame(
     keep = np.exp(-1.0 / width)
     out = np.empty_like(moved)
     for run in runs:
-        out[run] = both_ways(moved[run], keep)
+        out[run] = two_sided_sums(moved[run], keep)
     return np.asarray(out)
 
 
@@ -336,5 +341,5 @@ def denoised_force(accel_b_m_s2: Array, runs: Sequence[slice]) -> Array:
     out = accel_b_m_s2.copy()
     for run in runs:
         if run.stop - run.start >= SPECTRUM_ROWS and np.isfinite(out[run]).all():
-            out[run] = denoised(accel_b_m_s2[run])
+            out[run] = wiener_filter(accel_b_m_s2[run])
     return out

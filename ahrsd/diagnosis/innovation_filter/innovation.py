@@ -55,7 +55,7 @@ from ahrsd.diagnosis.innovation_filter.parallel_scan import (
     products_before,
 )
 from ahrsd.diagnosis.model import Columns, NullModel
-from ahrsd.diagnosis.time_series import both_ways
+from ahrsd.diagnosis.time_series import two_sided_sums
 from ahrsd.diagnosis.track import Track
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
@@ -323,7 +323,7 @@ def _nominal_field(
     out = np.empty_like(carried)
     firsts = layout.starts[layout.opens]
     for first, last in zip(firsts, [*firsts[1:], len(field)], strict=True):
-        out[first:last] = both_ways(carried[first:last], 1.0 - forget)
+        out[first:last] = two_sided_sums(carried[first:last], 1.0 - forget)
         near = np.flatnonzero(seen[first:last])
         far = np.flatnonzero(np.max(np.abs(out[first:last]), axis=1) < _NEGLIGIBLE_GAUSS)
         if len(near) and len(far):

@@ -23,7 +23,7 @@ from ahrsd.diagnosis.answer.null_simulations import (
 from ahrsd.diagnosis.answer.text import verdict
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import problem_of
-from ahrsd.diagnosis.repaired_model.forward import noise_of
+from ahrsd.diagnosis.repaired_model.forward import model_noise
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.simulation import Experiment
 
@@ -156,8 +156,8 @@ def test_a_copy_has_the_motion_the_noise_and_the_stamps() -> None:
     truth = motion_of(track, model)
     clean = track_of(_made(0.0, 0.0)).gyro_b_rad_s
     assert np.std(truth.gyro_b_rad_s - clean) < 0.1 * 5e-2
-    one = copy_of(track, truth, noise_of(model), seed=3)
+    one = copy_of(track, truth, model_noise(model), seed=3)
     assert np.array_equal(one.time_s, track.time_s)
     assert np.std(one.gyro_b_rad_s - truth.gyro_b_rad_s) == pytest.approx(5e-2, rel=0.03)
     assert np.std(one.mag_b_gauss - truth.mag_b_gauss) == pytest.approx(1e-4, rel=0.03)
-    assert np.array_equal(one.mag_b_gauss, copy_of(track, truth, noise_of(model), 3).mag_b_gauss)
+    assert np.array_equal(one.mag_b_gauss, copy_of(track, truth, model_noise(model), 3).mag_b_gauss)

@@ -19,13 +19,13 @@ from ahrsd.diagnosis.repaired_model import forward
 def recorded(name=None, strength=1.0, seed=0, rows=3000):
     """The null that is fitted to a recording, with an effect or without."""
     context, _ = moving(11, rows=rows)
-    truth = forward.truth_along(context)
+    truth = forward.noise_free_readings(context)
     terms = ()
     if name is not None:
         value, setting = EFFECTS[name].example(truth, strength)
         terms = (Term(name, value, 0.1 * np.abs(value), setting),)
-    made = forward.simulated(truth, terms, forward.noise_of(context.model), seed)
-    track = forward.track_of(made)
+    made = forward.simulate_readings(truth, terms, forward.model_noise(context.model), seed)
+    track = forward.track_from_readings(made)
     model = replace(context.model, gyro_walk_rad_s_sqrt_s=0.0)
     return fit_null(track, start=model, walk=False)
 
@@ -57,8 +57,10 @@ def test_noise_of_any_colour_and_tail_is_inside_and_so_is_a_reading_now_and_then
 ):
     context, _ = moving(11, rows=3000)
     model = replace(context.model, gyro_walk_rad_s_sqrt_s=0.0)
-    noise = replace(forward.noise_of(model), colour=colour, freedom=freedom)
-    track = forward.track_of(forward.simulated(forward.truth_along(context), (), noise, 3))
+    noise = replace(forward.model_noise(model), colour=colour, freedom=freedom)
+    track = forward.track_from_readings(
+        forward.simulate_readings(forward.noise_free_readings(context), (), noise, 3)
+    )
     mag = track.mag_b_gauss.copy()
     mag[np.arange(len(track)) % read != 0] = np.nan
     null = fit_null(replace(track, mag_b_gauss=mag), start=model, walk=False)
@@ -71,8 +73,10 @@ def test_the_noise_is_as_loud_as_it_is_where_it_is_loud():
     model = replace(context.model, gyro_walk_rad_s_sqrt_s=0.0)
     time_s = context.track.time_s
     level = np.where((time_s > 30) & (time_s < 60), 3.0, 1.0)
-    noise = replace(forward.noise_of(model), level=level)
-    track = forward.track_of(forward.simulated(forward.truth_along(context), (), noise, 3))
+    noise = replace(forward.model_noise(model), level=level)
+    track = forward.track_from_readings(
+        forward.simulate_readings(forward.noise_free_readings(context), (), noise, 3)
+    )
     fit = fit_null(track, start=model, walk=False)
     law = predictive_checks.noise_law(fit, [(30.0, 60.0)])
     loud = law.level[(time_s > 31) & (time_s < 59)]
@@ -94,8 +98,10 @@ def test_readings_in_coarse_steps_are_simulated_so_and_their_noise_is_what_was_t
     context, _ = moving(11, rows=3000)
     model = replace(context.model, gyro_walk_rad_s_sqrt_s=0.0)
     steps = Term("mag_quantisation", np.array([step_gauss]), np.array([1e-6]))
-    noise = forward.noise_of(model)
-    track = forward.track_of(forward.simulated(forward.truth_along(context), [steps], noise, 3))
+    noise = forward.model_noise(model)
+    track = forward.track_from_readings(
+        forward.simulate_readings(forward.noise_free_readings(context), [steps], noise, 3)
+    )
     fit = fit_null(track, start=model, walk=False)
     law = predictive_checks.usual_noise(fit, terms=[steps])
     assert law.mag_gauss == pytest.approx(model.sigma_mag_gauss, rel=0.1)
@@ -156,8 +162,10 @@ def test_a_recording_that_lost_turns_looks_like_its_simulations():
     """What is lost unseen jumps by a few deviations of a reading: here by 2, at 3 rows in 100."""
     context, _ = moving(11, rows=4000)
     model = replace(context.model, gyro_walk_rad_s_sqrt_s=0.0)
-    truth = forward.truth_along(context)
-    made = forward.track_of(forward.simulated(truth, (), forward.noise_of(model), 5))
+    truth = forward.noise_free_readings(context)
+    made = forward.track_from_readings(
+        forward.simulate_readings(truth, (), forward.model_noise(model), 5)
+    )
     told = replace(made, lost_turns=np.full(4000, 0.03), step_share=0.15)
     track = replace(told, gyro_b_rad_s=predictive_checks._losing(told, made, 77).gyro_b_rad_s)
     fit = fit_null(track, start=model, walk=False)

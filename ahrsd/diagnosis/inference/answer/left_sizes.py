@@ -220,7 +220,7 @@ def with_channels(
         return left
     frame, track = left.where.frame, found.all_sets.made.context.track
     like = [one for course in courses if course.frame == frame
-            for one in locate.matches(track, course)]  # fmt: skip
+            for one in locate.matching_channels(track, course)]  # fmt: skip
     follows = tuple(
         Suspect(one.channel, one.correlation, one.p_value)
         for one in like

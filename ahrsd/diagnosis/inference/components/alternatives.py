@@ -16,7 +16,7 @@ import numpy as np
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.inference.components.component import Component, Law, Sized
 from ahrsd.diagnosis.inference.components.gaussian_process import CourseLaw, course
-from ahrsd.diagnosis.model import Columns, Context, directions
+from ahrsd.diagnosis.model import Columns, Context, unit_vectors
 from ahrsd.diagnosis.where_and_when.regime import heading_columns
 from ahrsd.estimator.locked import harmonics, on_each_axis
 from ahrsd.samples import Array
@@ -88,7 +88,7 @@ def varying(known: Component, added: Array, context: Context) -> list[Component]
     order = np.arange(1, _WAVES + 1)
     phase = np.pi * (time_s - time_s[0]) / (time_s[-1] - time_s[0])
     in_time = CourseLaw(order.astype(float), 1.0, most=priors.VARIES_MOST)
-    unit = directions(context.field_b)
+    unit = unit_vectors(context.field_b)
     degree_1_and_2 = np.column_stack([np.sqrt(3.0) * unit, harmonics(context.field_b)[:, :5]])
     low, high = (np.array([np.log(one)]) for one in (priors.COURSE_SIZES[0], priors.VARIES_MOST))
     in_attitude = Sized(np.ones(degree_1_and_2.shape[1]), low, high)

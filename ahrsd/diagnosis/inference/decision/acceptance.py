@@ -36,7 +36,7 @@ from ahrsd.diagnosis.inference.search.model_search import (
     at_its_moments,
     come_and_gone,
 )
-from ahrsd.diagnosis.where_and_when.locate import single_source
+from ahrsd.diagnosis.where_and_when.locate import single_source_direction
 
 
 def accepted(
@@ -262,7 +262,7 @@ def _of_one_source(
     unknown = [key for key in set(members) - set(named) if not is_ordinary(all_sets, best, key)]
     added = {key: added_by(all_sets, best, key)[0] for key in (*named, *unknown)}
     for key in sorted(unknown, key=lambda one: -odds[one]):
-        direction, share = single_source(added[key], np.ones(len(added[key])))
+        direction, share = single_source_direction(added[key], np.ones(len(added[key])))
         if share < priors.MAINLY_ONE:
             continue
         alike = [one for one in named if is_along(direction, added[one])]

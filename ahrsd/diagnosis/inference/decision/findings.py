@@ -28,7 +28,7 @@ from ahrsd.diagnosis.inference.search.model_search import (
 )
 from ahrsd.diagnosis.inference.search.near_settings import changed, opened
 from ahrsd.diagnosis.model import Term
-from ahrsd.diagnosis.where_and_when.address import where_of
+from ahrsd.diagnosis.where_and_when.address import locate_contribution
 from ahrsd.samples import Array
 
 
@@ -143,7 +143,7 @@ def _shares(all_sets: Hypotheses, space: Space, best: Hypothesis, key: str) -> d
 def _where(all_sets: Hypotheses, best: Hypothesis, key: str, frame: str) -> Where:
     """When, on which axes and in which regime a member acts, told in a frame."""
     one, track = all_sets.component(key), all_sets.made.context.track
-    return where_of(track, added_by(all_sets, best, key)[0], one.setting, frame)
+    return locate_contribution(track, added_by(all_sets, best, key)[0], one.setting, frame)
 
 
 def drift_finding(

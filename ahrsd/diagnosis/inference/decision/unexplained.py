@@ -19,8 +19,8 @@ from ahrsd.diagnosis.inference.decision.members import (
 )
 from ahrsd.diagnosis.inference.likelihood.directed_noise import Directed
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space
-from ahrsd.diagnosis.where_and_when.address import AXES, departures
-from ahrsd.diagnosis.where_and_when.locate import Frame, single_source, unit_columns
+from ahrsd.diagnosis.where_and_when.address import AXES, departure_intervals
+from ahrsd.diagnosis.where_and_when.locate import Frame, single_source_direction, unit_columns
 from ahrsd.samples import Array
 
 #: moments at which a course is drawn over a recording, and at least in a spell
@@ -107,7 +107,7 @@ def along_its_direction(
 
 def is_along(direction: Array, added: Array) -> bool:
     """Whether what a name adds has one direction, and nearly this one."""
-    own, share = single_source(added, np.ones(len(added)))
+    own, share = single_source_direction(added, np.ones(len(added)))
     return bool(share > priors.ONE_SOURCE and abs(own @ direction) > priors.SAME_DIRECTION)
 
 
@@ -122,7 +122,7 @@ def _course(all_sets: Hypotheses, best: Hypothesis, key: str, odds: float) -> Un
     waves = np.cos(phase[:, None] * order)
     course = waves @ modes
     deviation = np.sqrt(np.mean(waves**2 @ unsure**2, axis=1))
-    away = departures(edges, course, deviation)
+    away = departure_intervals(edges, course, deviation)
     spans = away or [(float(time_s[0]), float(time_s[-1]))]
     return _described(at, course, one.frame, odds, tuple(spans))
 
@@ -145,7 +145,7 @@ def _other(all_sets: Hypotheses, best: Hypothesis, keys: Sequence[str], odds: fl
         edges = np.array(one.setting["edges_s"])
         levels = drawn((edges[1:] + edges[:-1]) / 2)
         unsure = float(np.max(coefficients(all_sets, best, keys[0])[1]))
-        spans = tuple(departures(edges, levels, np.full(len(levels), unsure)))
+        spans = tuple(departure_intervals(edges, levels, np.full(len(levels), unsure)))
     return _described(at, drawn(at), one.frame, odds, spans)
 
 
@@ -153,7 +153,7 @@ def _described(
     at: Array, course: Array, frame: str, nats: float, spans: tuple[tuple[float, float], ...]
 ) -> Unexplained:
     """A course (k, 3) at times (k,) as what no name explains."""
-    direction, share = single_source(course, np.ones(len(at)))
+    direction, share = single_source_direction(course, np.ones(len(at)))
     source = course @ direction
     spread = course.std(axis=0)
     axes = tuple(axis for axis, size in zip(AXES, spread, strict=True) if size > 0.3 * spread.max())

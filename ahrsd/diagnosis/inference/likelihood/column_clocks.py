@@ -21,7 +21,7 @@ from ahrsd.diagnosis.inference.likelihood.evidence import At
 from ahrsd.diagnosis.inference.likelihood.linearisation import by_key, linearised
 from ahrsd.diagnosis.inference.likelihood.richest_model import RICH_COURSES, Judged, psi_by_key
 from ahrsd.diagnosis.model import Columns
-from ahrsd.diagnosis.where_and_when.locate import Located, segments
+from ahrsd.diagnosis.where_and_when.locate import Located, equal_segments
 
 _COURSE = RICH_COURSES[0]
 
@@ -39,7 +39,7 @@ def wrong_clock(found: Judged) -> Late | None:
 def _course(found: Judged) -> Located:
     """The free course on the sensor, stretch by stretch."""
     base, track = found.base, found.base.made.context.track
-    cut = segments(track.time_s, max(2, int(track.duration_s / priors.ON_TIME_S)))
+    cut = equal_segments(track.time_s, max(2, int(track.duration_s / priors.ON_TIME_S)))
     value, unsure = (
         by_key(base.made, base.whole, at)[_COURSE].reshape(-1, 3)
         for at in (found.at, replace(found.at, mean=found.at.deviation))

@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.inference.likelihood.noise_model import octaves
-from ahrsd.diagnosis.model import directions
+from ahrsd.diagnosis.model import unit_vectors
 from ahrsd.samples import Array
 
 #: directions to begin with, of each axis and of each octave's loudest, the likeliest of them
@@ -78,7 +78,7 @@ def directed(left: Array, field_b: Array, rate_hz: float, used: float) -> Direct
     count = len(left)
     edges = octaves(count)
     bands = [(max(1, int(a)), int(b)) for a, b in itertools.pairwise(edges)]
-    unit = directions(field_b)
+    unit = unit_vectors(field_b)
     with_field = np.sum(left * unit, axis=1, keepdims=True) * unit
     whole, along = (np.asarray(dct(one, axis=0, norm="ortho")) for one in (left, with_field))
     rows = np.array([max(b - a, 1) * used for a, b in bands])
