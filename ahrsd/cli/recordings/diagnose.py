@@ -47,7 +47,7 @@ def command(
                          diagnosis.json the answer
                          model.json     the repaired model: ahrsd simulate --model
     """
-    from ahrsd.diagnosis.answer.text import lines
+    from ahrsd.diagnosis.answer.text import answer_lines
     from ahrsd.offline.diagnose import diagnose_recording
 
     refuse_unwritable(json_path)
@@ -68,7 +68,7 @@ def command(
     if folder is not None:
         _write_report(folder, found)
     if json_path != "-":
-        click.echo("\n".join(lines(found)))
+        click.echo("\n".join(answer_lines(found)))
         if folder is not None:
             click.echo(f"report: {folder / 'report.html'}")
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
-from ahrsd.diagnosis.answer.null_simulations import Answered, beyond_chance
+from ahrsd.diagnosis.answer.null_simulations import FittedDiagnosis, diagnose_beyond_chance
 from ahrsd.diagnosis.calibration_fit.gyro_at_rest import at_rest, resting, told_at_rest
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null
 from ahrsd.diagnosis.calibration_fit.problem import Problem, problem_of
@@ -58,19 +58,19 @@ def diagnose(
     """
     known = spec or Spec()
     ask = partial(_answered, spec=known, library=library, simulated=simulated, clocks=True)
-    return replace(beyond_chance(track, ask), recording=recording)
+    return replace(diagnose_beyond_chance(track, ask), recording=recording)
 
 
 def _answered(
     track: Track, spec: Spec, library: Mapping[str, Effect], *, simulated: bool, clocks: bool
-) -> Answered:
+) -> FittedDiagnosis:
     """The answer, whatever is to be expected of it by chance.
 
     clocks: whether a column may run by another clock than the sensor
     """
     asked = prepared(track)
     if (nothing := asked.stopped("", library)) is not None:
-        return Answered(nothing)
+        return FittedDiagnosis(nothing)
     problem, start = begun(asked.put_right(), spec)
     came, counted = problem.recorded, asked
     if lost := lost_turns(came, problem.cold):
@@ -106,4 +106,4 @@ def _answered(
         spec_given=spec.sigma_mag_gauss is not None,
         simulated=simulated,
     )
-    return Answered(told, problem, start)
+    return FittedDiagnosis(told, problem, start)

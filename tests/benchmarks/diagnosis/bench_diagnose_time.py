@@ -49,7 +49,7 @@ PHASES = {
     **dict.fromkeys(("prepared", "problem_of", "fit_null", "lost_turns", "wrong_clock"), engine),
     "richest": richest_model,
     **dict.fromkeys(("answered", "quick"), both_rates),
-    **dict.fromkeys(("lost_beside", "whole_answer", "beyond_chance"), engine),
+    **dict.fromkeys(("lost_beside", "whole_answer", "diagnose_beyond_chance"), engine),
 }
 
 

@@ -22,8 +22,13 @@ from scipy.fft import idct
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Check, RegimeMap, Whiteness
-from ahrsd.diagnosis.answer.omnibus import omnibus
-from ahrsd.diagnosis.answer.predictive_checks import COPIES, bands, scene_of, statistics
+from ahrsd.diagnosis.answer.omnibus import omnibus_tests
+from ahrsd.diagnosis.answer.predictive_checks import (
+    COPIES,
+    build_scene,
+    predictive_bands,
+    residual_statistics,
+)
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, Linearised, by_frequency
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
@@ -100,16 +105,20 @@ def _compared(
 ) -> tuple[dict[str, float], dict[str, float], dict[str, tuple[float, float]]]:
     """Statistics before and after, and the bands of copies."""
     rows = found.rows
-    scene, shape = scene_of(rows.made.context), (-1, 3)
+    scene, shape = build_scene(rows.made.context), (-1, 3)
 
     def stated(left: Array) -> dict[str, float]:
-        return statistics(rows.in_track(left.reshape(shape)), scene)
+        return residual_statistics(rows.in_track(left.reshape(shape)), scene)
 
     rng = np.random.default_rng(0)
     e = _drawn(rng, found, (len(found.after), COPIES))
     w = rng.standard_normal((rows.X.shape[2], COPIES)) * found.whole.deviation[:, None]
     copies = found.whole.left(e + found.whole.X @ w)
-    return stated(found.before), stated(found.after), bands([stated(one) for one in copies.T])
+    return (
+        stated(found.before),
+        stated(found.after),
+        predictive_bands([stated(one) for one in copies.T]),
+    )
 
 
 def _drawn(rng: np.random.Generator, found: Residuals, shape: tuple[int, int]) -> Array:
@@ -158,10 +167,10 @@ def whiteness(start: NullFit, found: Residuals) -> dict[str, Whiteness]:
     """Tests that need no idea of what may be wrong, of the null and of what the answer leaves."""
     context = found.rows.made.context
     left = replace(found.rows.made.point.filtered, whitened=found.whitened)
-    later = {test.name: test.p_value for test in omnibus(left, context)}
+    later = {test.name: test.p_value for test in omnibus_tests(left, context)}
     return {
         test.name: Whiteness(test.words, test.p_value, later.get(test.name, 1.0))
-        for test in omnibus(start.filtered, start.context())
+        for test in omnibus_tests(start.filtered, start.context())
     }
 
 
