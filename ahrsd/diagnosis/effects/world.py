@@ -32,6 +32,7 @@ _BUMP_LENGTHS_S = (4.0, 12.0, 36.0)
 _BUMPS = 2
 _DISTANCES_M = (1.0, 3.0)
 _SIDES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+#: metres; least distance of an object from the path
 NEAREST_M = 0.2
 _PATH_PLACES = 5  # further places along the path around which it is searched for
 _SIGNIFICANT = 4.0  # usual departures of the magnitude from which an object is located
@@ -50,7 +51,6 @@ _STARTS_M = (
     (-1.5, -1.5, 0.5),
 )
 _TURNS_RAD = (-np.pi / 2, np.pi / 2, np.pi)  # of a frame of positions that does not point north
-_NEAREST_M = 0.2
 
 
 class FieldGradient(Linear):
@@ -396,7 +396,7 @@ def unit_dipole_fields(away_m: Array, distance_m: float, axes: Array | None = No
     axes: (N, 3, 3) the world's axes in the frame of the result; the world's own if None
     """
     size = np.sqrt(np.einsum("ni,ni->n", away_m, away_m))
-    distance = np.maximum(size, _NEAREST_M / 4)
+    distance = np.maximum(size, NEAREST_M / 4)
     r = away_m / distance[:, None]
     strength = (distance_m / distance) ** 3
     seen = r if axes is None else np.einsum("nij,nj->ni", axes, r)
@@ -430,7 +430,7 @@ def locate_dipole(
         columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         right = columns.T @ size
         ridge = columns.T @ columns + 1e-9 * np.eye(4)
-        outside = max(_NEAREST_M - float(np.linalg.norm(way - place, axis=1).min()), 0.0)
+        outside = max(NEAREST_M - float(np.linalg.norm(way - place, axis=1).min()), 0.0)
         return float(size @ size - right @ np.linalg.solve(ridge, right)) * (1 + outside)
 
     starts = [np.append(place_m[row] + np.array(start), 0.0) for start in _STARTS_M]
