@@ -123,31 +123,31 @@ def cut_track(track: Track, begin_s: float, end_s: float) -> Track:
 
 def remove_common_findings(real: Diagnosis, simulated: Diagnosis) -> Diagnosis:
     """The recording's diagnosis without the findings that the simulation has to the same size."""
-    kept: list[Finding] = []
+    remaining: list[Finding] = []
     notes: list[str] = []
     by_effect = {finding.effect: finding for finding in simulated.findings}
     for finding in real.findings:
-        twin = by_effect.get(finding.effect)
-        if twin is not None and _same_size(finding, twin):
+        counterpart = by_effect.get(finding.effect)
+        if counterpart is not None and _same_size(finding, counterpart):
             notes.append(f"{finding.effect} is in the simulation already, to the same size")
         else:
-            kept.append(finding)
+            remaining.append(finding)
     only = [effect for effect in by_effect if effect not in {one.effect for one in real.findings}]
     notes += [f"the simulation has {effect}, the recording does not show it" for effect in only]
     notes += _calibration_notes(real, simulated)
-    mismatch = bool(kept) or real.unexplained.detected or bool(only)
-    return replace(real, findings=tuple(kept), mismatch=mismatch, notes=(*real.notes, *notes))
+    mismatch = bool(remaining) or real.unexplained.detected or bool(only)
+    return replace(real, findings=tuple(remaining), mismatch=mismatch, notes=(*real.notes, *notes))
 
 
 def _same_size(one: Finding, other: Finding) -> bool:
     """True if all parameters agree within their standard deviations."""
     values = {value.name: value for value in other.parameters}
     for value in one.parameters:
-        twin = values.get(value.name)
-        if twin is None:
+        counterpart = values.get(value.name)
+        if counterpart is None:
             return False
-        sigma = float(np.hypot(value.std, twin.std))
-        if not abs(value.value - twin.value) <= priors.SAME_SIGMAS * max(sigma, 1e-12):
+        sigma = float(np.hypot(value.std, counterpart.std))
+        if not abs(value.value - counterpart.value) <= priors.SAME_SIGMAS * max(sigma, 1e-12):
             return False
     return True
 

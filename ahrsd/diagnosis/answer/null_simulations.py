@@ -135,10 +135,10 @@ def diagnose_beyond_chance(track: Track, diagnose: Callable[[Track], FittedDiagn
     recorded = problem.recorded
     models = [model_at_rate(start.model, problem), *([found.model] if found.model else [])]
     model = max(models, key=lambda one: gyro_to_mag_noise(recorded, one))
-    loud = gyro_to_mag_noise(recorded, model) >= priors.CHANCE_LOUD
-    if not loud and calibration_bend(start) < priors.CHANCE_BENT:
+    noisy = gyro_to_mag_noise(recorded, model) >= priors.CHANCE_LOUD
+    if not noisy and calibration_bend(start) < priors.CHANCE_BENT:
         return found
-    why = LOUD if loud else BENT
+    why = LOUD if noisy else BENT
     truth = noise_free_motion(recorded, model)
     for noise in _candidate_noises(model, start):
         copies = [
@@ -195,8 +195,8 @@ def noise_free_motion(track: Track, model: NullModel) -> Readings:
     seen = nominal_motion(track, model)
     context = build_context(track, UnfittedMotion(seen))
     rate = _denoised_rate(track, model)
-    quiet = replace(seen, orientation=carried_orientation(track, rate))
-    R_nb, levelled = attitude(track, quiet)
+    denoised_motion = replace(seen, orientation=carried_orientation(track, rate))
+    R_nb, levelled = attitude(track, denoised_motion)
     along = replace(
         context, R_nb=R_nb, world_levelled=levelled, rate_b_rad_s=rate, field_b=seen.nominal_b
     )
@@ -270,8 +270,8 @@ def _agreement_note(
 
 def _reported_effects(found: Diagnosis) -> str:
     """The reported effects that rest on a fit."""
-    names = [one.effect for one in found.findings if _is_fitted(one)]
-    return ", ".join([*names, *(["something unknown"] if found.unexplained.detected else [])])
+    effects = [one.effect for one in found.findings if _is_fitted(one)]
+    return ", ".join([*effects, *(["something unknown"] if found.unexplained.detected else [])])
 
 
 def _reported_evidence(found: Diagnosis) -> list[float]:

@@ -37,22 +37,27 @@ class Test:
     words: str
 
 
-def omnibus_tests(done: Filtered, context: Context | None = None) -> tuple[Test, ...]:
+def omnibus_tests(filtered: Filtered, context: Context | None = None) -> tuple[Test, ...]:
     """All tests; those of the variance only with a context.
 
     None below 100 innovations, where an axis does not vary at all, and where the magnetometer has
     less noise than the fit assumes at least: then the assumed noise along the field is absent, and
     the tests would show nothing else.
     """
-    rows = done.whitened[done.used]
+    rows = filtered.whitened[filtered.used]
     if len(rows) < 100 or np.any(np.std(rows, axis=0) < 1e-9):
         return ()
-    assumed = done.model.sigma_mag_gauss <= priors.FLOOR_MAG_GAUSS
+    assumed = filtered.model.sigma_mag_gauss <= priors.FLOOR_MAG_GAUSS
     if assumed and np.mean(rows**2) < priors.ABSENT_NOISE:
         return ()
-    out = [_level_test(rows), _ljung_box_test(done), _periodogram_test(done), _normality_test(rows)]
+    out = [
+        _level_test(rows),
+        _ljung_box_test(filtered),
+        _periodogram_test(filtered),
+        _normality_test(rows),
+    ]
     if context is not None:
-        out.append(variance_test(done, variance_covariates(context)))
+        out.append(variance_test(filtered, variance_covariates(context)))
     return tuple(out)
 
 
@@ -63,10 +68,10 @@ def _level_test(rows: Array) -> Test:
     return Test("normalised_innovation", total / freedom, 1.0, float(min(1.0, 2 * tail)), "level")
 
 
-def _ljung_box_test(done: Filtered) -> Test:
+def _ljung_box_test(filtered: Filtered) -> Test:
     """Autocorrelation to lag 20 of the three axes together; rows without a reading count as 0."""
-    rows = np.where(done.used[:, None], done.whitened, 0.0)
-    count = int(np.count_nonzero(done.used))
+    rows = np.where(filtered.used[:, None], filtered.whitened, 0.0)
+    count = int(np.count_nonzero(filtered.used))
     power = np.sum(rows**2, axis=0)
     q = 0.0
     for lag in range(1, LAGS + 1):
@@ -76,9 +81,9 @@ def _ljung_box_test(done: Filtered) -> Test:
     return Test("ljung_box", q, freedom, chi2_above(q, freedom), "whiteness over time")
 
 
-def _periodogram_test(done: Filtered) -> Test:
+def _periodogram_test(filtered: Filtered) -> Test:
     """Bartlett's test: largest distance of the cumulative periodogram from the diagonal."""
-    rows = np.where(done.used[:, None], done.whitened, 0.0)
+    rows = np.where(filtered.used[:, None], filtered.whitened, 0.0)
     power = np.abs(np.fft.rfft(rows - rows.mean(axis=0), axis=0))[1:-1] ** 2
     share = np.cumsum(power, axis=0) / np.sum(power, axis=0)
     count = len(share)
@@ -110,18 +115,18 @@ def variance_covariates(context: Context) -> dict[str, Array]:
     return out
 
 
-def variance_test(done: Filtered, columns: Mapping[str, Array]) -> Test:
+def variance_test(filtered: Filtered, columns: Mapping[str, Array]) -> Test:
     """Do the squared innovations depend on any column?  Koenker's n R^2, robust to heavy tails.
 
     words: the column of largest correlation.
     """
-    square = np.sum(done.whitened[done.used] ** 2, axis=1)
+    square = np.sum(filtered.whitened[filtered.used] ** 2, axis=1)
     names, kept = [], []
     for name, values in columns.items():
-        mine = values[done.used]
-        if np.isfinite(mine).all() and np.std(mine) > 1e-9 * (np.abs(mine).max() + 1e-300):
+        used = values[filtered.used]
+        if np.isfinite(used).all() and np.std(used) > 1e-9 * (np.abs(used).max() + 1e-300):
             names.append(name)
-            kept.append((mine - mine.mean()) / mine.std())
+            kept.append((used - used.mean()) / used.std())
     if not kept:
         return Test("variance", 0.0, 0.0, 1.0, "no column to follow")
     X = np.column_stack(kept)

@@ -60,8 +60,8 @@ def check_null(null: NullFit) -> dict[str, Check]:
     context = null.context()
     scene, found = build_scene(context), _CalibrationColumns.of(null)
     value = residual_statistics(found.left(null.filtered.whitened), scene)
-    made = _simulated_innovations(null, fit_noise_law(null), (), EFFECTS, COPIES, 0)
-    expected = predictive_bands([residual_statistics(found.left(e), scene) for e in made])
+    simulated = _simulated_innovations(null, fit_noise_law(null), (), EFFECTS, COPIES, 0)
+    expected = predictive_bands([residual_statistics(found.left(e), scene) for e in simulated])
     return {
         name: Check(value[name], band, inside := _inside(value[name], band), inside)
         for name, band in expected.items()
@@ -101,60 +101,64 @@ def _fit_statistics(fit: NullFit) -> dict[str, float]:
 
 def fit_noise_law(
     fit: NullFit,
-    loud: Sequence[tuple[float, float]] = (),
+    noisy_intervals: Sequence[tuple[float, float]] = (),
     terms: Sequence[Term] = (),
     library: Mapping[str, Effect] = EFFECTS,
 ) -> Noise:
     """The noise of a fit: levels, colour, and Student-t tails where they are heavy.
 
-    loud: intervals in seconds that have a level of their own, each relative to the filter's.
+    noisy_intervals: in seconds; they have a level of their own, each relative to the filter's.
     Readings in coarse steps (a term) are rounded after the noise.
     Residuals that are constant for 20 s in the sensor's axes or the world's, beyond what the colour
     of the remaining noise explains, are no noise and left out.  The colour is such that the
     innovations of simulations have the colour of the recording's.
     """
-    done, quick = fit.filtered, _without_segment_means(fit, fit.filtered.whitened)
-    slow = done.normalised_innovation - quick.normalised_innovation
-    if slow > priors.SLOW_BEYOND * _slow_power(quick, segment_index(done.track)):
-        done = quick
-    within = np.zeros(len(done.track), dtype=bool)
-    for begin, end in loud:
-        within |= (done.track.time_s >= begin) & (done.track.time_s <= end)
-    law = forward.model_noise(fit.model, done)
+    filtered, quick = fit.filtered, _without_segment_means(fit, fit.filtered.whitened)
+    slow = filtered.normalised_innovation - quick.normalised_innovation
+    if slow > priors.SLOW_BEYOND * _slow_power(quick, segment_index(filtered.track)):
+        filtered = quick
+    within = np.zeros(len(filtered.track), dtype=bool)
+    for begin, end in noisy_intervals:
+        within |= (filtered.track.time_s >= begin) & (filtered.track.time_s <= end)
+    law = forward.model_noise(fit.model, filtered)
     steps = [float(term.value[0]) for term in terms if term.identifier == _QUANTISATION]
-    gyro_power = 0.0 if steps else _gyro_noise_share(fit, law, terms, library, quick=done is quick)
+    gyro_power = (
+        0.0 if steps else _gyro_noise_share(fit, law, terms, library, quick=filtered is quick)
+    )
     level = np.ones(len(within))
     for rows in (within, ~within):
-        if np.any(rows & done.used):
-            mag_power = float(np.mean(done.whitened[rows & done.used] ** 2)) - gyro_power
+        if np.any(rows & filtered.used):
+            mag_power = float(np.mean(filtered.whitened[rows & filtered.used] ** 2)) - gyro_power
             level[rows] = np.sqrt(max(mag_power, _LEAST_MAG_NOISE**2) / (1.0 - gyro_power))
     if steps:
         truth, covariance = forward.noise_free_readings(fit.context()), calibration_covariance(fit)
 
         def simulate(noise: Noise, seed: int) -> tuple[Array, Array]:
             known = readings_of_drawn_calibration(truth, covariance, seed) if seed else truth
-            made = forward.track_from_readings(
+            simulated = forward.track_from_readings(
                 forward.simulate_readings(known, terms, noise, seed, library)
             )
-            return made.mag_b_gauss, _filter_tracks([made], fit)
+            return simulated.mag_b_gauss, _filter_tracks([simulated], fit)
 
         return before_rounding(fit, replace(law, colour=(), level=level), steps[0], simulate)
     law = replace(law, level=level)
-    if done.track.lost_turns is None:  # else lost turns make the tails, and these are simulated
+    if filtered.track.lost_turns is None:  # else lost turns make the tails, and these are simulated
         law = replace(
-            law, freedom=tail_freedom(replace(done, whitened=done.whitened / level[:, None]))
+            law,
+            freedom=tail_freedom(replace(filtered, whitened=filtered.whitened / level[:, None])),
         )
     if not law.colour:
         return law
     tried = int(np.clip(_TRIAL_ROWS // len(level), 1, _TRIAL_COPIES))
-    made = _simulated_innovations(fit, law, terms, library, tried, _TRIAL_SEED)
+    simulated = _simulated_innovations(fit, law, terms, library, tried, _TRIAL_SEED)
     seen = [
-        _without_segment_means(fit, e) if done is quick else replace(done, whitened=e) for e in made
+        _without_segment_means(fit, e) if filtered is quick else replace(filtered, whitened=e)
+        for e in simulated
     ]
     stacked = np.concatenate([one.whitened for one in seen])
-    found = fit_colour(replace(done, whitened=stacked, used=np.tile(done.used, len(seen))))
-    colour, louder = colour_before_filter(fit_colour(done), found)
-    return replace(law, colour=tuple(colour.coefficients.tolist()), level=level * louder)
+    found = fit_colour(replace(filtered, whitened=stacked, used=np.tile(filtered.used, len(seen))))
+    colour, amplification = colour_before_filter(fit_colour(filtered), found)
+    return replace(law, colour=tuple(colour.coefficients.tolist()), level=level * amplification)
 
 
 def _gyro_noise_share(
@@ -169,20 +173,20 @@ def _gyro_noise_share(
 
     At least a third is the magnetometer's: along the field the gyro's noise has no effect.
     """
-    silent = replace(law, mag_gauss=0.0, colour=())
-    (made,) = _simulated_innovations(fit, silent, terms, library, 1, _TRIAL_SEED)
-    seen = _without_segment_means(fit, made).whitened if quick else made
+    gyro_only = replace(law, mag_gauss=0.0, colour=())
+    (simulated,) = _simulated_innovations(fit, gyro_only, terms, library, 1, _TRIAL_SEED)
+    seen = _without_segment_means(fit, simulated).whitened if quick else simulated
     return min(float(np.mean(seen[fit.filtered.used] ** 2)), _TANGENTIAL_SHARE)
 
 
 def constant_level_noise(
     fit: NullFit,
-    loud: Sequence[tuple[float, float]] = (),
+    noisy_intervals: Sequence[tuple[float, float]] = (),
     terms: Sequence[Term] = (),
     library: Mapping[str, Effect] = EFFECTS,
 ) -> Noise:
     """The noise law of a fit at one level, that of most rows."""
-    law = fit_noise_law(fit, loud, terms, library)
+    law = fit_noise_law(fit, noisy_intervals, terms, library)
     usual = 1.0 if law.level is None else float(np.median(law.level))
     return replace(law, mag_gauss=law.mag_gauss * usual, level=None)
 
@@ -224,7 +228,7 @@ def _simulated_innovations(
     if any(term.identifier == _QUANTISATION for term in terms):
         covariance = calibration_covariance(fit)
         truths = [readings_of_drawn_calibration(truth, covariance, one) for one in seeds]
-    made = [
+    simulated = [
         _lose_turns(
             track,
             forward.track_from_readings(
@@ -234,23 +238,23 @@ def _simulated_innovations(
         )
         for along, one in zip(truths, seeds, strict=True)
     ]
-    whole = [track for track in made if len(track) == len(fit.filtered.track)]
+    whole = [track for track in simulated if len(track) == len(fit.filtered.track)]
     return np.split(_filter_tracks(whole, fit), len(whole))
 
 
-def _lose_turns(track: Track, made: Track, seed: int) -> Track:
+def _lose_turns(track: Track, simulated: Track, seed: int) -> Track:
     """A simulation that loses as many turns as the recording is expected to have lost unseen.
 
     They are corrected on average: if a step loses n of them where m are expected, its true turn
     exceeds the gyro's by that of n - m device steps.
     """
     expected = track.lost_turns
-    if expected is None or len(made) != len(track):
-        return made
-    lost = np.random.default_rng([seed, len(made)]).poisson(expected)
+    if expected is None or len(simulated) != len(track):
+        return simulated
+    lost = np.random.default_rng([seed, len(simulated)]).poisson(expected)
     short = track.step_share * (lost - expected)
-    gyro = made.gyro_b_rad_s * (1.0 - short)[:, None]
-    return replace(made, gyro_b_rad_s=gyro, lost_turns=expected, step_share=track.step_share)
+    gyro = simulated.gyro_b_rad_s * (1.0 - short)[:, None]
+    return replace(simulated, gyro_b_rad_s=gyro, lost_turns=expected, step_share=track.step_share)
 
 
 def _inside(value: float, band: tuple[float, float]) -> bool:
@@ -307,10 +311,10 @@ def build_scene(context: Context) -> Scene:
         ),
         columns=_standardise(
             [
-                course
+                series
                 for values in track.covariates.values()
                 if np.isfinite(values).all() and np.ptp(values) > 0
-                for course in (values, time_series.derivative(values, track.time_s, track.dt_s))
+                for series in (values, time_series.derivative(values, track.time_s, track.dt_s))
             ]
         ).reshape(len(track), -1),
     )
@@ -424,8 +428,8 @@ def _portmanteau(e: Array) -> float:
     """Sum of squared autocorrelations times their number, over the number of lags."""
     count, axes = e.shape
     flat = e.ravel()
-    most = min(_LAGS, count - 1)
-    lags = [float(flat[: flat.size - k * axes] @ flat[k * axes :]) for k in range(most + 1)]
+    longest_lag = min(_LAGS, count - 1)
+    lags = [float(flat[: flat.size - k * axes] @ flat[k * axes :]) for k in range(longest_lag + 1)]
     return float(np.mean((np.array(lags[1:]) / max(lags[0], _TINY)) ** 2) * 3 * count)
 
 
@@ -438,9 +442,9 @@ def _largest_segment_mean(values: Array, scene: Scene) -> float:
     return float(means.max(initial=0.0))
 
 
-def _largest_correlation(values: Array, courses: Array) -> float:
+def _largest_correlation(values: Array, series: Array) -> float:
     """Largest correlation of a column (N, k) with a series (N, c), in deviations of unit noise."""
-    return float(np.abs(values.T @ courses).max())
+    return float(np.abs(values.T @ series).max())
 
 
 def _standardise(values: Sequence[Array]) -> Array:

@@ -86,12 +86,12 @@ def verdict(found: Diagnosis) -> str:
     """One sentence."""
     names = len(found.findings)
     failed, ordinary = found.failed_checks, ordinary_residual(found)
-    said = "" if ordinary is None else ordinary_text(ordinary)
+    ordinary_words = "" if ordinary is None else ordinary_text(ordinary)
     if found.undecided is not None:
         return f"nothing can be told: {found.undecided}"
-    if not found.mismatch and said:
+    if not found.mismatch and ordinary_words:
         return (
-            f"nothing beyond the ordinary: what is left is {said}; it is there "
+            f"nothing beyond the ordinary: what is left is {ordinary_words}; it is there "
             f"(p = {found.p_value:.1g} that nothing is)"
         )
     if not found.mismatch and failed:
@@ -104,7 +104,7 @@ def verdict(found: Diagnosis) -> str:
     if found.unexplained.detected:
         parts.append("something that the library has no name for")
     text = " and ".join(parts) or "recording and simulation differ (see the notes)"
-    rest = f"; what else is left is {said}" if said else ""
+    rest = f"; what else is left is {ordinary_words}" if ordinary_words else ""
     return f"MISMATCH: {text} (p = {found.p_value:.1g}){rest}"
 
 
@@ -338,18 +338,18 @@ UNREPORTED_SETTINGS: Mapping[str, str] = {
 def setting_text(setting: Mapping[str, Any]) -> str:
     """`by the column motor_current_a; logged 0.25 s late`; empty if there is nothing to report."""
     parts = []
-    for key, told in REPORTED_SETTINGS.items():
+    for key, entry in REPORTED_SETTINGS.items():
         value = setting.get(key)
         if not value:
             continue
         if isinstance(value, str):
-            parts.append(told.words.format(shown(value)))
+            parts.append(entry.words.format(shown(value)))
         elif isinstance(value, (list, tuple)):
-            parts.append(told.words.format(" or ".join(f"{one:.3g}" for one in value)))
-        elif value < 0 and told.negative:
-            parts.append(told.negative.format(f"{-value * told.times:.3g}"))
+            parts.append(entry.words.format(" or ".join(f"{one:.3g}" for one in value)))
+        elif value < 0 and entry.negative:
+            parts.append(entry.negative.format(f"{-value * entry.times:.3g}"))
         else:
-            parts.append(told.words.format(f"{value * told.times:.3g}"))
+            parts.append(entry.words.format(f"{value * entry.times:.3g}"))
     return "; ".join(parts)
 
 

@@ -418,8 +418,8 @@ class GyroStartup(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The exponential decay on each axis."""
-        passed = (readings.time_s - setting["start_s"]) / setting["time_constant_s"]
-        return Columns(gyro=design_matrix.on_axes(np.exp(-passed)[:, None]))
+        elapsed = (readings.time_s - setting["start_s"]) / setting["time_constant_s"]
+        return Columns(gyro=design_matrix.on_axes(np.exp(-elapsed)[:, None]))
 
 
 class VibrationRectification(Linear):
@@ -462,10 +462,10 @@ class VibrationRectification(Linear):
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The normalised vibration power on each axis."""
         if setting["covariate"] == "accel":
-            course = _vibration_power(readings, setting["window_s"])
+            vibration = _vibration_power(readings, setting["window_s"])
         else:
-            course = readings.covariates[setting["covariate"]] ** 2
-        return Columns(gyro=design_matrix.on_axes(np.asarray(course / setting["mean"])[:, None]))
+            vibration = readings.covariates[setting["covariate"]] ** 2
+        return Columns(gyro=design_matrix.on_axes(np.asarray(vibration / setting["mean"])[:, None]))
 
 
 def _vibration_power(readings: Readings, window_s: float) -> Array:

@@ -110,12 +110,12 @@ class MagScaleTemperature(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """(T - T0) times the quantity that the gain acts on, per axis."""
-        seen = readings.mag_b_gauss
+        gained = readings.mag_b_gauss
         if setting["of"] == "field":
-            seen = readings.field_b @ readings.soft_iron.T
+            gained = readings.field_b @ readings.soft_iron.T
         elif setting["of"] == "outside":
-            seen = readings.field_b
-        gain = design_matrix.covariate_series(readings, setting) * seen
+            gained = readings.field_b
+        gain = design_matrix.covariate_series(readings, setting) * gained
         return Columns(mag=np.asarray(gain[:, :, None] * np.eye(3)))
 
 

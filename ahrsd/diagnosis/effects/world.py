@@ -213,10 +213,10 @@ class GeomagneticDrift(Linear):
         if setting["shape"] == "wave":
             # the phase is that of the middle, where it does not correlate with the length
             turns = (part - 0.5) * setting["span_s"] / setting["length_s"]
-            course = np.sin(np.pi * turns + np.radians(setting["turn_deg"]))
+            series = np.sin(np.pi * turns + np.radians(setting["turn_deg"]))
         else:
-            course = part if setting["shape"] == "line" else np.sin(np.pi * np.clip(part, 0, 1))
-        return Columns(mag=design_matrix.in_world(readings, course))
+            series = part if setting["shape"] == "line" else np.sin(np.pi * np.clip(part, 0, 1))
+        return Columns(mag=design_matrix.in_world(readings, series))
 
 
 class AltitudeField(Linear):
@@ -262,13 +262,13 @@ class AltitudeField(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """f on each axis of the world."""
-        course = design_matrix.covariate_series(readings, setting)
+        series = design_matrix.covariate_series(readings, setting)
         if setting["shape"] == "near":
             lowest = setting["reference"]
-            course = (1 - (lowest / np.maximum(course + lowest, 0.5 * lowest)) ** 3) * lowest / 3
+            series = (1 - (lowest / np.maximum(series + lowest, 0.5 * lowest)) ** 3) * lowest / 3
         if setting["shape"] == "decay":
-            course = -np.expm1(-course / setting["length_m"]) * setting["length_m"]
-        return Columns(mag=design_matrix.in_world(readings, course))
+            series = -np.expm1(-series / setting["length_m"]) * setting["length_m"]
+        return Columns(mag=design_matrix.in_world(readings, series))
 
 
 class FieldStep(Linear):
@@ -399,8 +399,8 @@ def unit_dipole_fields(away_m: Array, distance_m: float, axes: Array | None = No
     distance = np.maximum(size, NEAREST_M / 4)
     r = away_m / distance[:, None]
     strength = (distance_m / distance) ** 3
-    seen = r if axes is None else np.einsum("nij,nj->ni", axes, r)
-    fields = (3 * strength[:, None] * seen)[:, :, None] * r[:, None, :]
+    direction = r if axes is None else np.einsum("nij,nj->ni", axes, r)
+    fields = (3 * strength[:, None] * direction)[:, :, None] * r[:, None, :]
     fields -= strength[:, None, None] * (np.eye(3) if axes is None else axes)
     return np.asarray(fields)
 
@@ -420,25 +420,27 @@ def locate_dipole(
     if len(rows) < 20:
         return None
     u = field_n / np.linalg.norm(field_n)
-    way, size = place_m[rows], size_gauss[rows]
+    path, size = place_m[rows], size_gauss[rows]
 
     def misfit(unknown: Array) -> float:
         place, turn = unknown[:3], float(unknown[3])
         c, s = np.cos(turn), np.sin(turn)
-        seen = np.array([c * u[0] + s * u[1], c * u[1] - s * u[0], u[2]])
-        columns = np.column_stack([seen @ unit_dipole_fields(way - place, 1.0), np.ones(len(way))])
+        direction = np.array([c * u[0] + s * u[1], c * u[1] - s * u[0], u[2]])
+        columns = np.column_stack(
+            [direction @ unit_dipole_fields(path - place, 1.0), np.ones(len(path))]
+        )
         columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         right = columns.T @ size
         ridge = columns.T @ columns + 1e-9 * np.eye(4)
-        outside = max(NEAREST_M - float(np.linalg.norm(way - place, axis=1).min()), 0.0)
+        outside = max(NEAREST_M - float(np.linalg.norm(path - place, axis=1).min()), 0.0)
         return float(size @ size - right @ np.linalg.solve(ridge, right)) * (1 + outside)
 
     starts = [np.append(place_m[row] + np.array(start), 0.0) for start in _STARTS_M]
     best = min((_minimise(misfit, start, 90) for start in starts), key=lambda one: one[0])
-    turned = [
+    rotated = [
         _minimise(misfit, np.append(best[1][:3], best[1][3] + turn), 90) for turn in _TURNS_RAD
     ]
-    best = min((best, *turned), key=lambda one: one[0])
+    best = min((best, *rotated), key=lambda one: one[0])
     found = _minimise(misfit, best[1], 250)[1]
     return found[:3], float(found[3])
 

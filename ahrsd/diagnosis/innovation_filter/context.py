@@ -94,19 +94,19 @@ class UnfittedMotion:
 
 def build_context(track: Track, fit: Fit) -> Context:
     """The context of a fit; rows as in the track."""
-    done = fit.filtered
-    rate = track.gyro_b_rad_s - done.model.gyro_bias_rad_s
+    filtered = fit.filtered
+    rate = track.gyro_b_rad_s - filtered.model.gyro_bias_rad_s
     if fit.terms_gyro is not None:
         rate = rate - fit.terms_gyro
     runs = track.runs or (slice(0, len(track)),)
-    smooth = smoothed_rate(rate, runs, track.step_s, done.model.sigma_gyro_rad_s)
-    R_nb, levelled = attitude(track, done)
-    width = _smoothing_width(rate, runs, track.step_s, done.model.sigma_gyro_rad_s)
-    smooth_b = smoothed_field(track, done.nominal_b, smooth, width)
+    smooth = smoothed_rate(rate, runs, track.step_s, filtered.model.sigma_gyro_rad_s)
+    R_nb, levelled = attitude(track, filtered)
+    width = _smoothing_width(rate, runs, track.step_s, filtered.model.sigma_gyro_rad_s)
+    smooth_b = smoothed_field(track, filtered.nominal_b, smooth, width)
     return Context(
         track=track,
-        model=done.model,
-        field_b=_predicted_or_nominal_field(done, smooth),
+        model=filtered.model,
+        field_b=_predicted_or_nominal_field(filtered, smooth),
         smooth_b=smooth_b,
         rate_b_rad_s=smooth,
         others_rate_b_rad_s=rate_without_own_row(rate, smooth, width),
@@ -117,11 +117,13 @@ def build_context(track: Track, fit: Fit) -> Context:
     )
 
 
-def _predicted_or_nominal_field(done: Filtered | NominalMotion, rate_b_rad_s: Array) -> Array:
+def _predicted_or_nominal_field(filtered: Filtered | NominalMotion, rate_b_rad_s: Array) -> Array:
     """(N, 3) the predicted field; the nominal one where no reading was used."""
-    if isinstance(done, NominalMotion):
-        return done.nominal_b
-    return np.where(done.used[:, None], predicted_field(done, rate_b_rad_s), done.nominal_b)
+    if isinstance(filtered, NominalMotion):
+        return filtered.nominal_b
+    return np.where(
+        filtered.used[:, None], predicted_field(filtered, rate_b_rad_s), filtered.nominal_b
+    )
 
 
 @lru_cache(maxsize=2)
@@ -277,15 +279,15 @@ def _power_density(values: Array, segment: int) -> Array:
     return np.asarray(power / np.sum(window**2))
 
 
-def attitude(track: Track, done: Filtered | NominalMotion) -> tuple[Array, bool]:
+def attitude(track: Track, filtered: Filtered | NominalMotion) -> tuple[Array, bool]:
     """R_nb (N, 3, 3) and whether its z axis is down."""
     accel = track.accel_b_m_s2
     if accel is not None and not np.isfinite(accel).all():
         accel = None
-    U = done.orientation
+    U = filtered.orientation
     runs = track.runs or (slice(0, len(track)),)
     width = DRIFT_S / track.step_s
-    field = _smoothed_in_carried_frame(U, done.nominal_b, runs, width)
+    field = _smoothed_in_carried_frame(U, filtered.nominal_b, runs, width)
     if accel is None:
         return np.asarray(field_drift_rotations(field, runs) @ U), False
     down = _unit_vectors(_smoothed_in_carried_frame(U, -accel, runs, width))

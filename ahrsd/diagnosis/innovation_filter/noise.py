@@ -49,10 +49,10 @@ class Colour:
         return np.asarray(self.variance / np.abs(np.fft.rfft(taps, _FREQUENCIES)) ** 2)
 
 
-def fit_colour(done: Filtered) -> Colour:
+def fit_colour(filtered: Filtered) -> Colour:
     """Fit an autoregression to the whitened innovations."""
-    rows = _centred_innovations(done)
-    count = max(float(np.count_nonzero(done.used)) * 3, 1.0)
+    rows = _centred_innovations(filtered)
+    count = max(float(np.count_nonzero(filtered.used)) * 3, 1.0)
     r = np.array(
         [
             float(np.sum(rows[lag:] * rows[: len(rows) - lag])) / count
@@ -64,10 +64,10 @@ def fit_colour(done: Filtered) -> Colour:
     best, best_value, variance = np.zeros(0), count * np.log(max(r[0], 1e-300)), r[0]
     for order in range(1, min(_MAX_ORDER, int(count) // 60) + 1):
         a = solve_toeplitz(r[:order], r[1 : order + 1])
-        left = float(r[0] - a @ r[1 : order + 1])
-        value = count * np.log(max(left, 1e-300)) + order * np.log(count)
+        remaining = float(r[0] - a @ r[1 : order + 1])
+        value = count * np.log(max(remaining, 1e-300)) + order * np.log(count)
         if value < best_value - 2.0:
-            best, best_value, variance = np.asarray(a), value, left
+            best, best_value, variance = np.asarray(a), value, remaining
     return Colour(best, float(variance))
 
 
@@ -84,9 +84,9 @@ def colour_before_filter(wanted: Colour, found: Colour) -> tuple[Colour, float]:
     return Colour(a, float(r[0] - a @ r[1:])), float(np.sqrt(r[0] / whole))
 
 
-def tail_freedom(done: Filtered) -> float:
+def tail_freedom(filtered: Filtered) -> float:
     """Freedom of the Student-t that fits the innovations of all axes; inf: no heavy tails."""
-    e = done.whitened[done.used].ravel()
+    e = filtered.whitened[filtered.used].ravel()
     if len(e) < 30:
         return float("inf")
     z = (e - e.mean()) / max(float(e.std()), 1e-300)
@@ -103,15 +103,15 @@ def _maximum_likelihood_freedom(z: Array) -> float:
 
 
 def block_variances(
-    done: Filtered, block_s: float = _BLOCK_S, most: float = np.inf
+    filtered: Filtered, block_s: float = _BLOCK_S, limit: float = np.inf
 ) -> tuple[Array, Array, Array]:
     """Middle time (B,), white variance of the whitened innovations (B,), and their number (B,).
 
-    most: larger squares of a difference count as this
+    limit: larger squares of a difference count as this
     """
-    track = done.track
-    pairs = done.used[1:] & done.used[:-1]
-    squares = np.minimum(np.diff(done.whitened, axis=0) ** 2, most)
+    track = filtered.track
+    pairs = filtered.used[1:] & filtered.used[:-1]
+    squares = np.minimum(np.diff(filtered.whitened, axis=0) ** 2, limit)
     half = np.where(pairs, np.sum(squares, axis=1) / 2, 0.0)
     block = ((track.time_s[1:] - track.time_s[0]) / block_s).astype(int)
     size = np.asarray(np.bincount(block, weights=3.0 * pairs), dtype=np.float64)
@@ -129,92 +129,92 @@ class TwoNoiseLevels:
     """
 
     spans_s: tuple[tuple[float, float], ...]
-    loud: float
-    quiet: float
+    high: float
+    low: float
     burst: bool
 
 
-def find_high_noise(done: Filtered) -> TwoNoiseLevels | None:
+def find_high_noise(filtered: Filtered) -> TwoNoiseLevels | None:
     """Where the noise level is higher than elsewhere; None where there is one level."""
-    middle, variance, size = block_variances(done)
+    middle, variance, size = block_variances(filtered)
     if len(middle) < 10 or not np.any(variance > 1e-18):
         return None
     # a single outlier is no higher noise level
-    most = priors.LOUDER_OUTLIER**2 * 2.0 * _robust_variance(done) or np.inf
-    clipped = block_variances(done, most=most)[1]
+    limit = priors.LOUDER_OUTLIER**2 * 2.0 * _robust_variance(filtered) or np.inf
+    clipped = block_variances(filtered, limit=limit)[1]
     first, last, gain = _maximum_likelihood_interval(
-        clipped, size / _differences_per_reading(done, most)
+        clipped, size / _differences_per_reading(filtered, limit)
     )
     inside = np.zeros(len(middle), dtype=bool)
     inside[first:last] = True
-    sides = loud, quiet = _mean_inside_outside(variance, size, inside)
+    sides = high, low = _mean_inside_outside(variance, size, inside)
     if (
         gain <= priors.LOUDER_NATS
-        or loud <= priors.LOUDER_RATIO * quiet
-        or not _is_noise(done, middle[inside])
+        or high <= priors.LOUDER_RATIO * low
+        or not _is_noise(filtered, middle[inside])
     ):
         return None
-    stretch = (float(middle[first] - _BLOCK_S / 2), float(middle[last - 1] + _BLOCK_S / 2))
-    spans, loud, quiet = _high_noise_intervals(
-        done, *_mean_inside_outside(clipped, size, inside), most
+    interval = (float(middle[first] - _BLOCK_S / 2), float(middle[last - 1] + _BLOCK_S / 2))
+    spans, high, low = _high_noise_intervals(
+        filtered, *_mean_inside_outside(clipped, size, inside), limit
     )
-    filled = sum(b - a for a, b in spans) / (stretch[1] - stretch[0])
+    filled = sum(b - a for a, b in spans) / (interval[1] - interval[0])
     # a level that lasts from the beginning or to the end changed once
-    amid = first > 0 and last < len(middle)
-    short = amid and last - first <= priors.BURST_SHARE * len(middle)
-    if loud < priors.LOUDER_RATIO * quiet:  # not two alternating levels: the one interval alone
-        spans, loud, quiet = [], *sides
+    interior = first > 0 and last < len(middle)
+    short = interior and last - first <= priors.BURST_SHARE * len(middle)
+    if high < priors.LOUDER_RATIO * low:  # not two alternating levels: the one interval alone
+        spans, high, low = [], *sides
     if short or (len(spans) > 1 and filled < priors.BURST_FILLED):
-        return TwoNoiseLevels(tuple(spans or [stretch]), loud, quiet, burst=True)
-    return TwoNoiseLevels((stretch,), loud, quiet, burst=False)
+        return TwoNoiseLevels(tuple(spans or [interval]), high, low, burst=True)
+    return TwoNoiseLevels((interval,), high, low, burst=False)
 
 
-def level_facts(done: Filtered, *, spec_given: bool = False) -> list[Fact]:
+def level_facts(filtered: Filtered, *, spec_given: bool = False) -> list[Fact]:
     """A noise burst, or a noise level that changed or is above the specified one."""
-    if found := find_high_noise(done):
-        return [(_burst_fact if found.burst else _level_fact)(done, found)]
-    middle, variance, size = block_variances(done)
-    if not spec_given or len(middle) < 10 or not _is_noise(done, middle):
+    if found := find_high_noise(filtered):
+        return [(_burst_fact if found.burst else _level_fact)(filtered, found)]
+    middle, variance, size = block_variances(filtered)
+    if not spec_given or len(middle) < 10 or not _is_noise(filtered, middle):
         return []
     # a few outliers raise the mean power, but most readings may be at the specified level
-    overall = min(float(np.average(variance, weights=size)), _robust_variance(done))
+    overall = min(float(np.average(variance, weights=size)), _robust_variance(filtered))
     if overall > priors.LEVEL_RATIO and overall > 1 + 6 * np.sqrt(
-        2 * _differences_per_reading(done) / size.sum()
+        2 * _differences_per_reading(filtered) / size.sum()
     ):
         whole = (float(middle[0] - _BLOCK_S / 2), float(middle[-1] + _BLOCK_S / 2))
-        return [_level_fact(done, TwoNoiseLevels((whole,), overall, 1.0, burst=False))]
+        return [_level_fact(filtered, TwoNoiseLevels((whole,), overall, 1.0, burst=False))]
     return []
 
 
-def _differences_per_reading(done: Filtered, most: float = np.inf) -> float:
-    """How many squared differences, each at most `most`, are worth one Gaussian reading.
+def _differences_per_reading(filtered: Filtered, limit: float = np.inf) -> float:
+    """How many squared differences, each at most `limit`, are worth one Gaussian reading.
 
     Neighbouring differences share a sample; heavy tails scatter more than a Gaussian; an outlier
     on one axis may be one on all.
     """
-    pairs = done.used[1:] & done.used[:-1]
-    rows = np.sum(np.minimum(np.diff(done.whitened, axis=0)[pairs] ** 2, most), axis=1)
+    pairs = filtered.used[1:] & filtered.used[:-1]
+    rows = np.sum(np.minimum(np.diff(filtered.whitened, axis=0)[pairs] ** 2, limit), axis=1)
     scatter = float(np.var(rows) / np.mean(rows) ** 2)
     return 1.5 * max(scatter / (2.0 / 3.0), 1.0)
 
 
-def _robust_variance(done: Filtered) -> float:
+def _robust_variance(filtered: Filtered) -> float:
     """White variance of the whitened innovations from the median of their differences."""
-    d = np.diff(done.whitened, axis=0)[done.used[1:] & done.used[:-1]]
+    d = np.diff(filtered.whitened, axis=0)[filtered.used[1:] & filtered.used[:-1]]
     return float((1.4826 * np.median(np.abs(d))) ** 2 / 2) if len(d) else 0.0
 
 
-def _is_noise(done: Filtered, blocks: Array) -> bool:
+def _is_noise(filtered: Filtered, blocks: Array) -> bool:
     """True if the power in these blocks alternates like noise and does not move like a misfit.
 
     Successive differences of white noise are correlated by -1/2.
     """
-    time_s = done.track.time_s
+    time_s = filtered.track.time_s
     later = np.searchsorted(blocks, time_s).clip(1, len(blocks) - 1)
     away_s = np.minimum(np.abs(time_s - blocks[later - 1]), np.abs(time_s - blocks[later]))
     near = away_s <= _BLOCK_S / 2
-    d = np.diff(done.whitened, axis=0)
-    kept = (done.used & near)[2:] & done.used[1:-1] & done.used[:-2]
+    d = np.diff(filtered.whitened, axis=0)
+    kept = (filtered.used & near)[2:] & filtered.used[1:-1] & filtered.used[:-2]
     square = float(np.sum(d[1:][kept] ** 2))
     return square > 0 and float(np.sum((d[1:] * d[:-1])[kept])) / square < priors.NOISE_OPPOSED
 
@@ -226,12 +226,12 @@ def _maximum_likelihood_interval(variance: Array, weight: Array) -> tuple[int, i
     base = weights[-1] * np.log(squares[-1] / weights[-1])
     a, b = np.triu_indices(len(squares), k=1)
     inside, outside = weights[b] - weights[a], weights[-1] - weights[b] + weights[a]
-    loud, quiet = squares[b] - squares[a], squares[-1] - squares[b] + squares[a]
+    high, low = squares[b] - squares[a], squares[-1] - squares[b] + squares[a]
     with np.errstate(divide="ignore", invalid="ignore"):
-        inner = inside * np.log(loud / inside)
-        outer = np.where(outside > 0.5, outside * np.log(quiet / outside), 0.0)
+        inner = inside * np.log(high / inside)
+        outer = np.where(outside > 0.5, outside * np.log(low / outside), 0.0)
         gain = 0.5 * (base - inner - outer)
-        gain[(outside > 0.5) & (loud * outside < quiet * inside)] = 0.0
+        gain[(outside > 0.5) & (high * outside < low * inside)] = 0.0
     best = int(np.nanargmax(gain))
     return int(a[best]), int(b[best]), float(gain[best])
 
@@ -240,29 +240,29 @@ def _mean_inside_outside(
     variance: Array, size: Array, inside: NDArray[np.bool]
 ) -> tuple[float, float]:
     """Mean of (B,) variances inside and outside; 1 for no blocks."""
-    loud, quiet = (
+    high, low = (
         float(np.average(variance[part], weights=size[part])) if part.any() else 1.0
         for part in (inside, ~inside)
     )
-    return loud, quiet
+    return high, low
 
 
 def _high_noise_intervals(
-    done: Filtered, loud: float, quiet: float, most: float
+    filtered: Filtered, high: float, low: float, limit: float
 ) -> tuple[list[tuple[float, float]], float, float]:
     """Intervals in which the higher of two noise levels is the more likely, and both levels.
 
-    loud, quiet, most: of squares that are limited to `most`
+    high, low, limit: of squares that are limited to `limit`
     """
-    middle, clipped, size = block_variances(done, _FINE_BLOCK_S, most)
-    weight = size / _differences_per_reading(done, most)
+    middle, clipped, size = block_variances(filtered, _FINE_BLOCK_S, limit)
+    weight = size / _differences_per_reading(filtered, limit)
     on = np.zeros(len(middle), dtype=bool)
     for _ in range(_PASSES):
-        nats = 0.5 * weight * (np.log(quiet / loud) + clipped * (1 / quiet - 1 / loud))
+        nats = 0.5 * weight * (np.log(low / high) + clipped * (1 / low - 1 / high))
         on = nats > 0
         if on.all() or not on.any():
             break
-        loud, quiet = _mean_inside_outside(clipped, size, on)
+        high, low = _mean_inside_outside(clipped, size, on)
     # an interval may begin in any of the blocks
     price = float(np.log(max(len(middle), 1)))
     kept = [(a, b) for a, b in spans_of(on, 1) if float(np.sum(nats[a:b])) > price]
@@ -273,14 +273,14 @@ def _high_noise_intervals(
         (float(middle[a] - _FINE_BLOCK_S / 2), float(middle[b - 1] + _FINE_BLOCK_S / 2))
         for a, b in kept
     ]
-    return found, *_mean_inside_outside(block_variances(done, _FINE_BLOCK_S)[1], size, on)
+    return found, *_mean_inside_outside(block_variances(filtered, _FINE_BLOCK_S)[1], size, on)
 
 
-def _burst_fact(done: Filtered, found: TwoNoiseLevels) -> Fact:
-    loud, quiet = found.loud, found.quiet
-    sigma = done.model.sigma_mag_gauss * float(np.sqrt(max(loud - quiet, 0.0)))
+def _burst_fact(filtered: Filtered, found: TwoNoiseLevels) -> Fact:
+    high, low = found.high, found.low
+    sigma = filtered.model.sigma_mag_gauss * float(np.sqrt(max(high - low, 0.0)))
     times = ", ".join(f"{a:.0f} to {b:.0f}" for a, b in found.spans_s)
-    words = f"from {times} s the noise is {np.sqrt(loud / quiet):.2g} times its usual level"
+    words = f"from {times} s the noise is {np.sqrt(high / low):.2g} times its usual level"
     begin, end = found.spans_s[0]
     return Fact(
         "noise_burst",
@@ -292,20 +292,20 @@ def _burst_fact(done: Filtered, found: TwoNoiseLevels) -> Fact:
     )
 
 
-def _level_fact(done: Filtered, found: TwoNoiseLevels) -> Fact:
-    (stretch,), loud, quiet = found.spans_s, found.loud, found.quiet
-    begin, end = stretch[0], min(stretch[1], float(done.track.time_s[-1]))
-    sigma = done.model.sigma_mag_gauss * float(np.sqrt(max(loud - quiet, 0.0)))
-    ratio = float(np.sqrt(loud / quiet))
+def _level_fact(filtered: Filtered, found: TwoNoiseLevels) -> Fact:
+    (interval,), high, low = found.spans_s, found.high, found.low
+    begin, end = interval[0], min(interval[1], float(filtered.track.time_s[-1]))
+    sigma = filtered.model.sigma_mag_gauss * float(np.sqrt(max(high - low, 0.0)))
+    ratio = float(np.sqrt(high / low))
     words = f"from {begin:.0f} to {end:.0f} s the noise is {ratio:.2g} times its usual level"
     where = Where(((begin, end),), ("x", "y", "z"), "noise")
     parameters = (Value("mag", sigma, sigma * 0.1, "gauss"),)
-    falls = begin < done.track.time_s[0] + _BLOCK_S / 2 and end < done.track.time_s[-1]
+    falls = begin < filtered.track.time_s[0] + _BLOCK_S / 2 and end < filtered.track.time_s[-1]
     setting = {"onset_s": end if falls else begin}
     return Fact("noise_level", words, where, priors.SURE_OF_NOISE, parameters, setting)
 
 
-def _centred_innovations(done: Filtered) -> Array:
-    rows = np.where(done.used[:, None], done.whitened, 0.0)
-    mean = done.whitened[done.used].mean(axis=0) if done.used.any() else np.zeros(3)
-    return np.asarray(np.where(done.used[:, None], rows - mean, 0.0))
+def _centred_innovations(filtered: Filtered) -> Array:
+    rows = np.where(filtered.used[:, None], filtered.whitened, 0.0)
+    mean = filtered.whitened[filtered.used].mean(axis=0) if filtered.used.any() else np.zeros(3)
+    return np.asarray(np.where(filtered.used[:, None], rows - mean, 0.0))

@@ -89,11 +89,11 @@ def noise_free_readings(context: Context) -> Readings:
     """
     start, model = readings_of(context), context.model
     size = float(np.mean(np.linalg.norm(start.field_b, axis=1)))
-    seen = np.einsum("nij,nj->ni", start.R_nb, start.field_b)
-    direction = seen.mean(axis=0) / np.linalg.norm(seen.mean(axis=0))
+    field_n = np.einsum("nij,nj->ni", start.R_nb, start.field_b)
+    direction = field_n.mean(axis=0) / np.linalg.norm(field_n.mean(axis=0))
     R_nb, rate = start.R_nb.copy(), start.rate_b_rad_s.copy()
     for run in time_series.gap_free_runs(start.dt_s):
-        slow = _two_sided_mean(seen[run], DRIFT_S, start.time_s[run])
+        slow = _two_sided_mean(field_n[run], DRIFT_S, start.time_s[run])
         R_nb[run] = _smallest_rotations(slow, direction) @ start.R_nb[run]
         rate[run] = _mean_rate(R_nb[run], start.time_s[run], rate[run])
     field_b = size * np.einsum("nji,j->ni", R_nb, direction)
@@ -119,15 +119,15 @@ def simulate_readings(
     Effects that act on the finished reading are applied after the noise, and effects on all that a
     sensor measures after the others.  KeyError for an unknown effect.
     """
-    named = [(library[term.identifier], term) for term in terms]
-    named.sort(key=lambda one: one[0].of_whole)
+    effects = [(library[term.identifier], term) for term in terms]
+    effects.sort(key=lambda one: one[0].of_whole)
     readings = truth
-    for effect, term in named:
+    for effect, term in effects:
         if not effect.after_noise:
             readings = effect.simulate(readings, term.value, term.setting)
     if noise is not None:
         readings = _add_noise(readings, noise, seed)
-    for effect, term in named:
+    for effect, term in effects:
         if effect.after_noise:
             readings = effect.simulate(readings, term.value, term.setting)
     return readings
@@ -137,14 +137,14 @@ def track_from_readings(readings: Readings, like: Track | None = None) -> Track:
     """The readings as a track; covariates of `like` that no effect knows are kept."""
     accel = readings.accel_b_m_s2 if np.isfinite(readings.accel_b_m_s2).all() else None
     same = like is not None and len(like) == len(readings.time_s)
-    others = like.covariates if like is not None and same else {}
+    covariates = like.covariates if like is not None and same else {}
     return Track(
         time_s=readings.time_s,
         dt_s=readings.dt_s,
         mag_b_gauss=readings.mag_b_gauss,
         gyro_b_rad_s=readings.gyro_b_rad_s,
         accel_b_m_s2=accel,
-        covariates={**others, **readings.covariates},
+        covariates={**covariates, **readings.covariates},
         runs=tuple(time_series.gap_free_runs(readings.dt_s)),
     )
 
@@ -191,8 +191,8 @@ def _add_noise(readings: Readings, noise: Noise, seed: int) -> Readings:
     mag = _colour_noise(mag, noise.colour)
     if noise.level is not None:
         mag = mag * noise.level[:, None]
-    passed = np.sqrt(np.concatenate([[0.0], np.diff(readings.time_s)]))[:, None]
-    bias = noise.gyro_walk_rad_s_sqrt_s * np.cumsum(passed * walk, axis=0)
+    root_step = np.sqrt(np.concatenate([[0.0], np.diff(readings.time_s)]))[:, None]
+    bias = noise.gyro_walk_rad_s_sqrt_s * np.cumsum(root_step * walk, axis=0)
     return replace(
         readings,
         mag_b_gauss=readings.mag_b_gauss + noise.mag_gauss * mag,

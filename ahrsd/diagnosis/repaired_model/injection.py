@@ -135,9 +135,9 @@ class EmulatedEffects:
     additive or an invalid request.
     """
 
-    def __init__(self, setup: Setup, wanted: Sequence[str]) -> None:
+    def __init__(self, setup: Setup, requested: Sequence[str]) -> None:
         _, self._truth, self._motion = hidden(setup)
-        requests = [parse_request(text) for text in wanted]
+        requests = [parse_request(text) for text in requested]
         for one in requests:
             if one.effect.kind != "mean" or one.effect.after_noise:
                 known = ", ".join(
@@ -154,15 +154,15 @@ class EmulatedEffects:
 
     def at(self, time_s: Array) -> tuple[Array, Array]:
         """Field (gauss) and rate (rad/s), (N, 3) each, that add at the instants (N,)."""
-        asked = np.maximum(time_s, 0.0)
-        mag, gyro = np.zeros((len(asked), 3)), np.zeros((len(asked), 3))
-        number = (asked // PIECE_S).astype(int)
+        instants = np.maximum(time_s, 0.0)
+        mag, gyro = np.zeros((len(instants), 3)), np.zeros((len(instants), 3))
+        number = (instants // PIECE_S).astype(int)
         for piece in np.unique(number).tolist():
             rows = number == piece
             known_s, of_mag, of_gyro = self._piece(piece)
             for axis in range(3):
-                mag[rows, axis] = np.interp(asked[rows], known_s, of_mag[:, axis])
-                gyro[rows, axis] = np.interp(asked[rows], known_s, of_gyro[:, axis])
+                mag[rows, axis] = np.interp(instants[rows], known_s, of_mag[:, axis])
+                gyro[rows, axis] = np.interp(instants[rows], known_s, of_gyro[:, axis])
         return mag, gyro
 
     def _piece(self, number: int) -> tuple[Array, Array, Array]:
@@ -288,13 +288,13 @@ def columns_for(effects: Iterable[Effect], time_s: Array, seed: int) -> LoggedCo
 
     If one of several roles is enough, the first that is a column of its own is made.
     """
-    wanted: dict[str, None] = {}
+    needed_roles: dict[str, None] = {}
     for effect in effects:
         for need in effect.needs:
             made = [role for role in need.split("|") if role not in roles.SENSORS]
-            wanted.update(dict.fromkeys(made[:1]))
+            needed_roles.update(dict.fromkeys(made[:1]))
     out: LoggedColumns = {}
-    for role in wanted:
+    for role in needed_roles:
         number = list(roles.ROLES).index(role)
         out |= PROFILES[role](time_s - time_s[0], np.random.default_rng([seed, 11, number]))
     return out

@@ -42,14 +42,16 @@ def _active_intervals(
     """From the onset on, if the setting has one; else the segments with most of the effect."""
     if "onset_s" in setting and "length_s" not in setting:
         return ((float(setting["onset_s"]), float(setting.get("end_s", track.time_s[-1]))),)
-    cut = equal_segments(track.time_s, _SEGMENTS)
+    segments = equal_segments(track.time_s, _SEGMENTS)
     size = np.array(
         [
-            np.sqrt(np.mean(added[cut.index == k] ** 2)) if (cut.index == k).any() else 0.0
-            for k in range(len(cut))
+            np.sqrt(np.mean(added[segments.index == k] ** 2))
+            if (segments.index == k).any()
+            else 0.0
+            for k in range(len(segments))
         ]
     )
-    found = joined_intervals(cut.edges_s, size > priors.ACTS_IN_STRETCH * size.max())
+    found = joined_intervals(segments.edges_s, size > priors.ACTS_IN_STRETCH * size.max())
     if sum(b - a for a, b in found) > priors.ACTS_EVERYWHERE * track.duration_s:
         found = [(float(track.time_s[0]), float(track.time_s[-1]))]
     return tuple(found)
@@ -71,7 +73,7 @@ def _regime_text(track: Track, added: Array, setting: Setting) -> str | None:
 
 
 def departure_intervals(
-    edges_s: Array, course: Array, deviation: Array
+    edges_s: Array, series: Array, deviation: Array
 ) -> list[tuple[float, float]]:
     """Intervals in which a time series (J, axes) departs from the level that lasts longest.
 
@@ -80,7 +82,7 @@ def departure_intervals(
     (`extend_departures`).  The whole time is returned if no level lasts for 40 % of it.
     """
     length = np.diff(edges_s)
-    distance = np.linalg.norm(course[:, None] - course[None], axis=2)
+    distance = np.linalg.norm(series[:, None] - series[None], axis=2)
     largest = float(distance.max(initial=0.0))
     if largest == 0.0:
         return [(float(edges_s[0]), float(edges_s[-1]))]
@@ -91,13 +93,13 @@ def departure_intervals(
     usual_segment = int(np.argmax(usual))
     if usual[usual_segment] < 0.4 * length.sum():
         return [(float(edges_s[0]), float(edges_s[-1]))]
-    usual_course = np.average(course[alike[usual_segment]], axis=0)
+    usual_course = np.average(series[alike[usual_segment]], axis=0)
     return joined_intervals(
-        edges_s, extend_departures(~alike[usual_segment], course - usual_course, deviation)
+        edges_s, extend_departures(~alike[usual_segment], series - usual_course, deviation)
     )
 
 
-def extend_departures(inside: Array, course: Array, deviation: Array) -> Array:
+def extend_departures(inside: Array, series: Array, deviation: Array) -> Array:
     """(J,) `inside` (J,), with each interval extended by the segments that still depart likewise.
 
     A source that comes and goes slowly has no sharp beginning and end.  A segment therefore
@@ -108,8 +110,8 @@ def extend_departures(inside: Array, course: Array, deviation: Array) -> Array:
     padded = np.concatenate([[False], out, [False]]).astype(int)
     starts, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)
     for start, end in zip(starts, ends, strict=True):
-        mean = course[start:end].mean(axis=0)
-        along = course @ mean / max(float(np.linalg.norm(mean)), 1e-300) / deviation
+        mean = series[start:end].mean(axis=0)
+        along = series @ mean / max(float(np.linalg.norm(mean)), 1e-300) / deviation
         before = np.flatnonzero(along[:start] <= priors.STILL_DEPARTED)
         after = np.flatnonzero(along[end:] <= priors.STILL_DEPARTED)
         out[before[-1] + 1 if len(before) else 0 : start] = True

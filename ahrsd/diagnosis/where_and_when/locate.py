@@ -110,17 +110,17 @@ class Located:
         return np.asarray(self.course @ self.direction)
 
 
-def single_source_direction(course: Array, deviation: Array) -> tuple[Array, float]:
+def single_source_direction(series: Array, deviation: Array) -> tuple[Array, float]:
     """Unit vector (3,) along which a series (J, 3) varies most, and its share of the variance.
 
     Its sign is such that the series rises from its beginning: a device that runs later is seldom
     on at the start.
     """
     weight = 1.0 / np.maximum(deviation, 1e-12)
-    centred = (course - np.average(course, axis=0, weights=weight**2)) * weight[:, None]
+    centred = (series - np.average(series, axis=0, weights=weight**2)) * weight[:, None]
     _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
     power = sizes**2
-    along = course @ axes[0]
+    along = series @ axes[0]
     first = max(1, len(along) // FIRST_SHARE)
     later = np.average(along, weights=weight**2) - np.average(
         along[:first], weights=weight[:first] ** 2

@@ -99,10 +99,10 @@ def _most_probable_frame(context: Context, inside: Array, outside: Array) -> Fra
     """
     unit = context.field_b @ context.model.soft_iron
     unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
-    louder = float(np.sum(inside**2)) - float(np.sum(outside**2))
+    excess = float(np.sum(inside**2)) - float(np.sum(outside**2))
     along = float(np.sum(np.sum(inside * unit, axis=1) ** 2))
     along -= float(np.sum(np.sum(outside * unit, axis=1) ** 2))
-    if along < priors.BAND_ALONG * louder:
+    if along < priors.BAND_ALONG * excess:
         return "gyro"
     world = np.einsum("nij,nj->ni", context.R_nb, inside)
     in_sensor, in_world = (np.linalg.slogdet(one.T @ one)[1] for one in (inside, world))
