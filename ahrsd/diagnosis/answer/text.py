@@ -353,12 +353,14 @@ def setting_text(setting: Mapping[str, Any]) -> str:
     return "; ".join(parts)
 
 
-def separating_manoeuvre(library: Mapping[str, Effect], name: str, others: Sequence[str]) -> str:
-    """The manoeuvre that separates `name` from the first of `others` that has one, in words."""
+def separating_manoeuvre(
+    library: Mapping[str, Effect], identifier: str, others: Sequence[str]
+) -> str:
+    """The manoeuvre that separates the effect from the first of `others` that has one, in words."""
     for other in others:
-        for one, two in ((name, other), (other, name)):
+        for one, two in ((identifier, other), (other, identifier)):
             if one in library:
                 for confuser, words in library[one].confusers:
                     if confuser == two:
                         return words
-    return library[name].manoeuvre if name in library else ""
+    return library[identifier].manoeuvre if identifier in library else ""

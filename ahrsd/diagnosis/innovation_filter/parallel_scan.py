@@ -57,9 +57,9 @@ class Layout:
     opens: NDArray[np.bool]
     rows: NDArray[np.intp]
 
-    def padded(self, values: Array, rest: Array | float) -> Array:
-        """(n, B, ...) of (N, ...), step by step; `rest` where a block has ended."""
-        tail = np.broadcast_to(np.asarray(rest, np.float64), values.shape[1:])
+    def padded(self, values: Array, fill: Array | float) -> Array:
+        """(n, B, ...) of (N, ...), step by step; `fill` where a block has ended."""
+        tail = np.broadcast_to(np.asarray(fill, np.float64), values.shape[1:])
         return np.asarray(np.concatenate([values, tail[None]])[self.rows])
 
     def unpadded(self, values: Array) -> Array:
@@ -178,10 +178,10 @@ class Recursion:
         if key not in self.made:
             s = self.states
             columns = [*range(s), *[*range(s, s + 3)] * gyro, *[*range(s + 3, s + 6)] * mag]
-            rest = np.zeros(self.matrix.shape[1:])
-            rest[3:, :s] = np.eye(s)
-            kept = self.layout.padded(self.matrix, rest)[:, :, :, columns]
-            self.made[key] = np.ascontiguousarray(kept)
+            fill = np.zeros(self.matrix.shape[1:])
+            fill[3:, :s] = np.eye(s)
+            selected = self.layout.padded(self.matrix, fill)[:, :, :, columns]
+            self.made[key] = np.ascontiguousarray(selected)
         return self.made[key]
 
     def _add_block_starts(self, out: Array, ends: Array) -> None:

@@ -123,10 +123,12 @@ def posterior_probabilities(
     log_evidence: Mapping[str, float], log_prior: Mapping[str, float]
 ) -> dict[str, float]:
     """Probabilities of the hypotheses; they sum to 1.  A missing prior is log 1."""
-    names = list(log_evidence)
-    values = np.array([log_evidence[name] + log_prior.get(name, 0.0) for name in names])
+    hypotheses = list(log_evidence)
+    values = np.array(
+        [log_evidence[hypothesis] + log_prior.get(hypothesis, 0.0) for hypothesis in hypotheses]
+    )
     share = np.exp(values - np.max(values, initial=-np.inf))
-    return dict(zip(names, (share / share.sum()).tolist(), strict=True))
+    return dict(zip(hypotheses, (share / share.sum()).tolist(), strict=True))
 
 
 #: lower peaks of the smoothed spectrum are its own scatter
