@@ -353,7 +353,7 @@ def _finding_json(finding: Finding) -> dict[str, Any]:
     return _without_missing(finding, ("heldout", "cost_if_left_out", "term", "priors"))
 
 
-def _without_missing(record: Any, optional: tuple[str, ...]) -> dict[str, Any]:  # noqa: ANN401 - as below
+def _without_missing(record: Any, optional: tuple[str, ...]) -> dict[str, Any]:  # noqa: ANN401
     """A record as a dictionary, without those optional keys that are None."""
     out: dict[str, Any] = _to_plain(record)
     return {k: value for k, value in out.items() if value is not None or k not in optional}
