@@ -122,9 +122,7 @@ def fit_noise_law(
         within |= (filtered.track.time_s >= begin) & (filtered.track.time_s <= end)
     law = forward.model_noise(fit.model, filtered)
     steps = [float(term.value[0]) for term in terms if term.identifier == _QUANTISATION]
-    gyro_power = (
-        0.0 if steps else _gyro_noise_share(fit, law, terms, library, quick=filtered is quick)
-    )
+    gyro_power = 0.0 if steps else _gyro_power(fit, law, terms, library, quick=filtered is quick)
     level = np.ones(len(within))
     for rows in (within, ~within):
         if np.any(rows & filtered.used):
@@ -161,7 +159,7 @@ def fit_noise_law(
     return replace(law, colour=tuple(colour.coefficients.tolist()), level=level * amplification)
 
 
-def _gyro_noise_share(
+def _gyro_power(
     fit: NullFit,
     law: Noise,
     terms: Sequence[Term],
