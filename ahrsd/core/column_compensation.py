@@ -53,10 +53,13 @@ class VehicleTerms:
     def load_terms(self, text: str) -> None:
         """The model's text; terms that cannot be followed are said. ValueError: it is no model."""
         # the library of effects takes 50 MB, which a daemon without a model does without
-        from ahrsd.diagnosis.repaired_model.column_terms import added, follows_a_column
+        from ahrsd.diagnosis.repaired_model.column_terms import (
+            column_contribution,
+            follows_a_column,
+        )
         from ahrsd.diagnosis.repaired_model.model_file import from_text
 
-        terms, self._added = from_text(text).terms, added
+        terms, self._added = from_text(text).terms, column_contribution
         self.terms = tuple(term for term in terms if follows_a_column(term))
         for term in terms:
             if term not in self.terms:

@@ -1,9 +1,9 @@
-"""A recording beside a simulation that somebody brought: the common time, and what only one has.
+"""Compare a recording with a simulation that the user supplies: common time, and differing effects.
 
-The two are the same motion if their rates agree, so the rates align them: the shift at which the
-two gyros correlate most, or where their axes differ the magnitudes.  A simulation contains what its
-author put in; an effect that both have to the same size is no difference, one that only the
-recording has was left out.
+The two have the same motion if their rates agree, so the rates align them: at the shift of largest
+correlation between the two gyros or, where their axes differ, between the magnitudes.  A
+simulation contains the effects that its author put in.  An effect that both have to the same size
+is no difference; one that only the recording has was left out of the simulation.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LONGEST_SHIFT_S = 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Overlap:
-    """Both over their common time, and sentences on how they were brought together."""
+    """Both over their common time, and notes on the alignment."""
 
     real: Track
     simulated: Track
@@ -32,7 +32,7 @@ class Overlap:
 
 def align(real: Track, simulated: Track) -> Overlap:
     """The common time of both.  ValueError where there is none, or where the motions differ."""
-    shift_s, correlation = _shift(real, simulated)
+    shift_s, correlation = _clock_shift(real, simulated)
     begin = max(real.time_s[0], simulated.time_s[0] - shift_s)
     end = min(real.time_s[-1], simulated.time_s[-1] - shift_s)
     if end - begin < priors.OVERLAP_S:
@@ -50,32 +50,36 @@ def align(real: Track, simulated: Track) -> Overlap:
     if abs(shift_s) > 0.5 * _step_s(real):
         notes.append(f"the simulation was moved by {shift_s:+.3f} s to match the recording's rates")
     moved = replace(simulated, time_s=simulated.time_s - shift_s)
-    return Overlap(cut(real, begin, end), cut(moved, begin, end), tuple(notes))
+    return Overlap(cut_track(real, begin, end), cut_track(moved, begin, end), tuple(notes))
 
 
 def _step_s(track: Track) -> float:
     return float(np.nanmedian(track.dt_s))
 
 
-def _shift(real: Track, simulated: Track) -> tuple[float, float]:
+def _clock_shift(real: Track, simulated: Track) -> tuple[float, float]:
     """Shift in s of the simulation's clock against the recording's, and the correlation there."""
     step = max(_step_s(real), _step_s(simulated))
     reach = round(LONGEST_SHIFT_S / step)
     begin = max(real.time_s[0], simulated.time_s[0])
     end = min(real.time_s[-1], simulated.time_s[-1])
     if end - begin < priors.OVERLAP_S:
-        return 0.0, 1.0  # said by the caller
+        return 0.0, 1.0  # the caller raises the error
     grid = np.arange(begin, end, step)
-    a, b = (_rates(track, grid) for track in (real, simulated))
+    a, b = (_resampled_rates(track, grid) for track in (real, simulated))
     reach = min(reach, len(grid) // 4)
-    found = _best(a, b, reach)
-    if found[1] < priors.SAME_MOTION:  # perhaps one has its axes swapped
-        found = max(found, _best(_size(a), _size(b), reach), key=lambda one: one[1])
+    found = _best_lag(a, b, reach)
+    if found[1] < priors.SAME_MOTION:  # the axes of one may be swapped
+        found = max(
+            found,
+            _best_lag(_rate_magnitudes(a), _rate_magnitudes(b), reach),
+            key=lambda one: one[1],
+        )
     return found[0] * step, found[1]
 
 
-def _best(a: Array, b: Array, reach: int) -> tuple[int, float]:
-    """Lag in rows of b (N, k) behind a, within reach, and the correlation of the two there."""
+def _best_lag(a: Array, b: Array, reach: int) -> tuple[int, float]:
+    """Lag in rows of b (N, k) behind a, within reach, and the correlation at that lag."""
     best = (0, -1.0)
     for lag in range(-reach, reach + 1):
         x = a[max(0, -lag) : len(a) - max(0, lag)]
@@ -87,17 +91,17 @@ def _best(a: Array, b: Array, reach: int) -> tuple[int, float]:
     return best
 
 
-def _rates(track: Track, grid_s: Array) -> Array:
+def _resampled_rates(track: Track, grid_s: Array) -> Array:
     axes = [np.interp(grid_s, track.time_s, values) for values in track.gyro_b_rad_s.T]
     return np.stack(axes, axis=1)
 
 
-def _size(rates: Array) -> Array:
-    """(N, 1) magnitudes, the bias taken off as the median."""
+def _rate_magnitudes(rates: Array) -> Array:
+    """(N, 1) magnitudes, with the median subtracted as the bias."""
     return np.asarray(np.linalg.norm(rates - np.median(rates, axis=0), axis=1))[:, None]
 
 
-def cut(track: Track, begin_s: float, end_s: float) -> Track:
+def cut_track(track: Track, begin_s: float, end_s: float) -> Track:
     """The rows between two times."""
     rows = slice(
         int(np.searchsorted(track.time_s, begin_s, "left")),
@@ -117,38 +121,39 @@ def cut(track: Track, begin_s: float, end_s: float) -> Track:
     )
 
 
-def differing(real: Diagnosis, simulated: Diagnosis) -> Diagnosis:
-    """The recording's diagnosis without what the simulation has as well, to the same size."""
-    kept: list[Finding] = []
+def remove_common_findings(real: Diagnosis, simulated: Diagnosis) -> Diagnosis:
+    """The recording's diagnosis without the findings that the simulation has to the same size."""
+    remaining: list[Finding] = []
     notes: list[str] = []
-    has = {finding.effect: finding for finding in simulated.findings}
+    by_effect = {finding.effect: finding for finding in simulated.findings}
     for finding in real.findings:
-        twin = has.get(finding.effect)
-        if twin is not None and _same(finding, twin):
+        counterpart = by_effect.get(finding.effect)
+        if counterpart is not None and _same_size(finding, counterpart):
             notes.append(f"{finding.effect} is in the simulation already, to the same size")
         else:
-            kept.append(finding)
-    only = [effect for effect in has if effect not in {one.effect for one in real.findings}]
+            remaining.append(finding)
+    only = [effect for effect in by_effect if effect not in {one.effect for one in real.findings}]
     notes += [f"the simulation has {effect}, the recording does not show it" for effect in only]
     notes += _calibration_notes(real, simulated)
-    mismatch = bool(kept) or real.unexplained.detected or bool(only)
-    return replace(real, findings=tuple(kept), mismatch=mismatch, notes=(*real.notes, *notes))
+    mismatch = bool(remaining) or real.unexplained.detected or bool(only)
+    return replace(real, findings=tuple(remaining), mismatch=mismatch, notes=(*real.notes, *notes))
 
 
-def _same(one: Finding, other: Finding) -> bool:
+def _same_size(one: Finding, other: Finding) -> bool:
+    """True if all parameters agree within their standard deviations."""
     values = {value.name: value for value in other.parameters}
     for value in one.parameters:
-        twin = values.get(value.name)
-        if twin is None:
+        counterpart = values.get(value.name)
+        if counterpart is None:
             return False
-        sigma = float(np.hypot(value.std, twin.std))
-        if not abs(value.value - twin.value) <= priors.SAME_SIGMAS * max(sigma, 1e-12):
+        sigma = float(np.hypot(value.std, counterpart.std))
+        if not abs(value.value - counterpart.value) <= priors.SAME_SIGMAS * max(sigma, 1e-12):
             return False
     return True
 
 
 def _calibration_notes(real: Diagnosis, simulated: Diagnosis) -> list[str]:
-    """Numbers of the calibration in which the two differ: no physics, but worth knowing."""
+    """Differences between the two calibrations: not a mismatch, but worth a note."""
     if real.model is None or simulated.model is None:
         return []
     hard = real.model.hard_iron_gauss - simulated.model.hard_iron_gauss

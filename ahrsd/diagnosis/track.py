@@ -1,4 +1,4 @@
-"""A recording as the mismatch engine wants it: one clock, a row per sample, covariates by name."""
+"""A recording as the diagnosis uses it: one clock, a row per sample, covariates by column name."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ahrsd.samples import Array
 
 
 class NothingToFit(ValueError):
-    """Why nothing can be fitted to a recording, in words for a person."""
+    """Nothing can be fitted to a recording; the message tells the user why."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,10 +23,10 @@ class Track:
     gyro_b_rad_s:  (N, 3) gyro readings, the mean rate over the step that ends at the sample
     accel_b_m_s2:  (N, 3) specific force, None where it was not recorded
     covariates:    (N,) columns by name (`motor_current_a`, `temperature_c`, ...); may hold nan
-    runs:          slices of the gap-free runs, in order, which cover every row
-    lost_turns:    (N,) how many of the device's steps are expected to be lost in a step, nobody
-                   knows in which, beyond those that were put right; None where none are
-    step_share:    part of a step's turn that one step of the device is
+    runs:          slices of the gap-free runs, in order; they cover every row
+    lost_turns:    (N,) expected number of device steps lost in each step at unknown times, beyond
+                   those already corrected; None where there are none
+    step_share:    turn of one device step, as a fraction of a step's turn
     """
 
     time_s: Array
@@ -43,7 +43,7 @@ class Track:
         return len(self.time_s)
 
     def with_columns(self, covariates: dict[str, Array]) -> Track:
-        """The same with other covariates."""
+        """The same track with other covariates."""
         return replace(self, covariates=covariates)
 
     @property
@@ -53,13 +53,13 @@ class Track:
 
     @property
     def step_s(self) -> float:
-        """The usual step between samples, 1 where none is known."""
+        """The median step between samples, 1 where none is known."""
         known = self.dt_s[np.isfinite(self.dt_s)]
         return float(np.median(known)) if len(known) else 1.0
 
     @property
     def usual_gauss(self) -> float:
-        """The usual size of a reading of the magnetometer that is not 0 0 0; 0 where none is."""
+        """Median magnitude of the magnetometer's readings other than 0 0 0; 0 if there are none."""
         size = np.linalg.norm(self.mag_b_gauss, axis=1)
         size = size[np.isfinite(size) & (size > 0.0)]
         return float(np.median(size)) if len(size) else 0.0
@@ -67,10 +67,10 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Spec:
-    """What the user knows of the sensor; None is estimated.  Deviations are per sample.
+    """What the user knows of the sensor; None is estimated.  Standard deviations are per sample.
 
-    shaken_gyro_rad_s: found, not told: what the gyro's differences are, where most of that is the
-                       motion's; its noise may be far less
+    shaken_gyro_rad_s: estimated, not given by the user: the scatter of the gyro's differences where
+                       most of it is motion; the noise may be far lower
     """
 
     sigma_mag_gauss: float | None = None

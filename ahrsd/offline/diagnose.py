@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
-from ahrsd.diagnosis.external_simulation import align, differing
+from ahrsd.diagnosis.external_simulation import align, remove_common_findings
 from ahrsd.diagnosis.inference.diagnose import diagnose_logged
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, from_text
 from ahrsd.diagnosis.track import Spec, Track
@@ -174,7 +174,7 @@ def diagnose_recording(
         raise RecordingError(simulation, str(error), "bring a simulation of this motion") from None
     found = _answered(real, overlap.real, known)
     own = _answered(simulation, overlap.simulated, Spec())
-    left = differing(found, own)
+    left = remove_common_findings(found, own)
     return replace(left, notes=(*notes, *overlap.notes, *left.notes))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.repaired_model import forward, injection
-from ahrsd.diagnosis.repaired_model.injection import injected, readings_of, terms_json
+from ahrsd.diagnosis.repaired_model.injection import inject_terms, readings_of, terms_json
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
 from ahrsd.diagnosis.track import Track
 from ahrsd.errors import AhrsdError
@@ -33,7 +33,7 @@ def with_effects(
         terms = [one.term(readings) for one in requests]
     except ValueError as error:
         raise AhrsdError(f"--effect: {error}") from None
-    return injected(experiment, readings, terms), terms_json(terms)
+    return inject_terms(experiment, readings, terms), terms_json(terms)
 
 
 def along(
@@ -46,11 +46,11 @@ def along(
     track, refused = roles.prepare_columns(read)
     try:
         context = forward.context_along(track, model.calibration, model.terms)
-        truth = forward.truth_along(context)
-        made = forward.simulated(truth, model.terms, model.noise, seed)
+        truth = forward.noise_free_readings(context)
+        made = forward.simulate_readings(truth, model.terms, model.noise, seed)
     except ValueError as error:
         raise AhrsdError(f"{recording}: {error}") from None
-    done = forward.track_of(made, track)
+    done = forward.track_from_readings(made, track)
     written = {"time_s": done.time_s}
     sensors = [("mag", "gauss", done.mag_b_gauss), ("gyro", "rad_s", done.gyro_b_rad_s)]
     if done.accel_b_m_s2 is not None:

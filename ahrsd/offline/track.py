@@ -20,7 +20,7 @@ from ahrsd.diagnosis.data_quality.preparation import find_facts
 from ahrsd.diagnosis.data_quality.stuck import dead_axis_notes, without_impossible_readings
 from ahrsd.diagnosis.data_quality.timestamps import without_clock_jumps
 from ahrsd.diagnosis.effects.design_matrix import GRAVITY_M_S2
-from ahrsd.diagnosis.repaired_model.forward import without
+from ahrsd.diagnosis.repaired_model.forward import remove_terms
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
 from ahrsd.diagnosis.track import Track
 from ahrsd.errors import AhrsdError
@@ -122,7 +122,7 @@ def without_terms(
         return seen, ()
     track, refused = prepare_columns(checked(track_of(blocks))[0])
     try:
-        track, left = without(track, model.calibration, model.terms)
+        track, left = remove_terms(track, model.calibration, model.terms)
     except ValueError as error:
         raise AhrsdError("; ".join([f"{path}: {error}", *refused])) from None
     rows = iter(np.cumsum([0, *map(len, blocks)]).tolist())

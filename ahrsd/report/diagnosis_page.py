@@ -22,18 +22,18 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Validation,
 )
 from ahrsd.diagnosis.answer.text import (
-    along,
+    component_lines,
+    direction_text,
     evidence_text,
     headline,
-    in_one_sentence,
-    ordinary_left,
-    place,
-    sensitivity,
+    ordinary_residual,
+    ordinary_text,
+    sensitivity_text,
     setting_text,
-    size_lines,
-    told_size,
+    size_text,
     value_text,
     verdict,
+    where_text,
 )
 from ahrsd.diagnosis.columns.roles import label
 from ahrsd.report.figures import AFTER, BEFORE, GREY, SERIES, WIDTH_IN, legend_above
@@ -317,7 +317,7 @@ _BY_FRAME = (
 
 def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
     """Write the page.  OSError where it cannot be written."""
-    ordinary = ordinary_left(found)
+    ordinary = ordinary_residual(found)
     page = render(
         "diagnosis.html",
         title=f"Diagnosis of {found.recording}",
@@ -325,10 +325,10 @@ def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
         verdict=verdict(found),
         findings=[_finding(found, one) for one in found.findings],
         unexplained=_unexplained(found),
-        ordinary=None if ordinary is None else in_one_sentence(ordinary),
+        ordinary=None if ordinary is None else ordinary_text(ordinary),
         how_real=_how_real(found),
         pictures=_pictures(found),
-        sensitivity=sensitivity(found.sensitivity),
+        sensitivity=sensitivity_text(found.sensitivity),
         limits=_limits(found),
         checks=[
             (_STATISTICS.get(name, name.replace("_", " ")), check)
@@ -364,7 +364,7 @@ def _finding(found: Diagnosis, one: Finding) -> dict[str, object]:
         rows.append(("to be sure", one.separate_from))
     return {
         "headline": headline(one),
-        "where": place(one.where),
+        "where": where_text(one.where),
         "sizes": [value_text(value) for value in one.parameters],
         "equation": one.equation,
         "rows": rows,
@@ -385,13 +385,13 @@ def _unexplained(found: Diagnosis) -> list[tuple[str, str]]:
     left = found.unexplained
     if left.where is None or not (left.detected or left.ordinary):
         return []
-    rows = [("where", place(left.where))]
+    rows = [("where", where_text(left.where))]
     if left.where.direction is not None:
-        rows.append(("along", along(left.where.direction)))
+        rows.append(("along", direction_text(left.where.direction)))
     if left.size is not None:
-        rows.append(("size", told_size(left.size, left.unit)))
+        rows.append(("size", size_text(left.size, left.unit)))
     if left.ordinary is not None:
-        rows += [("component", text) for text in size_lines(left.ordinary)]
+        rows += [("component", text) for text in component_lines(left.ordinary)]
         rows += [("why", left.ordinary.why)] if left.ordinary.why else []
     if left.single_source_share is not None:
         rows.append(("one source", f"{left.single_source_share:.0%} of it has one direction"))

@@ -9,7 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ahrsd.diagnosis.answer.diagnosis import Contribution, Diagnosis, Drawn
-from ahrsd.diagnosis.answer.text import headline, lines, ordinary_left, place
+from ahrsd.diagnosis.answer.text import answer_lines, headline, ordinary_residual, where_text
 from ahrsd.samples import Array
 from ahrsd.viewer.blueprint import X, Y, Z
 
@@ -29,7 +29,7 @@ def write_rrd(path: Path, found: Diagnosis) -> None:
     frames = [] if drawn is None else [one.frame for one in drawn.courses if len(one.course)]
     stream.set_sinks(rr.FileSink(str(path), write_footer=True))
     stream.send_blueprint(_blueprint(effects, [str(frame) for frame in frames]))
-    stream.log("verdict", rr.TextDocument("\n".join(lines(found))), static=True)
+    stream.log("verdict", rr.TextDocument("\n".join(answer_lines(found))), static=True)
     if drawn is not None:
         _series(stream, drawn)
         _spans(stream, found, drawn)
@@ -70,10 +70,10 @@ def _spans(stream: rr.RecordingStream, found: Diagnosis, drawn: Drawn) -> None:
     for finding in found.findings:
         for begin, _ in finding.where.intervals_s:
             stream.set_time(_TIME, duration=float(max(begin, drawn.time_s[0])))
-            stream.log("log", rr.TextLog(f"{headline(finding)}: {place(finding.where)}"))
+            stream.log("log", rr.TextLog(f"{headline(finding)}: {where_text(finding.where)}"))
     left = found.unexplained.where
     told = rr.TextLog("unknown, here", level=rr.TextLogLevel.WARN)
-    if ordinary_left(found) is not None:
+    if ordinary_residual(found) is not None:
         told = rr.TextLog("left here, and ordinary", level=rr.TextLogLevel.INFO)
     for begin, _ in () if left is None else left.intervals_s:
         stream.set_time(_TIME, duration=float(max(begin, drawn.time_s[0])))

@@ -31,7 +31,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Value,
     Where,
 )
-from ahrsd.diagnosis.answer.text import lines
+from ahrsd.diagnosis.answer.text import answer_lines
 from ahrsd.diagnosis.columns.roles import LABEL_CHARACTERS, label
 from ahrsd.diagnosis.model import NullModel
 from ahrsd.report import diagnosis_page
@@ -106,7 +106,7 @@ def diagnosis(**changes):
 
 
 def test_the_words_of_a_diagnosis():
-    assert lines(diagnosis())[:13] == [
+    assert answer_lines(diagnosis())[:13] == [
         "dive <7>.csv: MISMATCH: 1 effect left out and an unknown cause (p = 1e-09)",
         "",
         "1. the field of a motor current (motor_current_field), 97.0% sure",
@@ -214,7 +214,7 @@ def test_statistics_are_named_in_words(usual):
 
 
 def test_every_statistic_that_is_compared_has_its_words():
-    source = inspect.getsource(predictive_checks.statistics)
+    source = inspect.getsource(predictive_checks.residual_statistics)
     compared = set(re.findall(r'"([a-z_]+)"[:\]]', source))
     assert compared == set(_STATISTICS)
 
@@ -252,7 +252,7 @@ def test_where_nothing_is_found_and_the_checks_fail_nobody_says_that_all_agrees(
     }
     none = Unexplained(False)
     silent = diagnosis(mismatch=False, findings=(), unexplained=none, posterior_predictive=checks)
-    assert lines(silent)[0] == (
+    assert answer_lines(silent)[0] == (
         "dive <7>.csv: no cause found, but recording and model differ in: line (see the checks)"
     )
 
@@ -266,7 +266,9 @@ def test_nothing_found_says_what_would_have_been_seen():
         Limit("gyro_g_sensitivity", "g_xx", 1.7453e-3, "rad/s/g"),
     )
     none = Unexplained(False)
-    said = lines(diagnosis(mismatch=False, findings=(), unexplained=none, sensitivity=limits))
+    said = answer_lines(
+        diagnosis(mismatch=False, findings=(), unexplained=none, sensitivity=limits)
+    )
     assert said[0] == "dive <7>.csv: recording and model agree"
     assert said[2] == (
         "this recording would have shown: mag_time_lag above 1.5 ms, clock_rate above 0.69 %, "
@@ -305,7 +307,7 @@ def test_whatever_a_file_calls_its_columns_it_is_shown_in_one_short_line(name):
     tick = figure.axes[0].get_yticklabels()[0].get_text()
     assert tick.replace(r"\$", "$") == f"{label(name)}\n0 to 27"
     left = replace(diagnosis().unexplained, follows=(Suspect(name, 0.9, 0.01),))
-    told = lines(diagnosis(unexplained=left))
+    told = answer_lines(diagnosis(unexplained=left))
     assert "\x1b" not in "\n".join(told)
     assert max(map(len, told)) < 300
 

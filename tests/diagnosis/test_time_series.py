@@ -12,15 +12,15 @@ from scipy import ndimage, signal
 
 from ahrsd import so3
 from ahrsd.diagnosis import time_series
-from ahrsd.diagnosis.time_series import play
+from ahrsd.diagnosis.time_series import play_operator
 
 VALUES = np.random.default_rng(0).standard_normal((500, 3))
 
 
 def test_one_constant_is_lfilter():
-    found = time_series.first_order(VALUES, 0.93)
+    found = time_series.first_order_recursion(VALUES, 0.93)
     np.testing.assert_allclose(found, signal.lfilter([1.0], [1.0, -0.93], VALUES, axis=0))
-    assert np.array_equal(time_series.first_order(VALUES[:1], 0.93), VALUES[:1])
+    assert np.array_equal(time_series.first_order_recursion(VALUES[:1], 0.93), VALUES[:1])
 
 
 def test_a_constant_that_changes_is_the_loop():
@@ -28,7 +28,9 @@ def test_a_constant_that_changes_is_the_loop():
     expected = VALUES.copy()
     for k in range(1, len(expected)):
         expected[k] += keep[k - 1] * expected[k - 1]
-    np.testing.assert_allclose(time_series.first_order(VALUES, keep), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        time_series.first_order_recursion(VALUES, keep), expected, rtol=1e-12
+    )
 
 
 def test_autoregression_is_lfilter():
@@ -40,13 +42,13 @@ def test_autoregression_is_lfilter():
 def test_both_ways_weighs_by_distance():
     keep = 0.8
     weight = keep ** np.abs(np.subtract.outer(np.arange(500), np.arange(500)))
-    np.testing.assert_allclose(time_series.both_ways(VALUES, keep), weight @ VALUES, rtol=1e-9)
+    np.testing.assert_allclose(time_series.two_sided_sums(VALUES, keep), weight @ VALUES, rtol=1e-9)
 
 
 @pytest.mark.parametrize("width", [0.4, 3.0, 200.0])
 def test_gaussian_is_mirrored_at_the_ends(width):
     expected = ndimage.gaussian_filter1d(VALUES, width, axis=0, mode="reflect")
-    np.testing.assert_allclose(time_series.gaussian(VALUES, width), expected, atol=1e-12)
+    np.testing.assert_allclose(time_series.gaussian_smooth(VALUES, width), expected, atol=1e-12)
 
 
 def test_a_diagnosis_of_a_table_loads_neither_the_daemon_nor_what_draws():
@@ -63,14 +65,14 @@ def test_play_is_that_of_one_row_after_the_other(memory):
     values = np.cumsum(np.random.default_rng(3).standard_normal((777, 3)), axis=0)
     for radius in (0.01, 2.0, 40.0):
         last = values[0] + radius * np.asarray(memory or (0.0, 0.0, 0.0))
-        for row, found in zip(values, play(values, radius, memory), strict=True):
+        for row, found in zip(values, play_operator(values, radius, memory), strict=True):
             last = np.clip(last, row - radius, row + radius)
             np.testing.assert_array_equal(found, last)
 
 
 def test_play_follows_at_a_distance_and_rests_when_it_turns_round():
     values = np.array([0.0, 1.0, 2.0, 1.5, 0.5, -1.0])[:, None]
-    assert time_series.play(values, 0.5)[:, 0].tolist() == [0.0, 0.5, 1.5, 1.5, 1.0, -0.5]
+    assert time_series.play_operator(values, 0.5)[:, 0].tolist() == [0.0, 0.5, 1.5, 1.5, 1.0, -0.5]
 
 
 def test_a_low_pass_trails_a_ramp_by_its_time_constant():
@@ -99,7 +101,7 @@ def test_a_low_pass_quicker_than_the_samples_is_exact_on_a_curve(tau_s):
     dt_s = np.diff(time_s, prepend=np.nan)
     wave = np.sin(3.0 * time_s)[:, None]
     expected = np.imag(np.exp(3j * time_s) / (1 + 3j * tau_s))
-    out = time_series.low_pass_of_curves(wave, time_s, dt_s, tau_s)[:, 0]
+    out = time_series.low_pass_cubic(wave, time_s, dt_s, tau_s)[:, 0]
     straight = time_series.low_pass(wave, dt_s, tau_s)[:, 0]
     inner = slice(50, -1)
     assert np.abs(out - expected)[inner].max() < 2e-5
@@ -107,7 +109,7 @@ def test_a_low_pass_quicker_than_the_samples_is_exact_on_a_curve(tau_s):
     jittered = np.sort(time_s + np.random.default_rng(0).uniform(-0.01, 0.01, 1000))
     uneven = np.sin(3.0 * jittered)[:, None]
     steps = np.diff(jittered, prepend=np.nan)
-    out = time_series.low_pass_of_curves(uneven, jittered, steps, tau_s)[:, 0]
+    out = time_series.low_pass_cubic(uneven, jittered, steps, tau_s)[:, 0]
     expected = np.imag(np.exp(3j * jittered) / (1 + 3j * tau_s))
     assert np.abs(out - expected)[inner].max() < 1e-3
 

@@ -47,7 +47,7 @@ def command(
                          diagnosis.json the answer
                          model.json     the repaired model: ahrsd simulate --model
     """
-    from ahrsd.diagnosis.answer.text import lines
+    from ahrsd.diagnosis.answer.text import answer_lines
     from ahrsd.offline.diagnose import diagnose_recording
 
     refuse_unwritable(json_path)
@@ -68,13 +68,13 @@ def command(
     if folder is not None:
         _write_report(folder, found)
     if json_path != "-":
-        click.echo("\n".join(lines(found)))
+        click.echo("\n".join(answer_lines(found)))
         if folder is not None:
             click.echo(f"report: {folder / 'report.html'}")
 
 
 def _write_report(folder: Path, found: Diagnosis) -> None:
-    from ahrsd.diagnosis.repaired_model.model_file import of_diagnosis, to_text
+    from ahrsd.diagnosis.repaired_model.model_file import repaired_model_of, to_text
     from ahrsd.report.diagnosis_page import write_diagnosis_report
     from ahrsd.viewer.diagnosis import write_rrd
 
@@ -87,7 +87,7 @@ def _write_report(folder: Path, found: Diagnosis) -> None:
         )
         write_rrd(folder / "diagnosis.rrd", found)
         if found.model is not None:
-            (folder / "model.json").write_text(to_text(of_diagnosis(found)), encoding="utf-8")
+            (folder / "model.json").write_text(to_text(repaired_model_of(found)), encoding="utf-8")
     except OSError as error:
         raise AhrsdError(f"{folder}: cannot be written: {error.strerror}") from error
     write_json(str(folder / "diagnosis.json"), found.to_json())

@@ -1,1 +1,1 @@
-"""The answer in the contract's form, what it is held against, and its words."""
+"""The answer in the form of the contract, its checks, and its text."""

@@ -1,7 +1,7 @@
-"""How large something is that is added to the readings: in gauss, and in degrees of heading.
+"""Size of a field that is added to the readings, in gauss and in degrees of heading.
 
-What another calibration would take of it is no part of it: on a car that hardly tilts nearly all of
-a field by attitude is such.  Here, too: by how much one calibration in place of another
+The part that a different calibration would absorb is not counted: on a car that hardly tilts, that
+is nearly all of a field by attitude.  Also here: by how much one calibration in place of another
 turns a heading.
 """
 
@@ -14,8 +14,8 @@ from ahrsd.diagnosis.model import Context, NullModel
 from ahrsd.samples import Array
 
 
-def calibration_of(context: Context) -> Array:
-    """(3 N, 9) orthonormal: how readings move with soft and hard iron."""
+def calibration_basis(context: Context) -> Array:
+    """(3 N, 9) orthonormal basis of what soft and hard iron can add to the readings."""
     x, y, z = context.field_b.T
     zero, one = np.zeros_like(x), np.ones_like(x)
     soft = [
@@ -26,28 +26,28 @@ def calibration_of(context: Context) -> Array:
     return np.asarray(np.linalg.svd(columns, full_matrices=False)[0])
 
 
-def less_calibration(added: Array, take: Array) -> Array:
-    """(N, 3) what no soft and hard iron would take over; take: `calibration_of`."""
+def project_out_calibration(added: Array, basis: Array) -> Array:
+    """(N, 3) the part that no soft and hard iron would absorb; basis: `calibration_basis`."""
     flat = added.ravel()
-    return np.asarray((flat - take @ (take.T @ flat)).reshape(added.shape))
+    return np.asarray((flat - basis @ (basis.T @ flat)).reshape(added.shape))
 
 
-def deviation(added: Array) -> float:
+def rms_about_mean(added: Array) -> float:
     """Root mean square length of (N, 3) about its mean."""
     return float(np.sqrt(np.sum(np.var(added, axis=0))))
 
 
-def heading_off_deg(added: Array, context: Context) -> float:
-    """Deviation of a level vehicle's heading by a field (N, 3) that is added to the readings.
+def heading_deviation_deg(added: Array, context: Context) -> float:
+    """Standard deviation of a level vehicle's heading due to a field (N, 3) added to the readings.
 
-    Across the horizontal field; where nothing says what is level, of any direction in a field of
-    usual dip.
+    From the component across the horizontal field; where no down direction is known, for a field
+    of random direction and usual inclination.
     """
     read = context.field_b @ context.model.soft_iron.T
     if not context.world_levelled:
         size = float(np.median(np.linalg.norm(read, axis=1)))
-        return float(np.degrees(deviation(added) / np.sqrt(3.0) / (priors.LEVEL_SHARE * size)))
-    outside, in_world = (_turned(context.R_nb, vectors) for vectors in (read, added))
+        return float(np.degrees(rms_about_mean(added) / np.sqrt(3.0) / (priors.LEVEL_SHARE * size)))
+    outside, in_world = (_rotate(context.R_nb, vectors) for vectors in (read, added))
     north, east, _ = mean = outside.mean(axis=0)
     level = float(np.hypot(north, east))
     least = max(level, priors.LEVEL_LEAST_SHARE * float(np.linalg.norm(mean)))
@@ -55,15 +55,15 @@ def heading_off_deg(added: Array, context: Context) -> float:
     return float(np.degrees(np.std(across) / least))
 
 
-def _turned(rotations: Array, vectors: Array) -> Array:
+def _rotate(rotations: Array, vectors: Array) -> Array:
     return np.asarray(np.einsum("nij,nj->ni", rotations, vectors))
 
 
 def heading_error_deg(before: NullModel, after: NullModel, field_b: Array) -> float:
-    """Largest heading error that a level vehicle sees from the one calibration in place of another.
+    """Largest heading error of a level vehicle if one calibration is used in place of another.
 
-    Both correct the readings of the repaired sensor; field_b (N, 3) gives the field's size, and the
-    inclination is taken as 60 degrees.
+    Both correct the readings of the repaired sensor; field_b (N, 3) gives the field's size, and
+    the inclination is taken as 60 degrees.
     """
     size = float(np.median(np.linalg.norm(field_b, axis=1)))
     heading = np.radians(np.arange(0.0, 360.0, 5.0))

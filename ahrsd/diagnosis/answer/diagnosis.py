@@ -1,6 +1,6 @@
-"""The answer of a diagnosis, field for field as the contract's section 5, and what a report draws.
+"""The answer of a diagnosis, as in section 5 of the contract, and the data of the report.
 
-`to_json` gives the contract's object; arrays and working values are left out of it.
+`to_json` gives the contract's object, without arrays and working values.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Baseline:
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """A name with its probability."""
+    """An effect with its probability."""
 
     effect: str
     confidence: float
@@ -36,7 +36,7 @@ class Share:
 
 @dataclass(frozen=True, slots=True)
 class Where:
-    """The address of a mismatch.  frame: sensor, world, gyro, link or noise."""
+    """Where a mismatch acts.  frame: sensor, world, gyro, link or noise."""
 
     intervals_s: tuple[tuple[float, float], ...]
     axes: tuple[str, ...]
@@ -58,9 +58,9 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Heldout:
-    """What the model gains on blocks that it was not fitted to.
+    """Predictive gain of the model on blocks that it was not fitted to.
 
-    placebo_gain: that of the same effect moved in time (99th percentile), nats per sample
+    placebo_gain: that of the same effect shifted in time (99th percentile), nats per sample
     """
 
     rms_before_gauss: float
@@ -71,7 +71,7 @@ class Heldout:
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What the calibration would be off by without the effect in the model."""
+    """Error of the calibration if the effect is left out of the model."""
 
     hard_iron_shift_gauss: float
     heading_error_deg: float
@@ -79,7 +79,7 @@ class Cost:
 
 @dataclass(frozen=True, slots=True)
 class Assumed:
-    """The log odds of an answer where one thing that was assumed is half and twice as much."""
+    """The log odds of an answer if one prior assumption is halved and doubled."""
 
     what: str
     half_nats: float
@@ -88,10 +88,11 @@ class Assumed:
 
 @dataclass(frozen=True, slots=True)
 class OnPriors:
-    """How an answer depends on what was assumed before any reading.
+    """Prior sensitivity of an answer.
 
-    log_odds: of it, nats, to what is likeliest without it;  asked: from which on it is told
-    stays: whether it is told whichever of these is half or twice as much
+    log_odds: of the answer against the most probable one without it, nats;  asked: the threshold
+    from which it is reported
+    stays: whether it is reported with each assumption halved and doubled
     """
 
     log_odds: float
@@ -102,11 +103,11 @@ class OnPriors:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One named effect.
+    """One effect of the library that was found.
 
     heldout, cost_if_left_out: None, and no key in the answer, for what was counted and not fitted
-    term: its number among the terms of the repaired model, likewise
-    priors: likewise, where the odds are no posterior's
+    term: index among the terms of the repaired model, likewise
+    priors: likewise, where the odds are not those of a posterior
     """
 
     effect: str
@@ -127,7 +128,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Suspect:
-    """A logged channel that moves with an unexplained course."""
+    """A logged channel that correlates with an unexplained time series."""
 
     channel: str
     correlation: float
@@ -136,11 +137,12 @@ class Suspect:
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """One part of what is left, beside what recordings ordinarily leave of it.
+    """One part of the residual, compared with what recordings ordinarily leave of it.
 
-    size:    deviation over the recording, in `unit`;  up_to: what ordinary recordings leave
-    heading_deg: deviation of a level vehicle's heading by it; None of the gyro's errors
-    evidence_nats: by which the recording is likelier with it;  there: whether that is enough
+    size:    standard deviation over the recording, in `unit`
+    up_to:   what ordinary recordings leave
+    heading_deg: deviation of a level vehicle's heading by it; None for errors of the gyro
+    evidence_nats: log evidence for it;  there: whether that is enough
     """
 
     component: str
@@ -156,11 +158,11 @@ class Component:
 
 @dataclass(frozen=True, slots=True)
 class Ordinary:
-    """The size of what is left beside what real recordings ordinarily leave.
+    """Size of the residual, compared with what real recordings ordinarily leave.
 
     within: whether it is ordinary;  why: in a sentence, if it is not
-    field_gauss, heading_deg, gyro_rad_s: everything together, and what ordinary recordings leave
-    recordings: untouched real recordings that this was measured on
+    field_gauss, heading_deg, gyro_rad_s: all parts together, and what ordinary recordings leave
+    recordings: number of untouched real recordings on which this was measured
     """
 
     within: bool
@@ -177,7 +179,7 @@ class Ordinary:
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """What the library has no name for: located, with its course in time.
+    """A mismatch that is no effect of the library: where it is, and its time series.
 
     detected: whether it is there and, where `ordinary` is known, beyond what is ordinary
     course: (time in s, value in `unit`) of one source along `where.direction`, about its mean
@@ -208,9 +210,9 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Whiteness:
-    """A test of the innovations that needs no idea of what may be wrong.
+    """A test of the innovations without an alternative hypothesis.
 
-    p_before, p_after: its probability if nothing were left out, for the null and the repaired model
+    p_before, p_after: its p-value for the null and the repaired model
     """
 
     words: str
@@ -220,7 +222,7 @@ class Whiteness:
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """The smallest effect that this recording would have shown, per parameter; None: not at all."""
+    """The smallest effect that this recording would have shown, by parameter; None: none."""
 
     effect: str
     parameter: str
@@ -230,11 +232,11 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """What whole models gain over the calibration alone where nothing was fitted.
+    """Predictive gain of whole models over the calibration alone, on readings not used for the fit.
 
-    Nats per recorded sample.  named: all names together, each fifth of the recording from the other
-    four;  free: what the names leave, drawn freely, beside them, from every second stretch;
-    placebo: the largest gain of a name that was moved in time
+    Nats per recorded sample.  named: all effects together, each fifth of the recording from the
+    other four;  free: with them, a free time series for the residual, from every second segment;
+    placebo: the largest gain of an effect that was shifted in time
     """
 
     named: float
@@ -244,10 +246,11 @@ class Validation:
 
 @dataclass(frozen=True, slots=True)
 class RegimeMap:
-    """How much is left under which conditions: one quantity in bins with equally many samples.
+    """Residual by condition: one quantity in bins of equally many samples.
 
-    edges: (bins + 1,);  before, after: (bins,) nats that a field of the bin's own gains beside the
-    calibration, and beside the repaired model; noise alone has 1.5
+    edges: (bins + 1,)
+    before, after: (bins,) nats that a constant field of the bin gains, with the calibration alone
+    and with the repaired model; noise alone gains 1.5
     """
 
     quantity: str
@@ -258,7 +261,7 @@ class RegimeMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contribution:
-    """What a term adds to the readings: time_s (N,), added (N, 3) in `unit`, gauss or rad/s."""
+    """What an effect adds to the readings: time_s (N,), added (N, 3) in `unit`, gauss or rad/s."""
 
     effect: str
     time_s: Array
@@ -271,9 +274,10 @@ class Drawn:
     """What the report draws; rows as in the (thinned) track.
 
     time_s (N,); before, after (N, 3): whitened innovations of the null and the repaired model;
-    before_gauss, after_gauss (N, 3): the same as they are, reading less what was expected;
-    contributions: of the repaired model's terms, in their order;  courses: the agnostic frames'
-    after the named terms;  evidence: nats of every candidate in the first round, best setting.
+    before_gauss, after_gauss (N, 3): the same without whitening, reading less prediction;
+    contributions: of the repaired model's terms, in their order;  courses: the piecewise constant
+    fields of the three frames, given the effects;  evidence: nats of every candidate in the first
+    round, at its best setting.
     """
 
     time_s: Array
@@ -290,7 +294,7 @@ class Drawn:
 class Diagnosis:
     """The whole answer.
 
-    undecided: why nothing can be told, None where it can: then it says neither yes nor no
+    undecided: why the recording cannot be judged; None where it can
     model, noise, terms: the repaired model, of single samples
     """
 
@@ -314,56 +318,59 @@ class Diagnosis:
 
     @property
     def failed_checks(self) -> list[str]:
-        """Statistics in which the recording is not like simulations of the repaired model."""
+        """Statistics in which the recording differs from simulations of the repaired model."""
         return [k for k, check in self.posterior_predictive.items() if not check.inside_after]
 
     def to_json(self) -> dict[str, Any]:
-        """The contract's object, and what is beside it: tests, maps, notes, the repaired model."""
+        """The contract's object, and additional keys: tests, maps, notes, the repaired model."""
         out: dict[str, Any] = {
             "schema": SCHEMA,
             "recording": self.recording,
-            "baseline": _plain(self.baseline),
+            "baseline": _to_plain(self.baseline),
             "mismatch": self.mismatch,
             "p_value": self.p_value,
-            "findings": [_told(finding) for finding in self.findings],
-            "unexplained": _measured(self.unexplained, ("priors",)),
-            "posterior_predictive": {k: _plain(v) for k, v in self.posterior_predictive.items()},
-            "omnibus": {k: _plain(v) for k, v in self.omnibus.items()},
-            "validation": _plain(self.validation),
-            "regime_map": [_plain(one) for one in self.regime_map],
-            "sensitivity": [_plain(limit) for limit in self.sensitivity],
+            "findings": [_finding_json(finding) for finding in self.findings],
+            "unexplained": _without_missing(self.unexplained, ("priors",)),
+            "posterior_predictive": {k: _to_plain(v) for k, v in self.posterior_predictive.items()},
+            "omnibus": {k: _to_plain(v) for k, v in self.omnibus.items()},
+            "validation": _to_plain(self.validation),
+            "regime_map": [_to_plain(one) for one in self.regime_map],
+            "sensitivity": [_to_plain(limit) for limit in self.sensitivity],
             "notes": list(self.notes),
         }
         if self.undecided is not None:
             out["undecided"] = self.undecided
         if self.model is not None:
-            out["model"] = {**_plain(self.model), "terms": [_plain(term) for term in self.terms]}
+            out["model"] = {
+                **_to_plain(self.model),
+                "terms": [_to_plain(term) for term in self.terms],
+            }
         return out
 
 
-def _told(finding: Finding) -> dict[str, Any]:
+def _finding_json(finding: Finding) -> dict[str, Any]:
     """A finding without the keys of what was not measured."""
-    return _measured(finding, ("heldout", "cost_if_left_out", "term", "priors"))
+    return _without_missing(finding, ("heldout", "cost_if_left_out", "term", "priors"))
 
 
-def _measured(record: Any, optional: tuple[str, ...]) -> dict[str, Any]:  # noqa: ANN401 - as below
-    """A record without the keys of these that were not measured."""
-    out: dict[str, Any] = _plain(record)
+def _without_missing(record: Any, optional: tuple[str, ...]) -> dict[str, Any]:  # noqa: ANN401
+    """A record as a dictionary, without those optional keys that are None."""
+    out: dict[str, Any] = _to_plain(record)
     return {k: value for k, value in out.items() if value is not None or k not in optional}
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401 - any of the records above
+def _to_plain(value: Any) -> Any:  # noqa: ANN401 - any of the records above
     """Dataclasses to dictionaries, arrays to lists, numbers to Python's own."""
     if isinstance(value, np.ndarray):
-        return [_plain(item) for item in value.tolist()]
+        return [_to_plain(item) for item in value.tolist()]
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return _to_plain(value.item())
     if isinstance(value, float):
         return value if np.isfinite(value) else None
     if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
+        return [_to_plain(item) for item in value]
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _to_plain(item) for key, item in value.items()}
     if hasattr(value, "__dataclass_fields__"):
-        return {name: _plain(getattr(value, name)) for name in value.__dataclass_fields__}
+        return {name: _to_plain(getattr(value, name)) for name in value.__dataclass_fields__}
     return value

@@ -1,31 +1,31 @@
-"""What is told beside a loud gyro, held against what the model alone shows there by chance.
+"""The evidence of a diagnosis with a noisy gyro, compared with simulations of the null model.
 
-The filter takes the measured rates for those that turn the field.  Where the gyro's noise turns it
-by more from one reading to the next than the magnetometer scatters, that noise is in every column
-and every evidence (a regression on noisy regressors), and the law by which evidence is judged
-elsewhere is not the one it follows.  Where the motion hardly shows the calibration far less noise
-does the same: a sensor that turns slowly and is hardly tilted has the scale of its vertical axis
-from turns that are as small as the noise, and calibrations a tenth of a gauss off are likelier,
-with a mount that gives and iron that lags for the rest.
+The filter takes the measured rates for the true ones.  If the gyro's noise turns the field between
+two readings by more than the magnetometer's noise, that noise is in every column and every
+evidence (a regression on noisy regressors), and evidence no longer follows the law by which it is
+judged elsewhere.  If the motion hardly determines the calibration, far less noise has the same
+effect: a sensor that turns slowly and is hardly tilted determines the scale of its vertical axis
+from turns as small as the noise.  Then calibrations that are a tenth of a gauss off are more
+likely, with a flexible mount and viscous iron to explain the remainder.
 
-So the law of what is told is measured (a parametric bootstrap): the fitted
-calibration alone is simulated along the recording's own motion, with its stamps, its columns and
-the noise that was fitted.  First the calibration is fitted to each copy as it was to the recording:
-where what it leaves of the recording is like what it leaves of the copies, the two agree, whatever
-else is told.  Where it is not, the same question is asked of the first copies, and what is told
-must be far beyond what is told of these.  Calibration and noise are those of the fit without
-any name or beside the names, whose magnetometer is the quieter one: what a missing name leaves is
-no noise, and louder copies show more by chance.
+Therefore the distribution of the evidence is measured (a parametric bootstrap).  The fitted
+calibration alone is simulated along the recording's own motion, with its time stamps, its columns
+and the fitted noise.  First the calibration is fitted to each copy as it was to the recording.  If
+the residuals of the recording are like those of the copies, recording and calibration agree,
+whatever else was found.  If not, the first copies are diagnosed as well, and a finding must be far
+beyond what is found in these.  Calibration and noise are those of the fit without any effect or of
+the fit with the effects, whichever has the lower magnetometer noise: the residual of a missing
+effect is not noise, and noisier copies show more by chance.
 
-The motion is what the gyro's readings are expected to be without their noise
-(`time_series.denoised`), held by field and accelerometer.  Nothing is different in a copy, so
-whatever is told of one is chance.
+The motion is the expected value of the gyro's readings without their noise
+(`time_series.wiener_filter`), aligned by field and accelerometer.  A copy has no mismatch, so
+whatever is found in it is chance.
 Evidence that is too large by an unknown factor has an exponential tail of unknown scale: it is t
-times the largest of n such with the chance n! / ((1 + t) ... (n + t)), whatever that scale: 1 in
-126 for four times the largest of five.  Of what is far beyond the first copies the others need not
-be asked: 1 in 1000 is enough at each of them (43 times the larger of two), and with all of these
-looks about 1 in 94 of what chance makes is told.  A copy of which nothing is told counts with what
-is kept untold of it.
+times the largest of n such with probability n! / ((1 + t) ... (n + t)), whatever that scale: 1 in
+126 for four times the largest of five.  If the evidence is far beyond that of the first copies, the
+others need not be diagnosed: 1 in 1000 is required at each of them (43 times the larger of two).
+With all of these looks about 1 in 94 of chance findings is reported.  A copy without findings
+counts with the evidence below which nothing is reported.
 """
 
 from __future__ import annotations
@@ -37,22 +37,26 @@ import numpy as np
 
 from ahrsd.diagnosis import priors, time_series
 from ahrsd.diagnosis.answer.diagnosis import Check, Diagnosis, Finding, Unexplained
-from ahrsd.diagnosis.answer.predictive_checks import beside_refitted, checks, usual_noise
+from ahrsd.diagnosis.answer.predictive_checks import (
+    check_null,
+    compare_with_refits,
+    constant_level_noise,
+)
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, fit_null
 from ahrsd.diagnosis.calibration_fit.problem import Problem, build_problem, model_of_samples
 from ahrsd.diagnosis.data_quality.preparation import detectable_faults
 from ahrsd.diagnosis.effects.effect import Readings
 from ahrsd.diagnosis.innovation_filter.context import (
-    Given,
+    UnfittedMotion,
     attitude,
     build_context,
     smoothed_rate,
 )
 from ahrsd.diagnosis.innovation_filter.innovation import (
-    bearings,
-    carried_along,
+    carried_orientation,
+    filtered_for_regression,
+    nominal_motion,
     nuisance_columns,
-    regressing,
     sensitivities,
 )
 from ahrsd.diagnosis.model import Noise, NullModel
@@ -66,8 +70,8 @@ BENT = "the gyro's noise bends the calibration, which this motion hardly shows"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answered:
-    """An answer, with the calibration that was fitted before any name.
+class FittedDiagnosis:
+    """A diagnosis, with the calibration that was fitted before any effect.
 
     problem, start: None where nothing was fitted
     """
@@ -78,8 +82,8 @@ class Answered:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Alone:
-    """How the fit of the calibration alone compares with fits of simulations of it.
+class RefitComparison:
+    """The fit of the calibration alone, compared with fits to simulations of it.
 
     checks:  empty where fewer than half of the simulations could be fitted
     p_value: of the recording's fit among those of the simulations
@@ -91,12 +95,12 @@ class Alone:
     fitted: int
 
     @staticmethod
-    def of(problem: Problem, start: NullFit, copies: Sequence[Track]) -> Alone:
-        """Of the recording's fit, and of copies, to which a calibration is fitted as to it."""
-        fits = [fit for one in copies if (fit := _fit_of(one, problem)) is not None]
+    def of(problem: Problem, start: NullFit, copies: Sequence[Track]) -> RefitComparison:
+        """Compare the recording's fit with fits of the calibration to the copies."""
+        fits = [fit for one in copies if (fit := _fit_copy(one, problem)) is not None]
         enough = 2 * len(fits) >= len(copies)
-        checked, p_value = beside_refitted(start, fits) if enough else ({}, 1.0)
-        return Alone(checked, p_value, len(copies), len(fits))
+        checked, p_value = compare_with_refits(start, fits) if enough else ({}, 1.0)
+        return RefitComparison(checked, p_value, len(copies), len(fits))
 
     @property
     def undecided(self) -> str | None:
@@ -110,123 +114,135 @@ class Alone:
 
     @property
     def differs(self) -> bool:
-        """Whether the recording's fit leaves what those of simulations do not."""
+        """Whether the residuals of the recording's fit differ from those of the simulations."""
         return any(not check.inside_after for check in self.checks.values())
 
 
-def beyond_chance(track: Track, ask: Callable[[Track], Answered]) -> Diagnosis:
-    """The answer about a track; beside a loud gyro only what is clearly beyond chance is told.
+def diagnose_beyond_chance(track: Track, diagnose: Callable[[Track], FittedDiagnosis]) -> Diagnosis:
+    """Diagnose a track; with a noisy gyro, report only what is clearly beyond chance.
 
-    ask: answers about a track.  Where the gyro is loud, by itself or for this motion, and something
-    is told or a check fails, the calibration is fitted to `CHANCE_FITS` copies (seeds 0, 1 and so
-    on); where the recording's fit is not like theirs, `CHANCE_COPIES` of these at most are asked
-    about as well
+    diagnose: the diagnosis of a track
+    If the gyro is noisy, by itself or for this motion, and there is a finding or a failed check,
+    the calibration is fitted to `CHANCE_FITS` copies (seeds 0, 1 and so on).  If the recording's
+    fit differs from theirs, `CHANCE_COPIES` of these at most are diagnosed.
     """
-    first = ask(track)
+    first = diagnose(track)
     found, problem, start = first.found, first.problem, first.start
-    told = max(_told(found), default=0.0)
-    seen = told > 0.0 or found.failed_checks or found.p_value < priors.FAMILY_P
+    evidence = max(_reported_evidence(found), default=0.0)
+    seen = evidence > 0.0 or found.failed_checks or found.p_value < priors.FAMILY_P
     if problem is None or start is None or not seen:
         return found
     recorded = problem.recorded
     models = [model_of_samples(start.model, problem), *([found.model] if found.model else [])]
-    model = max(models, key=lambda one: loudness(recorded, one))
-    loud = loudness(recorded, model) >= priors.CHANCE_LOUD
-    if not loud and bent(start) < priors.CHANCE_BENT:
+    model = max(models, key=lambda one: gyro_to_mag_noise(recorded, one))
+    noisy = gyro_to_mag_noise(recorded, model) >= priors.CHANCE_LOUD
+    if not noisy and calibration_bend(start) < priors.CHANCE_BENT:
         return found
-    why = LOUD if loud else BENT
-    truth = motion_of(recorded, model)
-    for noise in _noises_of(model, start):
-        copies = [copy_of(recorded, truth, noise, seed) for seed in range(priors.CHANCE_FITS)]
-        alone = Alone.of(problem, start, copies)
-        if not alone.differs:
+    why = LOUD if noisy else BENT
+    truth = noise_free_motion(recorded, model)
+    for noise in _candidate_noises(model, start):
+        copies = [
+            simulated_copy(recorded, truth, noise, seed) for seed in range(priors.CHANCE_FITS)
+        ]
+        comparison = RefitComparison.of(problem, start, copies)
+        if not comparison.differs:
             break
-    if not alone.differs:
-        return _agreeing(
-            first, problem, start, alone, _alike(why, found, told, alone), alone.undecided
+    if not comparison.differs:
+        return _null_answer(
+            first,
+            problem,
+            start,
+            comparison,
+            _agreement_note(why, found, evidence, comparison),
+            comparison.undecided,
         )
-    if told <= 0.0:
-        return replace(found, posterior_predictive=alone.checks)
-    shown, bound = _shown(copies[: priors.CHANCE_COPIES], ask, found)
-    said = _words(why, found, told, shown, bound)
-    if told <= bound:
-        untold = None if np.isfinite(bound) else NOT_DIAGNOSED
-        return _agreeing(first, problem, start, alone, said, untold)
-    weak = [one.effect for one in found.findings if _fitted(one) and one.evidence_nats <= bound]
-    said = f"{said}, so that this is doubted: {', '.join(weak)}" if weak else said
-    return replace(found, notes=(*found.notes, said))
+    if evidence <= 0.0:
+        return replace(found, posterior_predictive=comparison.checks)
+    shown, bound = _evidence_in_copies(copies[: priors.CHANCE_COPIES], diagnose, found)
+    note = _comparison_note(why, found, evidence, shown, bound)
+    if evidence <= bound:
+        undecided = None if np.isfinite(bound) else NOT_DIAGNOSED
+        return _null_answer(first, problem, start, comparison, note, undecided)
+    weak = [one.effect for one in found.findings if _is_fitted(one) and one.evidence_nats <= bound]
+    note = f"{note}, so that this is doubted: {', '.join(weak)}" if weak else note
+    return replace(found, notes=(*found.notes, note))
 
 
-def loudness(track: Track, model: NullModel) -> float:
-    """By how much the gyro's noise turns the field in a step, in the magnetometer's deviations."""
+def gyro_to_mag_noise(track: Track, model: NullModel) -> float:
+    """Turn of the field in a step by gyro noise, in deviations of the magnetometer's noise."""
     field_b = np.linalg.solve(model.soft_iron, (track.mag_b_gauss - model.hard_iron_gauss).T)
     size = float(np.nanmedian(np.linalg.norm(field_b, axis=0)))
     return size * model.sigma_gyro_rad_s * track.step_s / model.sigma_mag_gauss
 
 
-def bent(start: NullFit) -> float:
-    """How far the noise in the columns moves a calibration, in the deviations to which it is known.
+def calibration_bend(start: NullFit) -> float:
+    """Bias of the calibration by the noise in its columns, in its own standard deviations.
 
-    The fit follows the slopes of the innovations, in which the gyro's noise is; slopes of the
-    smoothed motion have none, and what they say otherwise at the fit is what that noise does.
+    The fit uses the derivatives of the innovations, which contain the gyro's noise.  Derivatives
+    from the smoothed motion contain none, and the difference of the two scores at the fit is due
+    to that noise.
     """
     done = start.filtered
-    smooth = regressing(done, start.context().rate_b_rad_s)
+    smooth = filtered_for_regression(done, start.context().rate_b_rad_s)
     noisy, clean = (sensitivities(one, nuisance_columns(one)) for one in (done, smooth))
     score = np.einsum("nia,ni->a", noisy - clean, done.whitened)
     known = start.covariance[: len(score), : len(score)]
     return float(np.sqrt(max(score @ known @ score, 0.0)))
 
 
-def motion_of(track: Track, model: NullModel) -> Readings:
+def noise_free_motion(track: Track, model: NullModel) -> Readings:
     """Noise-free readings of a calibration along a track's motion without the gyro's noise."""
-    seen = bearings(track, model)
-    context = build_context(track, Given(seen))
-    rate = _without_noise(track, model)
-    quiet = replace(seen, orientation=carried_along(track, rate))
-    R_nb, levelled = attitude(track, quiet)
+    seen = nominal_motion(track, model)
+    context = build_context(track, UnfittedMotion(seen))
+    rate = _denoised_rate(track, model)
+    denoised_motion = replace(seen, orientation=carried_orientation(track, rate))
+    R_nb, levelled = attitude(track, denoised_motion)
     along = replace(
         context, R_nb=R_nb, world_levelled=levelled, rate_b_rad_s=rate, field_b=seen.nominal_b
     )
-    return forward.truth_along(along)
+    return forward.noise_free_readings(along)
 
 
-def _noises_of(model: NullModel, start: NullFit) -> list[Noise]:
-    """The noise of a model; where the magnetometer has less than a fit believes at least, how much
-    is not known: what the innovations say, and none."""
-    noise = forward.noise_of(model)
+def _candidate_noises(model: NullModel, start: NullFit) -> list[Noise]:
+    """The noise of a model, or two where the magnetometer's is at the least that a fit assumes.
+
+    How much it really is, is then unknown: the noise that the innovations show, and none.
+    """
+    noise = forward.model_noise(model)
     if start.model.sigma_mag_gauss > priors.FLOOR_MAG_GAUSS:
         return [noise]
-    less = min(1.0, usual_noise(start).mag_gauss / forward.noise_of(start.model).mag_gauss)
+    less = min(
+        1.0, constant_level_noise(start).mag_gauss / forward.model_noise(start.model).mag_gauss
+    )
     return [replace(noise, mag_gauss=less * noise.mag_gauss), replace(noise, mag_gauss=0.0)]
 
 
-def copy_of(track: Track, truth: Readings, noise: Noise, seed: int) -> Track:
-    """The track with other readings: those of the truth with noise."""
-    made = forward.simulated(truth, (), noise, seed)
+def simulated_copy(track: Track, truth: Readings, noise: Noise, seed: int) -> Track:
+    """The track with simulated readings: those of the truth with noise."""
+    made = forward.simulate_readings(truth, (), noise, seed)
     read = np.isfinite(track.mag_b_gauss)
     mag = np.where(read, made.mag_b_gauss, track.mag_b_gauss)
     return replace(track, mag_b_gauss=mag, gyro_b_rad_s=made.gyro_b_rad_s)
 
 
-def _without_noise(track: Track, model: NullModel) -> Array:
-    """(N, 3) rates as they are expected to be; in runs too short for a spectrum, smoothed."""
+def _denoised_rate(track: Track, model: NullModel) -> Array:
+    """(N, 3) expected rates without noise; smoothed in runs that are too short for a spectrum."""
     rate = track.gyro_b_rad_s - model.gyro_bias_rad_s
     runs = track.runs or (slice(0, len(track)),)
     out = smoothed_rate(rate, runs, track.step_s, model.sigma_gyro_rad_s)
     for run in runs:
         if run.stop - run.start >= time_series.SPECTRUM_ROWS:
-            out[run] = time_series.denoised(rate[run])
+            out[run] = time_series.wiener_filter(rate[run])
     return out
 
 
-def _fitted(one: Finding) -> bool:
-    """Whether it rests on a fit; what was counted in the readings is no matter of noise."""
+def _is_fitted(one: Finding) -> bool:
+    """Whether the finding rests on a fit; for one counted in the readings noise does not matter."""
     return one.term is not None
 
 
-def _fit_of(copy: Track, problem: Problem) -> NullFit | None:
-    """The calibration alone fitted to a copy, as it was to the recording; None where it cannot."""
+def _fit_copy(copy: Track, problem: Problem) -> NullFit | None:
+    """The calibration alone fitted to a copy, as it was to the recording; None if that fails."""
     try:
         made, cold = build_problem(copy, problem.spec)
         return fit_null(made.track, made.spec, cold, walk=False)
@@ -234,33 +250,40 @@ def _fit_of(copy: Track, problem: Problem) -> NullFit | None:
         return None
 
 
-def _alike(why: str, found: Diagnosis, told: float, alone: Alone) -> str:
-    """What was seen, and why it is not told."""
-    seen = f"{why}: {_names(found)} is worth {told:.0f} nats here" if told > 0.0 else why
-    if (untold := alone.undecided) is not None:
-        return f"{seen}; {untold}"
+def _agreement_note(
+    why: str, found: Diagnosis, evidence: float, comparison: RefitComparison
+) -> str:
+    """The note on what was found, and why it is not reported."""
+    seen = (
+        f"{why}: {_reported_effects(found)} is worth {evidence:.0f} nats here"
+        if evidence > 0.0
+        else why
+    )
+    if (undecided := comparison.undecided) is not None:
+        return f"{seen}; {undecided}"
     return (
-        f"{seen}; {alone.fitted} simulations of the model alone with this noise (seeds 0 to "
-        f"{alone.copies - 1}), fitted as the recording was, look like it, so that nothing is told"
+        f"{seen}; {comparison.fitted} simulations of the model alone with this noise (seeds 0 to "
+        f"{comparison.copies - 1}), fitted as the recording was, look like it, so that nothing is "
+        "told"
     )
 
 
-def _names(found: Diagnosis) -> str:
-    """What is told and rests on a fit."""
-    names = [one.effect for one in found.findings if _fitted(one)]
-    return ", ".join([*names, *(["something unknown"] if found.unexplained.detected else [])])
+def _reported_effects(found: Diagnosis) -> str:
+    """The reported effects that rest on a fit."""
+    effects = [one.effect for one in found.findings if _is_fitted(one)]
+    return ", ".join([*effects, *(["something unknown"] if found.unexplained.detected else [])])
 
 
-def _told(found: Diagnosis) -> list[float]:
-    """The evidence of each that is told and was fitted, nats."""
-    nats = [one.evidence_nats for one in found.findings if _fitted(one)]
+def _reported_evidence(found: Diagnosis) -> list[float]:
+    """The evidence of each reported mismatch that was fitted, nats."""
+    nats = [one.evidence_nats for one in found.findings if _is_fitted(one)]
     left = found.unexplained
     return [*nats, *([left.evidence_nats] if left.detected else [])]
 
 
-def times_beyond(copies: int, chance: float) -> float:
-    """How many times the largest of so many must be surpassed for so small a chance."""
-    from scipy.optimize import brentq  # dear to import, and seldom needed
+def required_ratio(copies: int, chance: float) -> float:
+    """Ratio to the largest of so many copies that chance exceeds with this probability."""
+    from scipy.optimize import brentq  # slow to import, and seldom needed
 
     orders = np.arange(1, copies + 1)
 
@@ -270,64 +293,66 @@ def times_beyond(copies: int, chance: float) -> float:
     return float(np.exp(brentq(too_likely, -20.0, -np.log(chance) + 1.0)))
 
 
-def _shown(
-    copies: Sequence[Track], ask: Callable[[Track], Answered], found: Diagnosis
+def _evidence_in_copies(
+    copies: Sequence[Track], diagnose: Callable[[Track], FittedDiagnosis], found: Diagnosis
 ) -> tuple[list[float], float]:
-    """What copies show, nats, until that decides; and up to how many nats it may be chance."""
-    told, last = _told(found), times_beyond(len(copies), priors.CHANCE_P)
+    """Evidence found in copies, nats, until that decides; and the bound of chance evidence."""
+    evidence, last = _reported_evidence(found), required_ratio(len(copies), priors.CHANCE_P)
     largest, shown = priors.ALONE_NATS, list[float]()
     for count, copy in enumerate(copies[:-1], 1):
-        shown.append(_shown_by(copy, ask))
+        shown.append(_evidence_in_copy(copy, diagnose))
         largest = max(largest, shown[-1])
-        early = largest * times_beyond(count, priors.CHANCE_EARLY_P)
-        if min(told) > early:
+        early = largest * required_ratio(count, priors.CHANCE_EARLY_P)
+        if min(evidence) > early:
             return shown, early
-        if max(told) <= last * largest:
+        if max(evidence) <= last * largest:
             return shown, last * largest
-    shown.append(_shown_by(copies[-1], ask))
+    shown.append(_evidence_in_copy(copies[-1], diagnose))
     return shown, last * max(largest, shown[-1])
 
 
-def _shown_by(copy: Track, ask: Callable[[Track], Answered]) -> float:
-    """What is told of a copy, nats; without end where its fit finds none."""
+def _evidence_in_copy(copy: Track, diagnose: Callable[[Track], FittedDiagnosis]) -> float:
+    """The largest evidence reported of a copy, nats; infinite if the copy cannot be fitted."""
     try:
-        return max(_told(ask(copy).found), default=0.0)
+        return max(_reported_evidence(diagnose(copy).found), default=0.0)
     except (np.linalg.LinAlgError, ValueError):
         return float("inf")
 
 
-def _words(why: str, found: Diagnosis, told: float, shown: Sequence[float], bound: float) -> str:
-    """What was seen, what simulations show, and what is told beside that."""
+def _comparison_note(
+    why: str, found: Diagnosis, evidence: float, shown: Sequence[float], bound: float
+) -> str:
+    """The note on what was found, what simulations show, and what is reported given that."""
     count, largest = len(shown), max(shown)
     seeds = "seed 0" if count == 1 else f"seeds 0 to {count - 1}"
     made = "a simulation" if count == 1 else f"{count} simulations"
     shows = "shows" if count == 1 else "show"
     by_chance = f"up to {largest:.0f} nats of such" if largest > 0.0 else "nothing"
     seen = (
-        f"{why}: {_names(found)} is worth {told:.0f} nats here; {made} of the "
+        f"{why}: {_reported_effects(found)} is worth {evidence:.0f} nats here; {made} of the "
         f"model alone with this noise ({seeds}) "
     )
     if not np.isfinite(largest):
         return f"{seen}were asked, and the last cannot be diagnosed"
-    untold = ", and nothing is told" if told <= bound else ""
+    untold = ", and nothing is told" if evidence <= bound else ""
     return f"{seen}{shows} {by_chance}; up to {bound:.0f} nats may be chance{untold}"
 
 
-def _agreeing(
-    answered: Answered,
+def _null_answer(
+    answered: FittedDiagnosis,
     problem: Problem,
     start: NullFit,
-    alone: Alone,
-    said: str,
+    comparison: RefitComparison,
+    note: str,
     undecided: str | None,
 ) -> Diagnosis:
     """The answer of the calibration alone, with what was counted in the readings.
 
-    said: for the notes;  undecided: why not even that can be told, None where it can
+    note: to be added;  undecided: why not even that can be decided, None where it can
     """
     found = answered.found
-    counted = tuple(one for one in found.findings if not _fitted(one))
-    fitted = {one.term for one in found.findings if _fitted(one)}
+    counted = tuple(one for one in found.findings if not _is_fitted(one))
+    fitted = {one.term for one in found.findings if _is_fitted(one)}
     terms = tuple(term for k, term in enumerate(found.terms) if k not in fitted)
     model, drawn = model_of_samples(start.model, problem), found.drawn
     if drawn is not None:
@@ -336,14 +361,14 @@ def _agreeing(
     return replace(
         found,
         mismatch=bool(counted),
-        p_value=found.p_value if counted else alone.p_value,
+        p_value=found.p_value if counted else comparison.p_value,
         findings=counted,
         unexplained=Unexplained(False),
-        posterior_predictive=alone.checks or checks(start),
+        posterior_predictive=comparison.checks or check_null(start),
         undecided=None if counted else undecided,
-        notes=(*found.notes, said, *more),
+        notes=(*found.notes, note, *more),
         model=model,
-        noise=forward.noise_of(model),
+        noise=forward.model_noise(model),
         terms=terms,
         drawn=drawn,
         omnibus={k: replace(one, p_after=one.p_before) for k, one in found.omnibus.items()},

@@ -1,6 +1,6 @@
-"""Is there anything at all?  Tests of the whitened innovations that need no idea of what.
+"""Tests of the whitened innovations without an alternative hypothesis: is there any mismatch?
 
-Each gives its statistic and its probability under the null (Gaussian, white, variance 1), which
+Each gives its statistic and its p-value under the null (Gaussian, white, variance 1), which
 `tests/diagnosis/answer/test_omnibus.py` checks to be uniform on simulated nulls.
 """
 
@@ -37,36 +37,41 @@ class Test:
     words: str
 
 
-def omnibus(done: Filtered, context: Context | None = None) -> tuple[Test, ...]:
+def omnibus_tests(filtered: Filtered, context: Context | None = None) -> tuple[Test, ...]:
     """All tests; those of the variance only with a context.
 
-    Empty below 100 innovations, where an axis does not vary at all, and where the magnetometer has
-    less noise than is assumed at least: then what is assumed along the field is not there, and the
-    tests would say only that.
+    None below 100 innovations, where an axis does not vary at all, and where the magnetometer has
+    less noise than the fit assumes at least: then the assumed noise along the field is absent, and
+    the tests would show nothing else.
     """
-    rows = done.whitened[done.used]
+    rows = filtered.whitened[filtered.used]
     if len(rows) < 100 or np.any(np.std(rows, axis=0) < 1e-9):
         return ()
-    assumed = done.model.sigma_mag_gauss <= priors.FLOOR_MAG_GAUSS
+    assumed = filtered.model.sigma_mag_gauss <= priors.FLOOR_MAG_GAUSS
     if assumed and np.mean(rows**2) < priors.ABSENT_NOISE:
         return ()
-    out = [_level(rows), _ljung_box(done), _periodogram(done), _normal(rows)]
+    out = [
+        _level_test(rows),
+        _ljung_box_test(filtered),
+        _periodogram_test(filtered),
+        _normality_test(rows),
+    ]
     if context is not None:
-        out.append(variance_test(done, drivers(context)))
+        out.append(variance_test(filtered, variance_covariates(context)))
     return tuple(out)
 
 
-def _level(rows: Array) -> Test:
+def _level_test(rows: Array) -> Test:
     """Normalised innovation squared; 1 by construction where the noise was estimated."""
     total, freedom = float(np.sum(rows**2)), rows.size
     tail = min(chi2_above(total, freedom), chi2_below(total, freedom))
     return Test("normalised_innovation", total / freedom, 1.0, float(min(1.0, 2 * tail)), "level")
 
 
-def _ljung_box(done: Filtered) -> Test:
+def _ljung_box_test(filtered: Filtered) -> Test:
     """Autocorrelation to lag 20 of the three axes together; rows without a reading count as 0."""
-    rows = np.where(done.used[:, None], done.whitened, 0.0)
-    count = int(np.count_nonzero(done.used))
+    rows = np.where(filtered.used[:, None], filtered.whitened, 0.0)
+    count = int(np.count_nonzero(filtered.used))
     power = np.sum(rows**2, axis=0)
     q = 0.0
     for lag in range(1, LAGS + 1):
@@ -76,9 +81,9 @@ def _ljung_box(done: Filtered) -> Test:
     return Test("ljung_box", q, freedom, chi2_above(q, freedom), "whiteness over time")
 
 
-def _periodogram(done: Filtered) -> Test:
+def _periodogram_test(filtered: Filtered) -> Test:
     """Bartlett's test: largest distance of the cumulative periodogram from the diagonal."""
-    rows = np.where(done.used[:, None], done.whitened, 0.0)
+    rows = np.where(filtered.used[:, None], filtered.whitened, 0.0)
     power = np.abs(np.fft.rfft(rows - rows.mean(axis=0), axis=0))[1:-1] ** 2
     share = np.cumsum(power, axis=0) / np.sum(power, axis=0)
     count = len(share)
@@ -88,7 +93,7 @@ def _periodogram(done: Filtered) -> Test:
     return Test("cumulative_periodogram", distance, 0.87, p_value, "whiteness over frequency")
 
 
-def _normal(rows: Array) -> Test:
+def _normality_test(rows: Array) -> Test:
     """Jarque-Bera of the three axes together, each by its own mean and deviation."""
     z = (rows - rows.mean(axis=0)) / rows.std(axis=0)
     skewness = np.mean(z**3, axis=0)
@@ -97,8 +102,8 @@ def _normal(rows: Array) -> Test:
     return Test("normality", value, 6.0, chi2_above(value, 6), "tails and skewness")
 
 
-def drivers(context: Context) -> dict[str, Array]:
-    """What the variance may follow: turn, change of the field, time, and the covariates."""
+def variance_covariates(context: Context) -> dict[str, Array]:
+    """What the variance may follow: turn rate, change of the field, time, and the covariates."""
     out = {
         "rate": np.linalg.norm(context.rate_b_rad_s, axis=1),
         "field_change": np.sum(context.field_dot_b**2, axis=1),
@@ -110,25 +115,25 @@ def drivers(context: Context) -> dict[str, Array]:
     return out
 
 
-def variance_test(done: Filtered, columns: Mapping[str, Array]) -> Test:
-    """Do the squares of the innovations follow any column?  Koenker's n R^2, any tails.
+def variance_test(filtered: Filtered, columns: Mapping[str, Array]) -> Test:
+    """Do the squared innovations depend on any column?  Koenker's n R^2, robust to heavy tails.
 
-    words: which column most.
+    words: the column of largest correlation.
     """
-    square = np.sum(done.whitened[done.used] ** 2, axis=1)
+    square = np.sum(filtered.whitened[filtered.used] ** 2, axis=1)
     names, kept = [], []
     for name, values in columns.items():
-        mine = values[done.used]
-        if np.isfinite(mine).all() and np.std(mine) > 1e-9 * (np.abs(mine).max() + 1e-300):
+        used = values[filtered.used]
+        if np.isfinite(used).all() and np.std(used) > 1e-9 * (np.abs(used).max() + 1e-300):
             names.append(name)
-            kept.append((mine - mine.mean()) / mine.std())
+            kept.append((used - used.mean()) / used.std())
     if not kept:
         return Test("variance", 0.0, 0.0, 1.0, "no column to follow")
     X = np.column_stack(kept)
     y = square - square.mean()
     solution, _, rank, _ = np.linalg.lstsq(X, y, rcond=1e-8)
-    left = y - X @ solution
-    value = float(len(y) * (1.0 - (left @ left) / (y @ y)))
+    residual = y - X @ solution
+    value = float(len(y) * (1.0 - (residual @ residual) / (y @ y)))
     alone = np.abs(X.T @ y)
     p_value = chi2_above(value, int(rank))
     most = names[int(np.argmax(alone))]

@@ -1,12 +1,12 @@
 """A diagnosis in the words of a field engineer.
 
-The whole answer is `lines`, one sentence of it `verdict`; what is left, how large it is, where, and
-what real recordings ordinarily leave is `in_one_sentence` and `size_lines`.  How an effect was read
-is `setting_text`: the parts of a finding's setting that a person can act on.  A column that is
-logged late, a period, a time constant: they were chosen among many and are no coefficients, so that
-they have no deviation of their own.
+`answer_lines` is the whole answer, `verdict` one sentence of it.  The residual, its size, its
+place and what real recordings ordinarily leave are `ordinary_text` and `component_lines`.
+`setting_text` describes the parts of a finding's setting that a user can act on.  The delay of a
+logged column, a period and a time constant were chosen among many values and are no coefficients,
+so that they have no standard deviation.
 
-What would separate two effects that a motion cannot tell apart is `separating_manoeuvre`.
+`separating_manoeuvre` is what would separate two effects that this motion cannot tell apart.
 """
 
 from __future__ import annotations
@@ -39,33 +39,30 @@ _FRAMES = {
     "noise": "in the noise",
 }
 _MG = 1e3
-#: units in which a person thinks of small effects, of those in which they are reckoned
-_SPOKEN_UNITS = {
+#: display units of small effects, by the unit of computation
+_DISPLAY_UNITS = {
     "gauss": ("mG", 1e3),
     "s": ("ms", 1e3),
     "rad": ("deg", 180 / math.pi),
     "1": ("%", 100.0),
 }
 _LIMITS_SHOWN = 6
-#: said of a simulation that leaves what a real recording may
+#: the note on a simulation whose residual would be ordinary for a real recording
 SIMULATED = "a simulated recording, its truth is beside it: nothing that is left there is ordinary"
 
 
-def lines(found: Diagnosis) -> list[str]:
+def answer_lines(found: Diagnosis) -> list[str]:
     """The whole answer, for a terminal."""
     out = [f"{found.recording}: {verdict(found)}"]
     for number, finding in enumerate(found.findings, start=1):
         out += ["", f"{number}. {headline(finding)}", *_finding_lines(finding)]
     if found.unexplained.detected:
-        out += [
-            "",
-            "unknown, here (nothing in the library explains it):",
-            *_unexplained_lines(found.unexplained),
-        ]
-    elif ordinary_left(found) is not None:
+        out += ["", "unknown, here (nothing in the library explains it):"]
+        out += [*_unexplained_lines(found.unexplained)]
+    elif ordinary_residual(found) is not None:
         out += ["", "remaining residual, ordinary:", *_unexplained_lines(found.unexplained)]
     if not found.mismatch and found.undecided is None and found.sensitivity:
-        out += ["", f"this recording would have shown: {sensitivity(found.sensitivity)}"]
+        out += ["", f"this recording would have shown: {sensitivity_text(found.sensitivity)}"]
     failed = found.failed_checks
     if found.posterior_predictive:
         count = len(found.posterior_predictive)
@@ -77,7 +74,7 @@ def lines(found: Diagnosis) -> list[str]:
 
 
 def _whiteness(found: Diagnosis) -> str:
-    """Which of the omnibus tests the model failed, and which the repaired one still fails."""
+    """Which of the omnibus tests the null model failed, and which the repaired one still fails."""
     before = [name for name, test in found.omnibus.items() if test.p_before < priors.TEST_FAILED]
     after = [name for name, test in found.omnibus.items() if test.p_after < priors.TEST_FAILED]
     if not before and not after:
@@ -91,13 +88,13 @@ def _whiteness(found: Diagnosis) -> str:
 def verdict(found: Diagnosis) -> str:
     """One sentence."""
     names = len(found.findings)
-    failed, ordinary = found.failed_checks, ordinary_left(found)
-    said = "" if ordinary is None else in_one_sentence(ordinary)
+    failed, ordinary = found.failed_checks, ordinary_residual(found)
+    ordinary_words = "" if ordinary is None else ordinary_text(ordinary)
     if found.undecided is not None:
         return f"no verdict: {found.undecided}"
-    if not found.mismatch and said:
+    if not found.mismatch and ordinary_words:
         return (
-            f"nothing beyond the ordinary: the residual is {said}; "
+            f"nothing beyond the ordinary: the residual is {ordinary_words}; "
             f"p = {found.p_value:.1g} that there is none"
         )
     if not found.mismatch and failed:
@@ -111,19 +108,19 @@ def verdict(found: Diagnosis) -> str:
     if found.unexplained.detected:
         parts.append("an unknown cause")
     text = " and ".join(parts) or "recording and simulation differ (see the notes)"
-    rest = f"; the remaining residual is {said}" if said else ""
+    rest = f"; the remaining residual is {ordinary_words}" if ordinary_words else ""
     return f"MISMATCH: {text} (p = {found.p_value:.1g}){rest}"
 
 
 def headline(finding: Finding) -> str:
-    """What it is and how sure that is."""
+    """The effect and its probability."""
     return f"{finding.words or finding.effect} ({finding.effect}), {finding.confidence:.1%} sure"
 
 
 def _finding_lines(finding: Finding) -> list[str]:
     held, cost = finding.heldout, finding.cost_if_left_out
     out = [
-        f"   where      {place(finding.where)}",
+        f"   where      {where_text(finding.where)}",
         *(
             f"   {'size' if k == 0 else '':<10} {value_text(v)}"
             for k, v in enumerate(finding.parameters)
@@ -160,7 +157,7 @@ def evidence_text(one: OnPriors) -> str:
     )
 
 
-def place(where: Where) -> str:
+def where_text(where: Where) -> str:
     """When, on which axes, in which frame, under which condition."""
     spans = ", ".join(f"{a:.1f}-{b:.1f} s" for a, b in where.intervals_s[:5])
     more = f" and {len(where.intervals_s) - 5} more" if len(where.intervals_s) > 5 else ""
@@ -174,7 +171,7 @@ def place(where: Where) -> str:
     return "; ".join(part for part in parts if part)
 
 
-def along(direction: tuple[float, float, float]) -> str:
+def direction_text(direction: tuple[float, float, float]) -> str:
     """`x -0.44, y +0.65, z +0.62 (a unit vector of that frame)`."""
     x, y, z = direction
     return f"x {x:+.2f}, y {y:+.2f}, z {z:+.2f} (a unit vector of that frame)"
@@ -186,13 +183,13 @@ def value_text(value: Value) -> str:
 
 
 def _unexplained_lines(left: Unexplained) -> list[str]:
-    out = [] if left.where is None else [f"   where      {place(left.where)}"]
+    out = [] if left.where is None else [f"   where      {where_text(left.where)}"]
     if left.where is not None and left.where.direction is not None:
-        out.append(f"   along      {along(left.where.direction)}")
+        out.append(f"   along      {direction_text(left.where.direction)}")
     if left.size is not None:
-        out.append(f"   size       {told_size(left.size, left.unit)}")
+        out.append(f"   size       {size_text(left.size, left.unit)}")
     if left.ordinary is not None:
-        out += [f"   component  {text}" for text in size_lines(left.ordinary)]
+        out += [f"   component  {text}" for text in component_lines(left.ordinary)]
         out += [f"   why        {left.ordinary.why}"] if left.ordinary.why else []
     if left.single_source_share is not None and left.single_source_share > 0.8:
         out.append(
@@ -213,48 +210,50 @@ def _unexplained_lines(left: Unexplained) -> list[str]:
     return out
 
 
-def _small(value: float, unit: str) -> str:
+def _limit_value_text(value: float, unit: str) -> str:
     """`1.5 ms` for 0.0015 s, `0.3 mG/A` for 3e-4 gauss/A, `0.69 %` for 0.0069."""
     first, *rest = unit.split("/")
-    spoken, factor = _SPOKEN_UNITS.get(first, (first, 1.0))
+    spoken, factor = _DISPLAY_UNITS.get(first, (first, 1.0))
     return f"{value * factor:.2g} {'/'.join([spoken, *rest])}"
 
 
-def sensitivity(limits: tuple[Limit, ...]) -> str:
+def sensitivity_text(limits: tuple[Limit, ...]) -> str:
     """The smallest effects that would have been seen, one parameter an effect."""
     seen: dict[str, str] = {}
     for limit in limits:
         if limit.smallest is not None and limit.effect not in seen:
-            seen[limit.effect] = f"{limit.effect} above {_small(limit.smallest, limit.unit)}"
+            seen[limit.effect] = (
+                f"{limit.effect} above {_limit_value_text(limit.smallest, limit.unit)}"
+            )
     texts = list(seen.values())
     more = f", and {len(texts) - _LIMITS_SHOWN} more" if len(texts) > _LIMITS_SHOWN else ""
     return ", ".join(texts[:_LIMITS_SHOWN]) + more
 
 
-def told_size(size: float, unit: str) -> str:
+def size_text(size: float, unit: str) -> str:
     """`9.1 mG`, `620 mrad/s`: two digits."""
     return f"{float(f'{1e3 * size:.2g}'):g} {'mG' if unit == 'gauss' else 'mrad/s'}"
 
 
 def limit_text(one: Component) -> str:
     """`up to 72 mG`, or that none is."""
-    return f"up to {told_size(one.up_to, one.unit)}" if one.up_to > 0.0 else "none"
+    return f"up to {size_text(one.up_to, one.unit)}" if one.up_to > 0.0 else "none"
 
 
-def ordinary_left(found: Diagnosis) -> Ordinary | None:
-    """What is left and is ordinary; None where nothing is, or where it is unknown."""
+def ordinary_residual(found: Diagnosis) -> Ordinary | None:
+    """The residual if it is ordinary; None where there is none, or where it is unexplained."""
     left = found.unexplained
     return left.ordinary if left.ordinary is not None and not left.detected else None
 
 
-def in_one_sentence(one: Ordinary) -> str:
+def ordinary_text(one: Ordinary) -> str:
     """`ordinary for a real recording: 9.1 mG, 1.3 deg of heading (...)`."""
     gyro = any(part.there and part.unit == "rad/s" for part in one.components)
-    more = f" and {told_size(one.gyro_rad_s, 'rad/s')} of the gyro" if gyro else ""
+    more = f" and {size_text(one.gyro_rad_s, 'rad/s')} of the gyro" if gyro else ""
     return (
-        f"ordinary for a real recording: {told_size(one.field_gauss, 'gauss')}, "
+        f"ordinary for a real recording: {size_text(one.field_gauss, 'gauss')}, "
         f"{one.heading_deg:.2g} deg of heading{more} (95 % of {one.recordings} untouched "
-        f"recordings have less than {told_size(one.field_up_to_gauss, 'gauss')}, "
+        f"recordings have less than {size_text(one.field_up_to_gauss, 'gauss')}, "
         f"{one.heading_up_to_deg:.2g} deg)"
     )
 
@@ -263,25 +262,25 @@ def component_text(one: Component) -> str:
     """`a field by attitude: 8.5 mG, 1.3 deg of heading, 130 nats (ordinary: up to 72 mG)`."""
     heading = "" if one.heading_deg is None else f", {one.heading_deg:.2g} deg of heading"
     return (
-        f"{one.words}: {told_size(one.size, one.unit)}{heading}, {one.evidence_nats:.0f} nats "
+        f"{one.words}: {size_text(one.size, one.unit)}{heading}, {one.evidence_nats:.0f} nats "
         f"(ordinary: {limit_text(one)})"
     )
 
 
-def size_lines(one: Ordinary) -> list[str]:
-    """The components that are there, the surest first; what all are together where none stands."""
+def component_lines(one: Ordinary) -> list[str]:
+    """The components that are there, by evidence; the total where there is no single one."""
     there = [part for part in one.components if part.there]
     if not there:
         return [
-            f"{told_size(one.field_gauss, 'gauss')}, {one.heading_deg:.2g} deg of heading, in no "
+            f"{size_text(one.field_gauss, 'gauss')}, {one.heading_deg:.2g} deg of heading, in no "
             "single component"
         ]
     return [component_text(part) for part in sorted(there, key=lambda part: -part.evidence_nats)]
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """Words of one part of a setting.
+class SettingText:
+    """Text for one part of a setting.
 
     words: with {} for the value, times `times`
     negative: the words where the value is below zero, with {} for its size
@@ -292,28 +291,28 @@ class Told:
     negative: str = ""
 
 
-#: by key, in the order in which they are told
-TOLD: Mapping[str, Told] = {
-    "covariate": Told("by the column {}"),
-    "late_s": Told("logged {} s late", negative="logged {} s early"),
-    "mean_s": Told("each value the mean of {} s"),
-    "harmonic": Told("{} times a turn of the shaft"),
-    "off_hz": Told("{} Hz faster than the column", negative="{} Hz slower than the column"),
-    "frequency_hz": Told("seen at {} Hz"),
-    "mains_hz": Told("as mains of {} Hz would be"),
-    "period_s": Told("every {} s"),
-    "width_s": Told("for {} s"),
-    "hold_samples": Told("each reading held for {} samples"),
-    "time_constant_s": Told("time constant {} s"),
-    "radius_gauss": Told("half width of the loop {} mG", times=1e3),
-    "shape": Told("shape: {}"),
-    "length_s": Told("lasts {} s"),
-    "length_m": Told("falls off within {} m"),
-    "distance_m": Told("its size is that of its field {} m away"),
+#: by key, in the order in which they are reported
+REPORTED_SETTINGS: Mapping[str, SettingText] = {
+    "covariate": SettingText("by the column {}"),
+    "late_s": SettingText("logged {} s late", negative="logged {} s early"),
+    "mean_s": SettingText("each value the mean of {} s"),
+    "harmonic": SettingText("{} times a turn of the shaft"),
+    "off_hz": SettingText("{} Hz faster than the column", negative="{} Hz slower than the column"),
+    "frequency_hz": SettingText("seen at {} Hz"),
+    "mains_hz": SettingText("as mains of {} Hz would be"),
+    "period_s": SettingText("every {} s"),
+    "width_s": SettingText("for {} s"),
+    "hold_samples": SettingText("each reading held for {} samples"),
+    "time_constant_s": SettingText("time constant {} s"),
+    "radius_gauss": SettingText("half width of the loop {} mG", times=1e3),
+    "shape": SettingText("shape: {}"),
+    "length_s": SettingText("lasts {} s"),
+    "length_m": SettingText("falls off within {} m"),
+    "distance_m": SettingText("its size is that of its field {} m away"),
 }
 
-#: what is not told, and why: it stands elsewhere in the answer, or nobody can act on it
-UNTOLD: Mapping[str, str] = {
+#: what is not reported, and why: it is elsewhere in the answer, or nobody can act on it
+UNREPORTED_SETTINGS: Mapping[str, str] = {
     "onset_s": "the finding's place says when",
     "end_s": "the finding's place says when",
     "start_s": "the first reading, or the zero of a phase",
@@ -342,29 +341,31 @@ UNTOLD: Mapping[str, str] = {
 
 
 def setting_text(setting: Mapping[str, Any]) -> str:
-    """`by the column motor_current_a; logged 0.25 s late`; empty where nothing is to be told."""
+    """`by the column motor_current_a; logged 0.25 s late`; empty if there is nothing to report."""
     parts = []
-    for key, told in TOLD.items():
+    for key, entry in REPORTED_SETTINGS.items():
         value = setting.get(key)
         if not value:
             continue
         if isinstance(value, str):
-            parts.append(told.words.format(label(value)))
+            parts.append(entry.words.format(label(value)))
         elif isinstance(value, (list, tuple)):
-            parts.append(told.words.format(" or ".join(f"{one:.3g}" for one in value)))
-        elif value < 0 and told.negative:
-            parts.append(told.negative.format(f"{-value * told.times:.3g}"))
+            parts.append(entry.words.format(" or ".join(f"{one:.3g}" for one in value)))
+        elif value < 0 and entry.negative:
+            parts.append(entry.negative.format(f"{-value * entry.times:.3g}"))
         else:
-            parts.append(told.words.format(f"{value * told.times:.3g}"))
+            parts.append(entry.words.format(f"{value * entry.times:.3g}"))
     return "; ".join(parts)
 
 
-def separating_manoeuvre(library: Mapping[str, Effect], name: str, others: Sequence[str]) -> str:
-    """What to drive so that `name` and the likeliest of `others` come apart, in words."""
+def separating_manoeuvre(
+    library: Mapping[str, Effect], identifier: str, others: Sequence[str]
+) -> str:
+    """The manoeuvre that separates the effect from the first of `others` that has one, in words."""
     for other in others:
-        for one, two in ((name, other), (other, name)):
+        for one, two in ((identifier, other), (other, identifier)):
             if one in library:
                 for confuser, words in library[one].confusers:
                     if confuser == two:
                         return words
-    return library[name].manoeuvre if name in library else ""
+    return library[identifier].manoeuvre if identifier in library else ""

@@ -63,7 +63,7 @@ def without_early_readings(track: Track) -> Track:
     if not track.covariates:
         return track
     mag = track.mag_b_gauss.copy()
-    for run in time_series.runs(track.dt_s):
+    for run in time_series.gap_free_runs(track.dt_s):
         before = track.time_s[run] - track.time_s[run.start] < priors.BEGIN_S
         if np.mean(before) < priors.BEGIN_SHARE:
             mag[run][before] = np.nan
@@ -86,7 +86,7 @@ def regular_step(dt_s: Array) -> float | None:
 
 def delayed_values(track: Track, values: Array, ago_s: float) -> Array:
     """Values logged with the track's samples, (N,) or (N, k), as they were `ago_s` before."""
-    return time_series.earlier(values, track.time_s, track.dt_s, ago_s)
+    return time_series.delayed_values(values, track.time_s, track.dt_s, ago_s)
 
 
 def delayed_gyro(track: Track, tau_s: float, *, instants: bool = False) -> Track:

@@ -23,10 +23,10 @@ from ahrsd.diagnosis.answer.text import separating_manoeuvre
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.effects.effect import Effect, Setting
 from ahrsd.diagnosis.innovation_filter.regression_statistics import (
-    log_bayes,
-    posterior,
-    solve,
-    total_score,
+    log_bayes_factor,
+    posterior_probabilities,
+    projected_score,
+    solve_semidefinite,
 )
 from ahrsd.diagnosis.model import Context
 from ahrsd.samples import Array
@@ -103,7 +103,9 @@ def find_bias_drift_at_rest(context: Context, library: Mapping[str, Effect]) -> 
     if not evidence or max(evidence.values()) < priors.REST_NATS:
         return ()
     shares = dict(
-        sorted(posterior(evidence, priors.REST_CAUSES).items(), key=lambda item: -item[1])
+        sorted(
+            posterior_probabilities(evidence, priors.REST_CAUSES).items(), key=lambda item: -item[1]
+        )
     )
     name = next(iter(shares))
     setting, root = best[name][1], roots[int(np.argmax(weight))]
@@ -233,8 +235,8 @@ def _log_bayes_factor(
     gains = []
     for root in roots:
         X, e = _whiten(still, root, means)
-        score = total_score(X.T @ X, X.T @ e, np.einsum("ij,ij->j", X, X), scale)
-        gains.append(log_bayes(score))
+        score = projected_score(X.T @ X, X.T @ e, np.einsum("ij,ij->j", X, X), scale)
+        gains.append(log_bayes_factor(score))
     return float(logsumexp(weight + np.array(gains)) - logsumexp(weight))
 
 
@@ -245,5 +247,5 @@ def _fit_effect(
     columns = effect.columns(context, setting).gyro
     means = still.means(np.zeros((len(still.second), 3, 1)) if columns is None else columns)
     X, e = _whiten(still, root, means)
-    found = solve(X.T @ X, np.column_stack([X.T @ e, np.eye(X.shape[1])]))
+    found = solve_semidefinite(X.T @ X, np.column_stack([X.T @ e, np.eye(X.shape[1])]))
     return found[:, 0], np.sqrt(np.maximum(np.diag(found[:, 1:]), 0.0)), means @ found[:, 0]

@@ -131,7 +131,7 @@ def find_lower_gyro_noise(
     known = replace(spec, shaken_gyro_rad_s=level)
     for turn in range(_MOST_ROUNDS):
         again = noise_fit.estimate_noise(
-            run_filter(work, model, sensitive=False), known, walk=False
+            run_filter(work, model, with_sensitivities=False), known, walk=False
         )
         if noise_fit.same_noise(again, model):
             break

@@ -161,7 +161,7 @@ def _fit_both_levels(track: Track, model: NullModel, differenced: float, below: 
     def scaled(level: float) -> tuple[NullModel, float]:
         ratio = float(np.exp(min(level, most)))
         tried = replace(model, sigma_gyro_rad_s=model.sigma_mag_gauss * ratio)
-        done = run_filter(track, tried, sensitive=False)
+        done = run_filter(track, tried, with_sensitivities=False)
         scale = max(done.normalised_innovation, 1e-12)
         count = 3 * int(np.count_nonzero(done.used))
         root = float(np.sqrt(scale))
@@ -232,7 +232,7 @@ def _with_bias_walk(track: Track, model: NullModel) -> NullModel:
 
 def _log_likelihood(track: Track, model: NullModel) -> float:
     """Log likelihood of the innovations."""
-    return float(np.sum(run_filter(track, model, sensitive=False).log_likelihood))
+    return float(np.sum(run_filter(track, model, with_sensitivities=False).log_likelihood))
 
 
 def _maximise(function: Callable[[float], float], start: float, step: float = 0.7) -> float:

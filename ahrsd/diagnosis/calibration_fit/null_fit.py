@@ -87,7 +87,7 @@ def fit_null(
     problem = FitProblem(track, calibration_prior(track))
     if start is None:
         start = noise_fit.estimate_noise(
-            run_filter(track, cold_start(track, known), sensitive=False), known, walk=walk
+            run_filter(track, cold_start(track, known), with_sensitivities=False), known, walk=walk
         )
     fit = descend(problem, start, _MOST_STEPS)
     prior = problem.prior.sharper(score_variance_ratio(fit.filtered))
@@ -466,7 +466,7 @@ def _take_step(
         if np.linalg.eigvalsh(model.soft_iron)[0] < _SMALLEST_EIGENVALUE:
             continue
         try:
-            new = run_filter(problem.track, model, held=point if near else None)
+            new = run_filter(problem.track, model, gains_from=point if near else None)
         except np.linalg.LinAlgError:  # a step too far
             continue
         if _cost(problem, new) <= cost * (1 + 1e-9):

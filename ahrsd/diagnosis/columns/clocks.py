@@ -20,7 +20,7 @@ import numpy as np
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.columns.roles import label
-from ahrsd.diagnosis.external_simulation import cut
+from ahrsd.diagnosis.external_simulation import cut_track
 from ahrsd.diagnosis.track import Track
 from ahrsd.diagnosis.where_and_when.locate import Located
 from ahrsd.samples import Array
@@ -47,7 +47,7 @@ class ColumnClock:
         values = np.interp(at_s, track.time_s, track.covariates[self.column])
         inside = np.flatnonzero((at_s >= track.time_s[0]) & (at_s <= track.time_s[-1]))
         whole = track.with_columns({**track.covariates, self.column: values})
-        return cut(whole, float(track.time_s[inside[0]]), float(track.time_s[inside[-1]]))
+        return cut_track(whole, float(track.time_s[inside[0]]), float(track.time_s[inside[-1]]))
 
     @property
     def words(self) -> str:

@@ -27,7 +27,7 @@ from scipy import fft
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.columns.roles import role_of
-from ahrsd.diagnosis.time_series import SPECTRUM_ROWS, denoised
+from ahrsd.diagnosis.time_series import SPECTRUM_ROWS, wiener_filter
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
@@ -130,7 +130,7 @@ def denoised_column(values: Array) -> Array | None:
     samples = values[pattern.first :: pattern.rows]
     if len(samples) < SPECTRUM_ROWS or not _is_flat_and_gaussian(samples):
         return None
-    signal = denoised(samples[:, None])[:, 0]
+    signal = wiener_filter(samples[:, None])[:, 0]
     if np.var(signal) < priors.COLUMN_COURSE * np.var(samples):
         return None
     return pattern.interpolate(signal, len(values))

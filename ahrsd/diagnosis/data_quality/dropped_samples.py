@@ -65,7 +65,7 @@ QUARTER_QUANTILE = 0.3186
 
 def find_lost_turns_at_start(track: Track, model: NullModel) -> list[Fact]:
     """`find_lost_turns` at the recorded rate, with the calibration from which the fit starts."""
-    done = run_filter(track, model, sensitive=False)
+    done = run_filter(track, model, with_sensitivities=False)
     return find_lost_turns(done, track.gyro_b_rad_s - model.gyro_bias_rad_s)
 
 
@@ -295,7 +295,7 @@ def recover_lost_steps(
     for _ in range(_MOST_ROUNDS):
         gyro = model.gyro_bias_rad_s + rate_b_rad_s * (1 + lost)[:, None]
         track = replace(done.track, mag_b_gauss=mag, gyro_b_rad_s=gyro)
-        filtered = run_filter(track, model, sensitive=False)
+        filtered = run_filter(track, model, with_sensitivities=False)
         likelihood = float(np.sum(filtered.log_likelihood[filtered.used]))
         if likelihood > highest:
             found = _most_probable_jumps(

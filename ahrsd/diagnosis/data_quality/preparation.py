@@ -130,7 +130,7 @@ def correct_track(track: Track, facts: Sequence[Fact]) -> Track:
             unseen = fact.unseen if fact.unseen is not None else unseen
         if fact.bad is not None:
             mag[fact.bad] = np.nan
-    runs = track.runs if dt_s is track.dt_s else tuple(time_series.runs(dt_s))
+    runs = track.runs if dt_s is track.dt_s else tuple(time_series.gap_free_runs(dt_s))
     return replace(
         track,
         time_s=time_s,

@@ -25,7 +25,7 @@ from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_sphere_centre
 from ahrsd.diagnosis.data_quality.facts import Fact, row_intervals, whole_recording
 from ahrsd.diagnosis.data_quality.range_and_resolution import quantisation_step
-from ahrsd.diagnosis.time_series import runs
+from ahrsd.diagnosis.time_series import gap_free_runs
 from ahrsd.diagnosis.track import Track
 from ahrsd.printable import counted
 from ahrsd.samples import Array
@@ -152,7 +152,7 @@ def without_impossible_readings(track: Track) -> tuple[Track, tuple[str, ...]]:
     if fast.any():
         dt_s = np.where(fast, np.nan, track.dt_s)
         gyro = np.where(fast[:, None], 0.0, track.gyro_b_rad_s)
-        track = replace(track, gyro_b_rad_s=gyro, dt_s=dt_s, runs=tuple(runs(dt_s)))
+        track = replace(track, gyro_b_rad_s=gyro, dt_s=dt_s, runs=tuple(gap_free_runs(dt_s)))
         notes.append(_left_out_note("rate", "", fast, track, f"{limit:.3g} rad/s"))
     return track, tuple(notes)
 

@@ -1,7 +1,7 @@
-"""Columns of which many effects are made: courses in time on the axes of a frame.
+"""Columns that many effects share: time series on the axes of a frame.
 
-A course is (N, k): k numbers per sample.  Three parameters (x, y, z) go with each of them, course
-by course.
+A time series is (N, k): k numbers per sample.  Each of the k has three parameters (x, y, z), in
+this order.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.effects.effect import Parameter, Readings, Setting
 from ahrsd.samples import Array
 
-#: An ordinary direction, unit length: no axis of a real disturbance is an axis of the sensor.
+#: an example direction, of unit length: real disturbances are along no axis of the sensor
 DIRECTION = (0.6, -0.64, 0.48)
 GRAVITY_M_S2 = 9.80665
 #: Symmetric matrices by the names of their entries.
@@ -38,23 +38,23 @@ def symmetric(name: str, unit: str, scale: float, bound: float) -> tuple[Paramet
 
 
 def along(size: float, courses: int = 1) -> tuple[float, ...]:
-    """A typical value: `size` along DIRECTION for each course."""
+    """A typical value: `size` along DIRECTION for each time series."""
     return tuple(size * part for part in DIRECTION) * courses
 
 
 def on_axes(course: Array) -> Array:
-    """Columns (N, 3, 3k): each course on each axis."""
+    """Columns (N, 3, 3k): each time series on each axis."""
     return np.asarray(np.einsum("nk,ij->nikj", course, np.eye(3)).reshape(len(course), 3, -1))
 
 
 @lru_cache(maxsize=2)
 def world_axes(readings: Readings) -> Array:
-    """(N, 3, 3) a field along each axis of the world as the magnetometer reads it."""
+    """(N, 3, 3) a unit field along each axis of the world, as the magnetometer reads it."""
     return np.asarray(readings.soft_iron @ np.swapaxes(readings.R_nb, 1, 2))
 
 
 def in_world(readings: Readings, course: Array) -> Array:
-    """Columns (N, 3, 3k) on the magnetometer: each course on each axis of the world."""
+    """Columns (N, 3, 3k) on the magnetometer: each time series on each axis of the world."""
     columns = np.einsum("nij,nk->nikj", world_axes(readings), course)
     return np.asarray(columns.reshape(len(course), 3, -1))
 
@@ -73,13 +73,13 @@ def times_symmetric(vectors: Array) -> Array:
     return out
 
 
-def turned_by(vectors: Array) -> Array:
+def cross_columns(vectors: Array) -> Array:
     """Columns (N, 3, 3) of phi x v for a rotation vector phi."""
     return np.stack([np.cross(axis, vectors) for axis in np.eye(3)], axis=2)
 
 
-def per_covariate(readings: Readings, role: str, **more: object) -> tuple[Setting, ...]:
-    """One setting per column of that role, with the value at which its effect counts as zero."""
+def settings_per_covariate(readings: Readings, role: str, **more: object) -> tuple[Setting, ...]:
+    """One setting per column of that role, with the value at which its effect is zero."""
     return tuple(
         {
             "covariate": name,
@@ -90,13 +90,13 @@ def per_covariate(readings: Readings, role: str, **more: object) -> tuple[Settin
     )
 
 
-def course_of(readings: Readings, setting: Setting) -> Array:
-    """The setting's covariate minus its reference, (N, 1), as it was before it was logged.
+def covariate_series(readings: Readings, setting: Setting) -> Array:
+    """The setting's covariate minus its reference, (N, 1), corrected for its logging.
 
-    late_s: how late it is logged
-    mean_s: over how long the logger takes its mean.  What that leaves of the ups and downs is put
-            back by a third of what the column's middle has beyond its neighbours half of that away:
-            exact for slow ones, and never more than two thirds more
+    late_s: delay of the logged column
+    mean_s: length of the mean that the logger takes.  Its attenuation is compensated by a third of
+            the difference between the column and the mean of its neighbours half a mean_s
+            away: exact for slow changes, and at most two thirds more
     """
     values, time_s = readings.covariates[setting["covariate"]], readings.time_s
     late_s, half_s = setting.get("late_s", 0.0), setting.get("mean_s", 0.0) / 2
@@ -108,32 +108,32 @@ def course_of(readings: Readings, setting: Setting) -> Array:
     return np.asarray(values - setting["reference"])[:, None]
 
 
-def onsets(readings: Readings) -> tuple[Setting, ...]:
-    """Times at which something may have begun, a coarse grid away from the ends."""
+def onset_settings(readings: Readings) -> tuple[Setting, ...]:
+    """Onset times on a coarse grid, away from the ends of the recording."""
     first, last = float(readings.time_s[0]), float(readings.time_s[-1])
     grid = np.linspace(first, last, _ONSETS + 2)[1:-1]
     return tuple({"onset_s": round(float(t), 3)} for t in grid)
 
 
-def since(readings: Readings, setting: Setting) -> Array:
+def after_onset(readings: Readings, setting: Setting) -> Array:
     """1 from the onset on, until the end where there is one (`end_s`), else 0, (N, 1)."""
     ended = readings.time_s >= setting.get("end_s", np.inf)
     return np.where((readings.time_s >= setting["onset_s"]) & ~ended, 1.0, 0.0)[:, None]
 
 
 def middle_s(readings: Readings) -> float:
-    """The time halfway through, to a millisecond."""
+    """The middle time of the recording, to a millisecond."""
     return round(float(readings.time_s[0] + readings.time_s[-1]) / 2, 3)
 
 
-def span(readings: Readings) -> Setting:
-    """Start and length of the recording, to which courses of time refer."""
+def span_setting(readings: Readings) -> Setting:
+    """Start and length of the recording, for time series that refer to it."""
     first, last = float(readings.time_s[0]), float(readings.time_s[-1])
     return {"start_s": first, "span_s": max(last - first, 1e-3)}
 
 
-def elapsed(readings: Readings, setting: Setting) -> Array:
-    """Time since the setting's start in units of its span, (N, 1)."""
+def elapsed_fraction(readings: Readings, setting: Setting) -> Array:
+    """Time since the setting's start as a fraction of its span, (N, 1)."""
     return np.asarray((readings.time_s - setting["start_s"]) / setting["span_s"])[:, None]
 
 

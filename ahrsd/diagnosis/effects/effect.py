@@ -1,4 +1,4 @@
-"""What a row of the library is."""
+"""Interface of an effect of the library, and the values that it works on."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ from ahrsd.samples import Array
 Family = Literal["sensor", "world", "gyro", "link"]
 #: what an effect changes: the mean of the readings, their scatter, or the stream itself
 Kind = Literal["mean", "variance", "discrete"]
-#: what a non-linear choice of an effect is made of: onset, time constant, covariate's name ...
+#: one non-linear choice of an effect: onset, time constant, covariate, ...
 Setting = dict[str, Any]
 
-#: settings that are a size or an angle, sought between the values of their grid
+#: settings that are a size or an angle: refined between the values of their grid
 SCALES = ("time_constant_s", "radius_gauss", "length_s", "length_m")
 ANGLES = ("turn_deg",)
-#: deviations that a coefficient at its physical bound must be for a direction to be observable
+#: a direction is observable if a coefficient at its physical bound is so many standard deviations
 BOUND_DEVIATIONS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One coefficient: its name, unit, how large it physically is (one prior deviation), the size
-    beyond which it is not believed, and the value below which it is not, of either sign if left
-    out."""
+    """One coefficient of an effect.
+
+    scale: its usual physical size, one prior deviation;  bound: larger values are not believed
+    least: smaller values are not believed; either sign is allowed if left out
+    """
 
     name: str
     unit: str
@@ -40,12 +42,12 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Readings:
-    """Readings of a simulated sensor together with the truth that an effect may need.
+    """Readings of a simulated sensor, and the truth that an effect may need.
 
     time_s, dt_s (N,), dt_s nan in the first row of each gap-free run; mag_b_gauss, gyro_b_rad_s,
     accel_b_m_s2 (nan where there is none), rate_b_rad_s (true mean rate over the step that ends at
     the sample), field_b (true, gauss) (N, 3); R_nb (N, 3, 3); soft_iron (3, 3); covariates (N,).
-    force_b_m_s2 (N, 3): specific force without the accelerometer's noise, None: as it reads.
+    force_b_m_s2 (N, 3): specific force without the accelerometer's noise; None: accel_b_m_s2.
     """
 
     time_s: Array
@@ -64,8 +66,8 @@ class Readings:
 class Effect(ABC):
     """One way in which a real recording departs from the calibration model.
 
-    identifier:  of the contract (`motor_current_field`);  code: of the dossier (`M4`)
-    words:       what a field engineer calls it
+    identifier:  as in the contract (`motor_current_field`);  code: as in the dossier (`M4`)
+    words:       the name that a field engineer would use
     equation:    of the left-out term, in text
     parameters:  the coefficients, in the order of `value` and of the columns
     typical:     a value of ordinary size: strength 1 of `simulate --effect`
@@ -73,28 +75,28 @@ class Effect(ABC):
     signature:   what it looks like in the residual
     confusers:   (identifier, what separates the two) pairs
     manoeuvre:   what to drive or do so that the effect shows itself
-    size:        what is seen on real vehicles;  source: where that and the equation come from
+    size:        what is seen on real vehicles;  source: of the size and of the equation
     kind:        "variance" and "discrete" effects have no columns and no settings
     after_noise: it acts on the finished reading, noise included
-    of_whole:    it acts on all that its sensor measures, whatever other effects put there
-    frame:       in which it is told, where that is not the family's name
-    rides:       its field stays on the sensor whatever that does, in gauss by what was logged
-    unseen:      unit directions (p,) of the parameters that no motion shows: what a fit says of
-                 them is the noise of its own columns, and what is known is the prior
-    quick:       only the recorded rate shows it: averaged over some readings it is gone
-    course:      whether any slow course in time of its frame is it, whatever the form
+    of_whole:    it acts on all that its sensor measures, other effects included
+    frame:       the frame in which it is reported, if that is not the family's name
+    rides:       its field is constant in sensor axes, in gauss per unit of a logged column
+    unseen:      unit directions (p,) of the parameters that no motion makes observable: a fit of
+                 them would fit the noise of their columns, so they keep the prior
+    quick:       visible only at the recorded rate: averaging over some readings removes it
+    course:      any slow time series in its frame is this effect, whatever its form
     jumps:       one constant vector along the axes of its frame, from its onset on
-    recurs:      a further one is no rare thing where there is one: what was put on is taken off
-    delay:       sign of the magnetometer's delay against the gyro that it is; 0 where it is none
-    plain:       among delays of a sign, the one that is told where nothing speaks for another
-    filters:     its delay is a filter's;  of_step: its delay is told in half steps of the recording
-    ordinary:    its size, in usual scales, that one in ten untouched recordings is beyond, beside
-                 what such leave; 0 where hardly any has it
+    recurs:      where there is one, a further one is no rare event: what was put on is taken off
+    delay:       sign of the delay of the magnetometer against the gyro; 0 if it is no delay
+    plain:       the delay that is reported for its sign unless another is more probable
+    filters:     its delay is that of a filter;  of_step: reported in half steps of the recording
+    ordinary:    the size, in usual scales, that one in ten untouched recordings exceeds, given the
+                 ordinary remainder; 0 where hardly any has it
                  (`python tests/benchmarks/diagnosis/bench_remainder_priors.py`)
-    ordinary_part: of what real recordings ordinarily leave, the part whose form it is
-    turns_sensors: its three parameters are the turn of the magnetometer against the gyro, rad
-    remembers:   the most of what each axis may have from before the recording (setting `memory`),
-                 in that setting's unit; 0 where it remembers nothing
+    ordinary_part: the part of the ordinary remainder that has the form of this effect
+    turns_sensors: its three parameters are the rotation of the magnetometer against the gyro, rad
+    remembers:   bound of each axis of its initial state (setting `memory`), in that setting's unit;
+                 0 without a memory
     """
 
     identifier: str
@@ -131,9 +133,9 @@ class Effect(ABC):
 
     @property
     def least_information(self) -> float:
-        """Of a direction of its coefficients, in prior deviations, for it to count as observable.
+        """Least information of an observable direction of its coefficients, in prior deviations.
 
-        A coefficient at its physical bound must be three of its own deviations there; one of usual
+        A coefficient at its physical bound must be three of its standard deviations.  One of usual
         size may be less: on a noisy recording only a large one shows, but that one does.
         """
         reach = min((one.bound / one.scale for one in self.parameters), default=1.0)
@@ -141,10 +143,11 @@ class Effect(ABC):
 
     @abstractmethod
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """The non-linear choices worth trying here; empty where it cannot be computed.
+        """The non-linear choices worth trying here; empty where the effect cannot be computed.
 
-        `onset_s` is in the time of the recording.  A key `searched` counts the alternatives among
-        which the setting was picked by looking at the data: evidence has to pay ln(searched).
+        `onset_s` is in the time of the recording.  A key `searched` counts the alternatives from
+        which the setting was selected by looking at the data; ln(searched) is subtracted from the
+        evidence.
         """
 
     @abstractmethod
@@ -157,45 +160,45 @@ class Effect(ABC):
 
     @abstractmethod
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
-        """Value and setting of the effect `strength` times as large as usual, for a simulation.
+        """Value and setting of an effect of `strength` times its typical size, for a simulation.
 
         Raises ValueError in one line where the readings lack what it needs.
         """
 
 
 class Linear(Effect):
-    """An effect that is linear in its parameters: its columns are the effect."""
+    """An effect that is linear in its parameters: columns times parameters is the effect."""
 
     @abstractmethod
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """The settings that these readings allow, without looking at the magnetometer."""
+        """The settings that these readings allow, without using the magnetometer."""
 
     @abstractmethod
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The columns, from the truth and the covariates."""
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """As the class says, and nothing else."""
+        """The choices."""
         return self.choices(readings_of(context))
 
     def columns(self, context: Context, setting: Setting) -> Columns:
-        """The terms along the recording as the present model sees it."""
+        """The terms along the recording under the present model."""
         return self.terms(readings_of(context), setting)
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Adds the terms times the value."""
-        return added(readings, self.terms(readings, setting), value)
+        return add_terms(readings, self.terms(readings, setting), value)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """The middle one of the choices."""
         choices = self.choices(readings)
         if not choices:
-            raise ValueError(f"{self.identifier} needs {lacking(self)}")
+            raise ValueError(f"{self.identifier} needs {needs_text(self)}")
         return strength * np.array(self.typical), choices[len(choices) // 2]
 
 
 class Scatter(Effect):
-    """An effect that changes how much the magnetometer scatters and nothing of the mean."""
+    """An effect on the magnetometer's noise and not on the mean of its readings."""
 
     kind: Kind = "variance"
 
@@ -209,7 +212,7 @@ class Scatter(Effect):
 
 
 class Discrete(Effect):
-    """A fault that is there or not; looked for before any physics."""
+    """A fault of the stream that is counted and not fitted, before any physics."""
 
     kind: Kind = "discrete"
 
@@ -223,7 +226,7 @@ class Discrete(Effect):
 
 
 class Clipped(Discrete):
-    """A sensor's range, none if 0. `quantity` names the readings (N, 3) that end there."""
+    """The range limit of a sensor, none if 0.  `quantity`: the readings (N, 3) that it clips."""
 
     quantity: ClassVar[str]
     after_noise = True
@@ -235,11 +238,11 @@ class Clipped(Discrete):
         return replace(readings, **{self.quantity: clipped})
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
-        """The stronger, the lower the limit."""
+        """A higher strength is a lower limit."""
         return np.array([self.typical[0] / strength if strength else 0.0]), {}
 
 
-def lacking(effect: Effect) -> str:
+def needs_text(effect: Effect) -> str:
     """What an effect needs, in words."""
     needs = [f"a column of {' or '.join(need.split('|'))}" for need in effect.needs]
     return " and ".join(needs) if needs else "a longer recording"
@@ -247,7 +250,7 @@ def lacking(effect: Effect) -> str:
 
 @lru_cache(maxsize=2)  # every effect asks in every setting
 def readings_of(context: Context) -> Readings:
-    """What the sensors of a context would read without noise, and the truth behind it."""
+    """Noise-free readings of a context's sensors, and the truth; cached for all effects."""
     track, model = context.track, context.model
     accel = track.accel_b_m_s2
     return Readings(
@@ -266,26 +269,26 @@ def readings_of(context: Context) -> Readings:
 
 
 def rowwise_readings_of(context: Context) -> Readings:
-    """The same with rates that share no noise with their row's innovation."""
+    """The same with rates that share no noise with the innovation of their row."""
     return replace(readings_of(context), rate_b_rad_s=context.rowwise_rate_b_rad_s)
 
 
 def smooth_readings_of(context: Context) -> Readings:
-    """The same with the smooth field: the differences of the foretold one are the gyro's noise."""
+    """The same with the smoothed field: differences of the predicted field are gyro noise."""
     model, smooth = context.model, context.smooth_b
     mag = smooth @ model.soft_iron.T + model.hard_iron_gauss
     return replace(readings_of(context), field_b=smooth, mag_b_gauss=mag)
 
 
 def residual_gauss(context: Context) -> Array:
-    """(N, 3) gauss, readings less what field and calibration make of them; 0 without a reading."""
+    """(N, 3) gauss, readings less the smoothed field under the calibration; 0 without a reading."""
     model = context.model
     expected = context.smooth_b @ model.soft_iron.T + model.hard_iron_gauss
     return np.nan_to_num(context.track.mag_b_gauss - expected)
 
 
-def added(readings: Readings, terms: Columns, value: Array) -> Readings:
-    """The readings with `terms` (N, 3, p) times `value` (p,) on top."""
+def add_terms(readings: Readings, terms: Columns, value: Array) -> Readings:
+    """The readings plus `terms` (N, 3, p) times `value` (p,)."""
     mag, gyro = readings.mag_b_gauss, readings.gyro_b_rad_s
     return replace(
         readings,

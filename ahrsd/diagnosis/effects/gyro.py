@@ -1,4 +1,4 @@
-"""What the gyro makes of a rate, and how its bias moves.
+"""Effects of the gyro: of the rate, and of the bias.
 
 Of the rate: scale, axes, non-linearity, delay, integration, clipping.  Of the bias: temperature,
 time, steps, vibration, start-up.
@@ -26,13 +26,13 @@ from ahrsd.diagnosis.effects.effect import (
 from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
-#: by which the earth turns among the stars: no axis has more of it
+#: the earth's rotation rate, the largest that an axis can have of it
 SIDEREAL_RAD_S = 7.292e-5
 _WALK_MODES = 4
 
 
 class GyroScale(Linear):
-    """G1."""
+    """G1: scale error per axis."""
 
     identifier = "gyro_scale"
     code = "G1"
@@ -52,11 +52,11 @@ class GyroScale(Linear):
     ordinary = 20.0
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Nothing to choose."""
+        """One empty setting: no non-linear choice."""
         return ({},)
 
     def columns(self, context: Context, setting: Setting) -> Columns:
-        """Of rates without their own row's noise."""
+        """The terms, from rates that lack the noise of their own row."""
         return self.terms(rowwise_readings_of(context), setting)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
@@ -65,7 +65,7 @@ class GyroScale(Linear):
 
 
 class GyroNonorthogonality(Linear):
-    """G2; the antisymmetric part is the misalignment."""
+    """G2: the symmetric part of the gyro's matrix; the antisymmetric part is the misalignment."""
 
     identifier = "gyro_nonorthogonality"
     code = "G2"
@@ -84,11 +84,11 @@ class GyroNonorthogonality(Linear):
     source = "Kalibr, OpenVINS (dossier G2)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Nothing to choose."""
+        """One empty setting: no non-linear choice."""
         return ({},)
 
     def columns(self, context: Context, setting: Setting) -> Columns:
-        """Of rates without their own row's noise."""
+        """The terms, from rates that lack the noise of their own row."""
         return self.terms(rowwise_readings_of(context), setting)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
@@ -97,7 +97,7 @@ class GyroNonorthogonality(Linear):
 
 
 class GyroNonlinearity(Linear):
-    """G9, per axis or by the size of the rate."""
+    """G9: a scale that depends on the rate of the axis, or on the magnitude of the rate."""
 
     identifier = "gyro_nonlinearity"
     code = "G9"
@@ -114,11 +114,11 @@ class GyroNonlinearity(Linear):
     ordinary = 6.9
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """The rate of the axis, or the size of the whole rate."""
+        """By the rate of the axis, or by the magnitude of the rate."""
         return ({"form": "axis"}, {"form": "size"})
 
     def columns(self, context: Context, setting: Setting) -> Columns:
-        """Of rates without their own row's noise."""
+        """The terms, from rates that lack the noise of their own row."""
         return self.terms(rowwise_readings_of(context), setting)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
@@ -132,7 +132,7 @@ class GyroNonlinearity(Linear):
 
 
 class GyroGSensitivity(Linear):
-    """G4."""
+    """G4: a bias linear in the specific force."""
 
     identifier = "gyro_g_sensitivity"
     code = "G4"
@@ -153,16 +153,16 @@ class GyroGSensitivity(Linear):
     source = "OpenVINS TRO 2023 (dossier G4)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Nothing to choose, where there is an accelerometer."""
+        """One empty setting where there is an accelerometer."""
         return ({},) if design_matrix.has_accel(readings) else ()
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """A matrix on the specific force."""
+        """The specific force times a 3 x 3 matrix."""
         return Columns(gyro=design_matrix.times_matrix(design_matrix.specific_force_g(readings)))
 
 
 class EarthRotation(Linear):
-    """G12.  Three numbers: the attitude may be known but for a turn of the world."""
+    """G12: a rate constant in the world; three parameters, as north may be unknown."""
 
     identifier = "earth_rotation"
     code = "G12"
@@ -183,7 +183,7 @@ class EarthRotation(Linear):
     source = "the sidereal day (dossier G12)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Nothing to choose."""
+        """One empty setting: no non-linear choice."""
         return ({},)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
@@ -192,7 +192,7 @@ class EarthRotation(Linear):
 
 
 class GyroIntegration(Linear):
-    """G13.  1 is a gyro that reports the rate at the sample in place of the step's mean."""
+    """G13.  The value 1 is a gyro that reports the rate at the sample, not the mean of the step."""
 
     identifier = "gyro_integration"
     code = "G13"
@@ -213,17 +213,17 @@ class GyroIntegration(Linear):
     of_step = True
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Nothing to choose."""
+        """One empty setting: no non-linear choice."""
         return ({},)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """From the step's mean to the instant."""
+        """The rate at the sample minus the step's mean."""
         change = time_series.instant_rate(readings) - readings.rate_b_rad_s
         return Columns(gyro=change[:, :, None])
 
 
 class GyroTimeLag(Effect):
-    """G15.  Exact for rates that are constant within each step."""
+    """G15: a delay of the gyro.  Exact for rates that are constant within each step."""
 
     identifier = "gyro_time_lag"
     code = "G15"
@@ -245,7 +245,7 @@ class GyroTimeLag(Effect):
     plain = True
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """Nothing to choose."""
+        """One empty setting: no non-linear choice."""
         return ({},)
 
     def columns(self, context: Context, setting: Setting) -> Columns:
@@ -254,10 +254,10 @@ class GyroTimeLag(Effect):
         return Columns(gyro=-time_series.derivative(r.rate_b_rad_s, r.time_s, r.dt_s)[:, :, None])
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
-        """What the gyro would have read `value` seconds ago in place of the present."""
+        """The gyro's reading of `value` seconds ago."""
         lag_s = float(value[0])
         others = readings.gyro_b_rad_s - readings.rate_b_rad_s
-        others = time_series.earlier(others, readings.time_s, readings.dt_s, lag_s)
+        others = time_series.delayed_values(others, readings.time_s, readings.dt_s, lag_s)
         return replace(readings, gyro_b_rad_s=time_series.delayed_rate(readings, lag_s) + others)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
@@ -266,7 +266,7 @@ class GyroTimeLag(Effect):
 
 
 class GyroSaturation(Clipped):
-    """G10."""
+    """G10: the range limit of the gyro."""
 
     identifier = "gyro_saturation"
     code = "G10"
@@ -284,7 +284,7 @@ class GyroSaturation(Clipped):
 
 
 class GyroBiasTemperature(Linear):
-    """G6."""
+    """G6: a bias linear in temperature."""
 
     identifier = "gyro_bias_temperature"
     code = "G6"
@@ -304,12 +304,14 @@ class GyroBiasTemperature(Linear):
     source = "dossier G6; the recording F00379"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """One per thermometer."""
-        return design_matrix.per_covariate(readings, "temperature")
+        """One per logged temperature."""
+        return design_matrix.settings_per_covariate(readings, "temperature")
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """T - T0 on each axis."""
-        return Columns(gyro=design_matrix.on_axes(design_matrix.course_of(readings, setting)))
+        return Columns(
+            gyro=design_matrix.on_axes(design_matrix.covariate_series(readings, setting))
+        )
 
 
 class GyroBiasDrift(Linear):
@@ -348,20 +350,20 @@ class GyroBiasDrift(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The recording's own length."""
-        return (design_matrix.span(readings),)
+        return (design_matrix.span_setting(readings),)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The modes on each axis."""
         order = np.arange(1, _WALK_MODES + 1) - 0.5
         return Columns(
             gyro=design_matrix.on_axes(
-                np.sin(np.pi * order * design_matrix.elapsed(readings, setting))
+                np.sin(np.pi * order * design_matrix.elapsed_fraction(readings, setting))
             )
         )
 
 
 class GyroBiasStep(Linear):
-    """G8."""
+    """G8: a step of the bias."""
 
     identifier = "gyro_bias_step"
     code = "G8"
@@ -382,16 +384,16 @@ class GyroBiasStep(Linear):
     jumps = True
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """A coarse grid of times."""
-        return design_matrix.onsets(readings)
+        """A coarse grid of onset times."""
+        return design_matrix.onset_settings(readings)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """1 from the onset on, on each axis."""
-        return Columns(gyro=design_matrix.on_axes(design_matrix.since(readings, setting)))
+        """A unit step at the onset, on each axis."""
+        return Columns(gyro=design_matrix.on_axes(design_matrix.after_onset(readings, setting)))
 
 
 class GyroStartup(Linear):
-    """G14; the recording's first sample counts as the start where nothing says better."""
+    """G14: a decay after power-on, which is taken to be the first sample."""
 
     identifier = "gyro_startup"
     code = "G14"
@@ -415,13 +417,13 @@ class GyroStartup(Linear):
         return tuple({**start, "time_constant_s": tau} for tau in (20.0, 60.0, 180.0))
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """The decay on each axis."""
-        passed = (readings.time_s - setting["start_s"]) / setting["time_constant_s"]
-        return Columns(gyro=design_matrix.on_axes(np.exp(-passed)[:, None]))
+        """The exponential decay on each axis."""
+        elapsed = (readings.time_s - setting["start_s"]) / setting["time_constant_s"]
+        return Columns(gyro=design_matrix.on_axes(np.exp(-elapsed)[:, None]))
 
 
 class VibrationRectification(Linear):
-    """G5.  The course is normalised to its own mean size, so that the parameter is a rate."""
+    """G5: a bias by vibration power, normalised to its mean, so that the parameter is a rate."""
 
     identifier = "vibration_rectification"
     code = "G5"
@@ -443,10 +445,13 @@ class VibrationRectification(Linear):
     ordinary = 0.6
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """The acceleration's variance over a second, each current and each shaft squared."""
+        """Variance of the acceleration over a second; square of each current and shaft speed."""
         found: list[Setting] = []
-        if design_matrix.has_accel(readings) and float(np.mean(_shaking(readings, 1.0))) > 0.0:
-            mean = float(np.mean(_shaking(readings, 1.0)))
+        if (
+            design_matrix.has_accel(readings)
+            and float(np.mean(_vibration_power(readings, 1.0))) > 0.0
+        ):
+            mean = float(np.mean(_vibration_power(readings, 1.0)))
             found.append({"covariate": "accel", "window_s": 1.0, "mean": mean})
         for role in ("current", "rpm"):
             for name in roles.usable_columns(readings.covariates, role):
@@ -455,15 +460,15 @@ class VibrationRectification(Linear):
         return tuple(found)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """The vibration's course on each axis."""
+        """The normalised vibration power on each axis."""
         if setting["covariate"] == "accel":
-            course = _shaking(readings, setting["window_s"])
+            vibration = _vibration_power(readings, setting["window_s"])
         else:
-            course = readings.covariates[setting["covariate"]] ** 2
-        return Columns(gyro=design_matrix.on_axes(np.asarray(course / setting["mean"])[:, None]))
+            vibration = readings.covariates[setting["covariate"]] ** 2
+        return Columns(gyro=design_matrix.on_axes(np.asarray(vibration / setting["mean"])[:, None]))
 
 
-def _shaking(readings: Readings, window_s: float) -> Array:
+def _vibration_power(readings: Readings, window_s: float) -> Array:
     """Variance (N,) in g^2 of the specific force about its mean over the window, all axes."""
     rows = max(round(window_s / time_series.median_step(readings.dt_s)), 3)
     total = np.zeros(len(readings.time_s))

@@ -1,4 +1,4 @@
-"""The library: every effect by its identifier, in the order of the contract."""
+"""The library: all effects by identifier, in the order of the contract."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clocks, links, firmware and people: what samples meet on their way, and how they scatter."""
+"""Effects of clocks, links, firmware and operators, and of the sensors' noise."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _CONVERGED_S = (20.0, 60.0, 180.0)  # time constants of a compensation on board
 
 
 class ClockRate(Linear):
-    """C1."""
+    """C1: the sample clock against the gyro's."""
 
     identifier = "clock_rate"
     code = "C1"
@@ -44,11 +44,11 @@ class ClockRate(Linear):
     source = "dossier C1"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Nothing to choose."""
+        """One empty setting: no non-linear choice."""
         return ({},)
 
     def columns(self, context: Context, setting: Setting) -> Columns:
-        """Of rates without their own row's noise."""
+        """The terms, from rates that lack the noise of their own row."""
         return self.terms(rowwise_readings_of(context), setting)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
@@ -57,7 +57,7 @@ class ClockRate(Linear):
 
 
 class TimestampJitter(Scatter):
-    """C2.  The stamps move, the samples do not."""
+    """C2: jitter of the time stamps, not of the samples."""
 
     identifier = "timestamp_jitter"
     code = "C2"
@@ -76,7 +76,7 @@ class TimestampJitter(Scatter):
     source = "dossier C2"
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
-        """Stamps off by a normal deviate, never so far that time would go back."""
+        """Normal errors of the stamps, limited so that time increases."""
         draw = np.random.default_rng(setting["seed"]).standard_normal(len(readings.time_s))
         most = 0.45 * time_series.median_step(readings.dt_s)
         time_s = readings.time_s + np.clip(float(value[0]) * draw, -most, most)
@@ -91,7 +91,7 @@ class TimestampJitter(Scatter):
 
 
 class NoiseBurst(Scatter):
-    """N1, for some seconds."""
+    """N1: a higher noise level for some seconds."""
 
     identifier = "noise_burst"
     code = "N1"
@@ -112,7 +112,7 @@ class NoiseBurst(Scatter):
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Normal noise within the burst."""
         draw = np.random.default_rng(setting["seed"]).standard_normal(readings.mag_b_gauss.shape)
-        noise = float(value[0]) * draw * _within(readings.time_s, setting)[:, None]
+        noise = float(value[0]) * draw * _inside_interval(readings.time_s, setting)[:, None]
         return replace(readings, mag_b_gauss=readings.mag_b_gauss + noise)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
@@ -123,7 +123,7 @@ class NoiseBurst(Scatter):
 
 
 class NoiseLevel(Scatter):
-    """N1, from a time on."""
+    """N1: a higher noise level from a time on."""
 
     identifier = "noise_level"
     code = "N1"
@@ -147,7 +147,7 @@ class NoiseLevel(Scatter):
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Normal noise on both sensors."""
         rng = np.random.default_rng(setting["seed"])
-        on = design_matrix.since(readings, setting)
+        on = design_matrix.after_onset(readings, setting)
         mag, gyro = (rng.standard_normal(readings.mag_b_gauss.shape) * on for _ in range(2))
         return replace(
             readings,
@@ -164,7 +164,7 @@ class NoiseLevel(Scatter):
 
 
 class DroppedSamples(Discrete):
-    """C3."""
+    """C3: lost samples."""
 
     identifier = "dropped_samples"
     code = "C3"
@@ -181,10 +181,10 @@ class DroppedSamples(Discrete):
     source = "dossier C3"
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
-        """The rows that are left; never the first."""
+        """The remaining rows; the first is always kept."""
         draw = np.random.default_rng(setting["seed"]).random(len(readings.time_s))
         draw[0] = 1.0
-        return time_series.kept(readings, draw >= float(value[0]))
+        return time_series.select_rows(readings, draw >= float(value[0]))
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """Two in a hundred."""
@@ -192,7 +192,7 @@ class DroppedSamples(Discrete):
 
 
 class StuckMagnetometer(Discrete):
-    """C3."""
+    """C3: one reading is repeated."""
 
     identifier = "stuck_magnetometer"
     code = "C3"
@@ -211,7 +211,7 @@ class StuckMagnetometer(Discrete):
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """The reading at the onset, repeated."""
         length = float(value[0])
-        stuck = _within(readings.time_s, {**setting, "length_s": length}) > 0
+        stuck = _inside_interval(readings.time_s, {**setting, "length_s": length}) > 0
         if not stuck.any():
             return readings
         mag = readings.mag_b_gauss.copy()
@@ -253,7 +253,7 @@ class FrameError(Discrete):
 
 
 class UnitError(Discrete):
-    """H2."""
+    """H2: a wrong unit of the gyro."""
 
     identifier = "unit_error"
     code = "H2"
@@ -277,14 +277,14 @@ class UnitError(Discrete):
         return replace(readings, gyro_b_rad_s=readings.gyro_b_rad_s * (1 + float(value[0])))
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
-        """Degrees; half of it is no unit."""
+        """Degrees for radians, at any strength."""
         return float(bool(strength)) * np.array(self.typical), {}
 
 
 class OnboardCalibrationActive(Effect):
-    """F1: the reading creeps from raw to the device's own correction (1 + gain) C (m - b).
+    """F1: the reading moves from raw to the device's own correction (1 + gain) C (m - b).
 
-    gain: what is corrected has the size of the device's reference field, not of the raw reading.
+    gain: the corrected reading has the size of the device's reference field, not of the raw one.
     """
 
     identifier = "onboard_calibration_active"
@@ -294,7 +294,7 @@ class OnboardCalibrationActive(Effect):
     equation = (
         "m += s(t) (k (h - m) + g h), h = A^-1 (m - b), s ~ 1 - exp(-(t - t0)/tau), 1 at the end"
     )
-    # a compensation takes hard iron away: less than a hundredth of it, or more of it, is a drift
+    # a compensation removes hard iron: less than a hundredth of it, or an increase, is a drift
     parameters = (Parameter("part", "1", 1.0, 2.0, least=0.01), Parameter("gain", "1", 0.1, 0.5))
     typical = (0.8, 0.0)
     frame = "sensor"
@@ -314,23 +314,23 @@ class OnboardCalibrationActive(Effect):
         first = float(readings.time_s[0])
         return tuple(
             {**onset, "time_constant_s": tau}
-            for onset in ({"onset_s": first}, *design_matrix.onsets(readings)[::2])
+            for onset in ({"onset_s": first}, *design_matrix.onset_settings(readings)[::2])
             for tau in _CONVERGED_S
         )
 
     def columns(self, context: Context, setting: Setting) -> Columns:
-        """From the raw reading to the corrected one."""
+        """The corrected reading minus the raw one, and the corrected reading."""
         readings = readings_of(context)
-        corrected = _corrected(readings)
+        corrected = _fully_corrected(readings)
         both = np.stack([corrected - readings.mag_b_gauss, corrected], axis=2)
-        return Columns(mag=_converged(readings, setting)[:, None, None] * both)
+        return Columns(mag=_convergence(readings, setting)[:, None, None] * both)
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """A convergence with a time constant, as of a filter that sees more and more attitudes."""
         part, gain = value
-        corrected = _corrected(readings)
+        corrected = _fully_corrected(readings)
         change = part * (corrected - readings.mag_b_gauss) + gain * corrected
-        change *= _converged(readings, setting)[:, None]
+        change *= _convergence(readings, setting)[:, None]
         return replace(readings, mag_b_gauss=readings.mag_b_gauss + change)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
@@ -341,20 +341,20 @@ class OnboardCalibrationActive(Effect):
         return value, {"onset_s": onset, "time_constant_s": 60.0}
 
 
-def _converged(readings: Readings, setting: Setting) -> Array:
-    """How far a filter that began at the onset has come, 1 at the last sample, (N,)."""
+def _convergence(readings: Readings, setting: Setting) -> Array:
+    """Progress of a filter that began at the onset, 1 at the last sample, (N,)."""
     since = np.maximum(readings.time_s - setting["onset_s"], 0.0) / setting["time_constant_s"]
     return np.asarray(np.expm1(-since) / min(np.expm1(-since[-1]), -1e-6))
 
 
-def _corrected(readings: Readings) -> Array:
-    """(N, 3) gauss, the readings with the whole of hard and soft iron compensated."""
+def _fully_corrected(readings: Readings) -> Array:
+    """(N, 3) gauss, the readings with all of hard and soft iron corrected."""
     induced = readings.field_b @ readings.soft_iron.T
     hard_iron = np.mean(readings.mag_b_gauss - induced, axis=0)
     return np.linalg.solve(readings.soft_iron, (readings.mag_b_gauss - hard_iron).T).T
 
 
-def _within(time_s: Array, setting: Setting) -> Array:
-    """1 from the onset for the setting's length, (N,)."""
+def _inside_interval(time_s: Array, setting: Setting) -> Array:
+    """1 from the onset for the setting's length, else 0, (N,)."""
     inside = (time_s >= setting["onset_s"]) & (time_s < setting["onset_s"] + setting["length_s"])
     return np.where(inside, 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""The library of effects as a page.
+"""The reference page of the library of effects.
 
 python -m ahrsd.diagnosis.effects.reference_page > docs/reference/effects.md
 """
@@ -57,12 +57,12 @@ def page(library: Mapping[str, Effect] = EFFECTS) -> str:
         lines += [f"## {title}", ""]
         for effect in library.values():
             if effect.family == family:
-                lines += _entry(effect)
-    lines += _covariates()
+                lines += _effect_lines(effect)
+    lines += _column_lines()
     return "\n".join(lines)
 
 
-def _entry(effect: Effect) -> Iterator[str]:
+def _effect_lines(effect: Effect) -> Iterator[str]:
     yield f"### `{effect.identifier}` ({effect.code})"
     yield ""
     yield f"{effect.words[:1].upper()}{effect.words[1:]}."
@@ -74,8 +74,8 @@ def _entry(effect: Effect) -> Iterator[str]:
     yield "| parameter | unit | typical | prior | limit |"
     yield "|---|---|---|---|---|"
     pairs = zip(effect.parameters, effect.typical, strict=True)
-    for _, alike in groupby(pairs, lambda pair: _family(pair[0])):
-        yield _row(list(alike))
+    for _, alike in groupby(pairs, lambda pair: _row_key(pair[0])):
+        yield _parameter_row(list(alike))
     yield ""
     yield f"* Looks like: {effect.signature}."
     if effect.needs:
@@ -89,13 +89,13 @@ def _entry(effect: Effect) -> Iterator[str]:
     yield ""
 
 
-def _family(parameter: Parameter) -> tuple[object, ...]:
-    """What parameters share that stand in one row."""
+def _row_key(parameter: Parameter) -> tuple[object, ...]:
+    """What parameters in one row of the table have in common."""
     stem, _, _ = parameter.name.rpartition("_")
     return stem or parameter.name, parameter.unit, parameter.scale, parameter.bound
 
 
-def _row(alike: Sequence[tuple[Parameter, float]]) -> str:
+def _parameter_row(alike: Sequence[tuple[Parameter, float]]) -> str:
     first = alike[0][0]
     names = ", ".join(f"`{parameter.name}`" for parameter, _ in alike)
     typical = ", ".join(f"{value:.3g}" for _, value in alike)
@@ -104,12 +104,12 @@ def _row(alike: Sequence[tuple[Parameter, float]]) -> str:
 
 
 def _anchor(identifier: str) -> str:
-    """What a Markdown viewer makes of the heading."""
+    """The anchor that a Markdown viewer gives the heading."""
     code = EFFECTS[identifier].code.lower().replace(",", "").replace(" ", "-")
     return f"{identifier}-{code}"
 
 
-def _covariates() -> Iterator[str]:
+def _column_lines() -> Iterator[str]:
     """The roles of further columns."""
     yield "## Columns of a recording"
     yield ""

@@ -1,4 +1,4 @@
-"""The magnetometer's own element: gain, non-linearity, range, steps, alternating fields."""
+"""Effects of the magnetometer element: gain, non-linearity, range, steps, alternating fields."""
 
 from __future__ import annotations
 
@@ -27,18 +27,20 @@ _MG = 1e-3
 _USUAL_GAUSS = 0.5  # of the earth's field: parameters of non-linear terms are errors at this field
 _MAINS_HZ = (50.0, 60.0, 100.0, 120.0, 400.0)
 _LINES = 2
-#: parts of the sample rate at which the device's own filters and updates leave lines
-_IN_STEP = (1 / 6, 1 / 5, 1 / 4, 1 / 3, 2 / 5)
-_LOWEST_HZ = 0.3  # below, a line is a slow course and other effects fit it as well
-#: a band's share of the turning's power at which the vehicle turns to and fro.  Hands that draw
+#: fractions of the sample rate at which the device's own filters and updates leave lines
+_SYNCHRONOUS = (1 / 6, 1 / 5, 1 / 4, 1 / 3, 2 / 5)
+_LOWEST_HZ = 0.3  # below, a line is a slow change that other effects fit as well
+#: share of the turn rate's power in a band at which the vehicle turns to and fro.  Hands that draw
 #: eights, walkers and shakers have .2 to .4 at their rate and its double, simulated vehicles less
 #: than .1 above half a Hz; what is faster is vibration, which may come with a source's own field
-_BAND_HZ, _OF_THE_TURNS, _TURNS_HZ = 0.2, 0.1, 3.0
-_REPEATED = 0.2  # share of repeated readings from which the magnetometer is slower than the output
+_BAND_HZ, _TURNS_SHARE, _TURNS_HZ = 0.2, 0.1, 3.0
+_REPEATED_SHARE = (
+    0.2  # share of repeated readings from which the magnetometer is slower than the output
+)
 
 
 class AcInterference(Linear):
-    """M7 and M8.  The lines come from the residual's spectrum; the search is paid for."""
+    """M7 and M8.  The frequencies are lines of the residual's spectrum; `searched` counts them."""
 
     identifier = "ac_interference"
     code = "M7, M8"
@@ -61,13 +63,15 @@ class AcInterference(Linear):
     quick = True
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """The two strongest lines."""
-        return lines(residual_gauss(context), context.track.gyro_b_rad_s, context.track.dt_s)
+        """The two strongest lines of the residual."""
+        return spectral_lines(
+            residual_gauss(context), context.track.gyro_b_rad_s, context.track.dt_s
+        )
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """The alias of 60 Hz at this rate, or a line in the middle of the band."""
         rate_hz = 1.0 / time_series.median_step(readings.dt_s)
-        alias = aliased(60.0, rate_hz)
+        alias = alias_frequency(60.0, rate_hz)
         return ({"frequency_hz": alias if alias > _LOWEST_HZ else 0.31 * rate_hz},)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
@@ -77,7 +81,7 @@ class AcInterference(Linear):
 
 
 class MagScaleTemperature(Linear):
-    """M11: of the field alone, within the iron or without, or of all that the element sees."""
+    """M11: gain by temperature: of A h, of A h + b (the reading), or of h."""
 
     identifier = "mag_scale_temperature"
     code = "M11"
@@ -101,17 +105,17 @@ class MagScaleTemperature(Linear):
         return tuple(
             setting
             for of in ("field", "reading", "outside")
-            for setting in design_matrix.per_covariate(readings, "temperature", of=of)
+            for setting in design_matrix.settings_per_covariate(readings, "temperature", of=of)
         )
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """(T - T0) times what the element sees, per axis."""
-        seen = readings.mag_b_gauss
+        """(T - T0) times the quantity that the gain acts on, per axis."""
+        gained = readings.mag_b_gauss
         if setting["of"] == "field":
-            seen = readings.field_b @ readings.soft_iron.T
+            gained = readings.field_b @ readings.soft_iron.T
         elif setting["of"] == "outside":
-            seen = readings.field_b
-        gain = design_matrix.course_of(readings, setting) * seen
+            gained = readings.field_b
+        gain = design_matrix.covariate_series(readings, setting) * gained
         return Columns(mag=np.asarray(gain[:, :, None] * np.eye(3)))
 
 
@@ -157,7 +161,7 @@ class MagCrossAxis(Linear):
 
 
 class MagNonlinearity(Linear):
-    """M13."""
+    """M13: a cubic term."""
 
     identifier = "mag_nonlinearity"
     code = "M13"
@@ -173,7 +177,7 @@ class MagNonlinearity(Linear):
     source = "dossier M13"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Nothing to choose."""
+        """One empty setting: no non-linear choice."""
         return ({},)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
@@ -183,7 +187,7 @@ class MagNonlinearity(Linear):
 
 
 class MagSaturation(Clipped):
-    """M14."""
+    """M14: the range limit of the magnetometer."""
 
     identifier = "mag_saturation"
     code = "M14"
@@ -201,7 +205,7 @@ class MagSaturation(Clipped):
 
 
 class MagQuantisation(Effect):
-    """M15: the step is noise to the mean, so there are no columns."""
+    """M15: coarse steps.  They act as noise on the mean, so that there are no columns."""
 
     identifier = "mag_quantisation"
     code = "M15"
@@ -239,7 +243,7 @@ class MagQuantisation(Effect):
 
 
 class MagSampleHold(Effect):
-    """M21: 1 is a magnetometer whose last value is repeated until the next comes."""
+    """M21.  The value 1 is a magnetometer whose last value is repeated until the next update."""
 
     identifier = "mag_sample_hold"
     code = "M21"
@@ -261,7 +265,7 @@ class MagSampleHold(Effect):
     def settings(self, context: Context) -> tuple[Setting, ...]:
         """The number of repeats, where readings repeat."""
         fresh = np.any(np.diff(context.track.mag_b_gauss, axis=0) != 0, axis=1)
-        if len(fresh) < 10 or np.mean(fresh) > 1 - _REPEATED:
+        if len(fresh) < 10 or np.mean(fresh) > 1 - _REPEATED_SHARE:
             return ()
         hold = round(1 / max(float(np.mean(fresh)), 1e-3))
         updates = np.flatnonzero(fresh[: 20 * hold]) + 1
@@ -269,34 +273,35 @@ class MagSampleHold(Effect):
         return ({"hold_samples": hold, "phase": phase},) if hold > 1 else ()
 
     def columns(self, context: Context, setting: Setting) -> Columns:
-        """From the present field to that of the last update."""
-        held = context.smooth_b[_last_update(context.track.dt_s, setting)]
+        """The field of the last update minus the present field."""
+        held = context.smooth_b[_last_update_rows(context.track.dt_s, setting)]
         return Columns(mag=((held - context.smooth_b) @ context.model.soft_iron.T)[:, :, None])
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
         """Readings of the last update, noise included."""
         m = readings.mag_b_gauss
-        part, held = float(value[0]), m[_last_update(readings.dt_s, setting)]
+        part, held = float(value[0]), m[_last_update_rows(readings.dt_s, setting)]
         return replace(readings, mag_b_gauss=(1 - part) * m + part * held)  # equal bit by bit at 1
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
-        """Updated every fourth sample; the stronger, the more seldom."""
+        """Updated every fourth sample; a higher strength is a slower update."""
         hold = max(round(4 * strength), 2)
         return np.array([min(strength, 1.0)]), {"hold_samples": hold, "phase": 0}
 
 
-def aliased(frequency_hz: float, rate_hz: float) -> float:
-    """Where a line appears at that sample rate."""
+def alias_frequency(frequency_hz: float, rate_hz: float) -> float:
+    """The frequency at which a line appears at that sample rate."""
     return abs(frequency_hz - round(frequency_hz / rate_hz) * rate_hz)
 
 
-def lines(residual: Array, gyro_b_rad_s: Array, dt_s: Array) -> tuple[Setting, ...]:
+def spectral_lines(residual: Array, gyro_b_rad_s: Array, dt_s: Array) -> tuple[Setting, ...]:
     """The strongest lines of (N, 3) in the longest gap-free run, and which mains they may be.
 
-    None that keeps step with the samples: no source outside the device does.  None where the
-    vehicle turns to and fro: whatever the model lacks returns at that rate.
+    Lines at simple fractions of the sample rate are left out: no source outside of the device
+    keeps step with the samples.  So are frequencies at which the vehicle turns to and fro, because
+    whatever the model lacks repeats at that rate.
     """
-    run = max(time_series.runs(dt_s), key=lambda r: int(r.stop - r.start))
+    run = max(time_series.gap_free_runs(dt_s), key=lambda r: int(r.stop - r.start))
     values, step_s = residual[run] - residual[run].mean(axis=0), time_series.median_step(dt_s[run])
     if len(values) < 64 or not np.any(values):
         return ()
@@ -306,34 +311,39 @@ def lines(residual: Array, gyro_b_rad_s: Array, dt_s: Array) -> tuple[Setting, .
     width = 2.0 / (len(values) * step_s)
     inside = (frequency > _LOWEST_HZ) & (frequency < 0.5 / step_s - width)
     power = np.where(inside, power, 0.0)
-    background = _background(power)
+    background = _spectral_background(power)
     power = np.divide(power, background, out=np.zeros_like(power), where=background > 0.0)
     turns = np.nan_to_num(gyro_b_rad_s[run])
     turned = np.fft.rfft((turns - turns.mean(axis=0)) * window, 4 * len(values), axis=0)
-    power[_to_and_fro(frequency, np.sum(np.abs(turned) ** 2, axis=1))] = 0.0
+    power[_oscillating_turns(frequency, np.sum(np.abs(turned) ** 2, axis=1))] = 0.0
     found: list[Setting] = []
-    for _ in range(_LINES + len(_IN_STEP)):
+    for _ in range(_LINES + len(_SYNCHRONOUS)):
         at = int(np.argmax(power))
-        best = float(frequency[at] + time_series.peak(power, at) * frequency[1])
-        mains = [f for f in _MAINS_HZ if abs(aliased(f, 1 / step_s) - best) < width + 5e-4 * f]
-        if mains or min(abs(best * step_s - part) for part in _IN_STEP) > width * step_s / 4:
+        best = float(frequency[at] + time_series.parabola_peak_offset(power, at) * frequency[1])
+        mains = [
+            f for f in _MAINS_HZ if abs(alias_frequency(f, 1 / step_s) - best) < width + 5e-4 * f
+        ]
+        if mains or min(abs(best * step_s - part) for part in _SYNCHRONOUS) > width * step_s / 4:
             found.append({"frequency_hz": best, "searched": len(values) // 2, "mains_hz": mains})
         power = np.where(np.abs(frequency - best) < 2 * width, 0.0, power)
     return tuple(found[:_LINES])
 
 
-def _to_and_fro(frequency_hz: Array, power: Array) -> NDArray[np.bool]:
-    """Where a turn comes back: a tenth of the turning's power in a fifth of a Hz, and no noise."""
+def _oscillating_turns(frequency_hz: Array, power: Array) -> NDArray[np.bool]:
+    """Frequencies where the vehicle turns to and fro: a tenth of the turn's power within 0.2 Hz.
+
+    The power must also exceed three times that of white noise in the band.
+    """
     total = np.r_[0.0, np.cumsum(power)]
     low = np.searchsorted(frequency_hz, frequency_hz - _BAND_HZ / 2)
     high = np.searchsorted(frequency_hz, frequency_hz + _BAND_HZ / 2)
     share = (total[high] - total[low]) / max(float(total[-1]), 1e-300)
     noise = _BAND_HZ / float(frequency_hz[-1])
-    return np.asarray((share > max(_OF_THE_TURNS, 3 * noise)) & (frequency_hz < _TURNS_HZ))
+    return np.asarray((share > max(_TURNS_SHARE, 3 * noise)) & (frequency_hz < _TURNS_HZ))
 
 
-def _background(power: Array) -> Array:
-    """The usual level around each frequency: what is coloured is no line."""
+def _spectral_background(power: Array) -> Array:
+    """The local level of the spectrum, so that coloured noise is no line."""
     pieces = max(len(power) // 256, 1)
     level = np.array([np.median(part) for part in np.array_split(power, pieces)])
     centres = (np.arange(pieces) + 0.5) * len(power) / pieces
@@ -341,10 +351,10 @@ def _background(power: Array) -> Array:
     return np.asarray(np.maximum(usual, float(power.max()) * 1e-12))
 
 
-def _last_update(dt_s: Array, setting: Setting) -> Rows:
+def _last_update_rows(dt_s: Array, setting: Setting) -> Rows:
     """Row of the last update for each row, counted within runs."""
     out = np.empty(len(dt_s), dtype=np.intp)
-    for run in time_series.runs(dt_s):
+    for run in time_series.gap_free_runs(dt_s):
         row = np.arange(run.stop - run.start)
         back = (row - setting["phase"]) % setting["hold_samples"]
         out[run] = run.start + np.maximum(row - back, 0)

@@ -1,4 +1,4 @@
-"""Iron on the vehicle that changes: steps, drifts, soft iron, hysteresis, viscosity."""
+"""Iron on the vehicle that changes: steps, drifts, soft iron, hysteresis, magnetic viscosity."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from ahrsd.diagnosis.effects.effect import Linear, Readings, Setting
 from ahrsd.diagnosis.model import Columns
 
 _MG = 1e-3
-#: time constants of a drift that settles, as a vehicle that warms up does
+#: time constants of an exponential drift, as of a vehicle that warms up
 SETTLING_S = (30.0, 60.0, 120.0, 240.0)
 
 
 class HardIronStep(Linear):
-    """M1."""
+    """M1: a step of the hard iron."""
 
     identifier = "hard_iron_step"
     code = "M1"
@@ -39,16 +39,16 @@ class HardIronStep(Linear):
     jumps = True
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """A coarse grid of times."""
-        return design_matrix.onsets(readings)
+        """A coarse grid of onset times."""
+        return design_matrix.onset_settings(readings)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """1 from the onset on, on each axis."""
-        return Columns(mag=design_matrix.on_axes(design_matrix.since(readings, setting)))
+        """A unit step at the onset, on each axis."""
+        return Columns(mag=design_matrix.on_axes(design_matrix.after_onset(readings, setting)))
 
 
 class HardIronDrift(Linear):
-    """M2: straight, relaxing like viscous iron, or settling; the parameter is the whole change."""
+    """M2: linear, logarithmic or exponential in time; the parameter is the total change."""
 
     identifier = "hard_iron_drift"
     code = "M2"
@@ -72,8 +72,8 @@ class HardIronDrift(Linear):
     ordinary = 12.0
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Straight; fast, then slow; settling, with time constants a factor of two apart."""
-        over = design_matrix.span(readings)
+        """Linear; logarithmic; exponential, with time constants a factor of two apart."""
+        over = design_matrix.span_setting(readings)
         return (
             {**over, "shape": "line"},
             {**over, "shape": "log", "relaxation_s": 10.0},
@@ -81,8 +81,8 @@ class HardIronDrift(Linear):
         )
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """The course from 0 to 1 on each axis."""
-        part = design_matrix.elapsed(readings, setting)
+        """The drift from 0 to 1 on each axis."""
+        part = design_matrix.elapsed_fraction(readings, setting)
         if setting["shape"] == "log":
             ratio = setting["span_s"] / setting["relaxation_s"]
             part = np.log1p(np.maximum(part, 0.0) * ratio) / np.log1p(ratio)
@@ -93,7 +93,7 @@ class HardIronDrift(Linear):
 
 
 class SoftIronStep(Linear):
-    """M3."""
+    """M3: a step of the soft iron."""
 
     identifier = "soft_iron_step"
     code = "M3"
@@ -114,24 +114,24 @@ class SoftIronStep(Linear):
     recurs = True
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """A coarse grid of times."""
-        return design_matrix.onsets(readings)
+        """A coarse grid of onset times."""
+        return design_matrix.onset_settings(readings)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The symmetric matrices on the field, from the onset on."""
-        on = design_matrix.since(readings, setting)[:, :, None]
+        on = design_matrix.after_onset(readings, setting)[:, :, None]
         return Columns(mag=design_matrix.times_symmetric(readings.field_b) * on)
 
 
 class Hysteresis(Linear):
-    """M16.  The play operator's middle trails the field by up to its radius."""
+    """M16: the output of a play operator lags the field by up to its radius."""
 
     identifier = "hysteresis"
     code = "M16"
     family = "sensor"
     words = "hysteresis of iron near the sensor"
     equation = "m_i += k_i (play_r[(A h)_i] - (A h)_i) / r"
-    # three times the largest that is known: in a spin the field along the axis has no swing but the
+    # bound: three times the largest known.  In a spin the field along the axis varies only by the
     # filter's own noise, of which a width of thirty explains a part of the innovations
     parameters = design_matrix.vector("width", "gauss", 2.0 * _MG, 10.0 * _MG)
     typical = design_matrix.along(2.0 * _MG)
@@ -145,21 +145,21 @@ class Hysteresis(Linear):
     size = "0.1 to 3 mG"
     source = "play operator (Preisach); Bowditch on retentive error (dossier M16)"
     ordinary = 1.4
-    remembers = 1.0  # at one end of the slot
+    remembers = 1.0  # one end of the slot
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Radii from the noise of a few readings to more than half of the field's usual swing."""
+        """Radii from the noise of a few readings to more than half of the field's usual range."""
         return tuple({"radius_gauss": radius} for radius in (0.0015, 0.006, 0.02, 0.06, 0.15))
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """Between -1 and 1 per axis."""
+        """The lag of the play operator relative to its radius, -1 to 1, per axis."""
         induced, radius = readings.field_b @ readings.soft_iron.T, setting["radius_gauss"]
-        gap = (time_series.play(induced, radius, setting.get("memory")) - induced) / radius
+        gap = (time_series.play_operator(induced, radius, setting.get("memory")) - induced) / radius
         return Columns(mag=np.asarray(gap[:, :, None] * np.eye(3)))
 
 
 class ViscousMagnetisation(Linear):
-    """M18."""
+    """M18: magnetisation that follows the field with a first-order lag."""
 
     identifier = "viscous_magnetisation"
     code = "M18"
@@ -185,7 +185,7 @@ class ViscousMagnetisation(Linear):
         return tuple({"time_constant_s": tau} for tau in (5.0, 18.0, 60.0))
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """The symmetric matrices on what trails."""
+        """The symmetric matrices on the lagging part."""
         tau, memory = setting["time_constant_s"], setting.get("memory")
         slow = time_series.low_pass(readings.field_b, readings.dt_s, tau, memory)
         return Columns(mag=design_matrix.times_symmetric(slow - readings.field_b))

@@ -1,4 +1,4 @@
-"""What turning does to the reading: lag, filters, eddy currents, a mount that gives."""
+"""Effects of motion on the magnetometer: lag, filters, eddy currents, mount, misalignment."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ahrsd.samples import Array
 
 
 class EddyCurrent(Linear):
-    """M17."""
+    """M17: a field linear in the field's rate of change."""
 
     identifier = "eddy_current"
     code = "M17"
@@ -43,16 +43,19 @@ class EddyCurrent(Linear):
     source = "eddy block of Tolles and Lawson (dossier M17)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Nothing to choose."""
+        """One empty setting: no non-linear choice."""
         return ({},)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """A matrix on the field's derivative."""
+        """The field's derivative times a 3 x 3 matrix."""
         return Columns(mag=design_matrix.times_matrix(time_series.field_dot(readings)))
 
 
 class MagTimeLag(Effect):
-    """M19.  Exact: the true field, turned back along the steps, and all else that is read."""
+    """M19: a delay of the magnetometer.  Exact: the true field is turned back along the steps.
+
+    All else that the magnetometer reads is delayed by interpolation.
+    """
 
     identifier = "mag_time_lag"
     code = "M19"
@@ -77,7 +80,7 @@ class MagTimeLag(Effect):
     plain = True
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """Nothing to choose."""
+        """One empty setting: no non-linear choice."""
         return ({},)
 
     def columns(self, context: Context, setting: Setting) -> Columns:
@@ -87,12 +90,12 @@ class MagTimeLag(Effect):
         return Columns(mag=-change[:, :, None])
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
-        """What the magnetometer would have read `value` seconds ago in place of the present."""
+        """The magnetometer's reading of `value` seconds ago."""
         lag_s = float(value[0])
         delay_s = np.full(len(readings.time_s), lag_s)
         field = time_series.delayed_field(readings, delay_s) @ readings.soft_iron.T
         others = readings.mag_b_gauss - readings.field_b @ readings.soft_iron.T
-        others = time_series.earlier(others, readings.time_s, readings.dt_s, lag_s)
+        others = time_series.delayed_values(others, readings.time_s, readings.dt_s, lag_s)
         return replace(readings, mag_b_gauss=field + others)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
@@ -101,7 +104,7 @@ class MagTimeLag(Effect):
 
 
 class MagLowPass(Linear):
-    """M20.  Straight in its parameter; with the delay equal to the setting it is the filter."""
+    """M20.  Linear in its parameter; exactly the filter where the delay equals the setting."""
 
     identifier = "mag_low_pass"
     code = "M20"
@@ -128,20 +131,20 @@ class MagLowPass(Linear):
         return tuple({"time_constant_s": tau} for tau in (0.03, 0.1, 0.3))
 
     def columns(self, context: Context, setting: Setting) -> Columns:
-        """Of the smooth field."""
+        """The terms, from the smoothed field."""
         return self.terms(smooth_readings_of(context), setting)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """What the filter takes away, per second of its time constant."""
+        """What the filter removes, per second of its time constant."""
         tau0 = setting["time_constant_s"]
         field_b, time_s, dt_s = readings.field_b, readings.time_s, readings.dt_s
-        change = time_series.low_pass_of_curves(field_b, time_s, dt_s, tau0) - field_b
+        change = time_series.low_pass_cubic(field_b, time_s, dt_s, tau0) - field_b
         others = readings.mag_b_gauss - field_b @ readings.soft_iron.T
         change = change @ readings.soft_iron.T + time_series.low_pass(others, dt_s, tau0) - others
         return Columns(mag=np.asarray(change / tau0)[:, :, None])
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
-        """The filter itself, of `strength` times 30 ms."""
+        """The exact filter, of `strength` times 30 ms."""
         value = strength * np.array(self.typical)
         return value, {"time_constant_s": float(max(value[0], 1e-6))}
 
@@ -149,8 +152,8 @@ class MagLowPass(Linear):
 class FlexibleMount(Effect):
     """M22.  Exact: a rotation by C (a - a0).
 
-    A mount is straight without a load, or under the one that it was aligned under: its mean.  The
-    two differ by a constant turn, which is a crooked gyro if it has no part here.
+    A mount is straight without a load, or under the mean load under which it was aligned.  The two
+    differ by a constant rotation, which looks like a gyro misalignment if the model has no a0.
     """
 
     identifier = "flexible_mount"
@@ -172,11 +175,11 @@ class FlexibleMount(Effect):
     source = "dossier M22"
     ordinary_part = "bending"
     # C = c I turns about the specific force, which at rest is the vertical: Exp(c g_b) R^T h is
-    # R^T (Exp(c g_n) h), another field in the world, and which one is there nobody knows
+    # R^T (Exp(c g_n) h): another constant field in the world, which is unknown anyway
     unseen = (tuple(np.eye(3).ravel() / np.sqrt(3.0)),)
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """Straight without a load or under the mean one, where there is an accelerometer."""
+        """Straight without a load or under the mean load, where there is an accelerometer."""
         if context.track.accel_b_m_s2 is None:
             return ()
         mean_g = np.mean(design_matrix.specific_force_g(readings_of(context)), axis=0)
@@ -187,13 +190,13 @@ class FlexibleMount(Effect):
         """A ((C (a - a0)) x h)."""
         readings = readings_of(context)
         force = _load_g(readings, setting)
-        turn = readings.soft_iron @ design_matrix.turned_by(readings.field_b)  # (N, 3, 3)
+        turn = readings.soft_iron @ design_matrix.cross_columns(readings.field_b)  # (N, 3, 3)
         return Columns(mag=np.einsum("nka,nb->nkab", turn, force).reshape(len(force), 3, 9))
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
-        """The field seen from the bent mount."""
+        """The field as measured on the bent mount."""
         bend = _load_g(readings, setting) @ value.reshape(3, 3).T
-        return with_field(readings, np.einsum("nij,nj->ni", so3.exp(bend), readings.field_b))
+        return replace_field(readings, np.einsum("nij,nj->ni", so3.exp(bend), readings.field_b))
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """About half a degree per g."""
@@ -203,13 +206,13 @@ class FlexibleMount(Effect):
 
 
 def _load_g(readings: Readings, setting: Setting) -> Array:
-    """(N, 3) specific force beyond that under which a mount is straight, g."""
+    """(N, 3) specific force less that under which the mount is straight, g."""
     straight_g = np.array(setting.get("straight_g", np.zeros(3)), dtype=np.float64)
     return np.asarray(design_matrix.specific_force_g(readings) - straight_g)
 
 
 class MagGyroMisalignment(Effect):
-    """G3.  Exact: the magnetometer sees the field turned by phi."""
+    """G3.  Exact: the magnetometer's field is rotated by phi."""
 
     identifier = "mag_gyro_misalignment"
     code = "G3"
@@ -230,23 +233,23 @@ class MagGyroMisalignment(Effect):
     source = "Kok and Schon 2016, arXiv 1612.01044 (dossier G3)"
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """Nothing to choose."""
+        """One empty setting: no non-linear choice."""
         return ({},)
 
     def columns(self, context: Context, setting: Setting) -> Columns:
         """A (phi x h)."""
-        return Columns(mag=context.model.soft_iron @ design_matrix.turned_by(context.field_b))
+        return Columns(mag=context.model.soft_iron @ design_matrix.cross_columns(context.field_b))
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
-        """The field turned by Exp(phi)."""
-        return with_field(readings, readings.field_b @ so3.exp(value).T)
+        """The field rotated by Exp(phi)."""
+        return replace_field(readings, readings.field_b @ so3.exp(value).T)
 
     def example(self, readings: Readings, strength: float) -> tuple[Array, Setting]:
         """About a degree."""
         return strength * np.array(self.typical), {}
 
 
-def with_field(readings: Readings, field_b: Array) -> Readings:
-    """The readings with another field at the sensor, whatever else is in them."""
+def replace_field(readings: Readings, field_b: Array) -> Readings:
+    """The readings with another field at the sensor; all else in them is kept."""
     change = (field_b - readings.field_b) @ readings.soft_iron.T
     return replace(readings, mag_b_gauss=readings.mag_b_gauss + change)

@@ -1,11 +1,11 @@
-"""Sources on the vehicle whose course somebody logs: currents, temperature, joints, switches.
+"""Sources on the vehicle with a logged time series: currents, temperature, joints, switches.
 
-Each is a field in the sensor frame, straight onto the reading: D = e_i f(covariate).
+Each is a field in the sensor frame that adds to the reading: D = e_i f(covariate).
 
-Of a train of short pulses nobody logs the times: its period, its phase, how long a pulse is are
-sought (`trains`).  Pulses of w seconds every P seconds are lines at all multiples of 1/P up to
-about 1/w, each of them too weak to be seen alone.  Their sum over the multiples shows the period;
-folding the residual at that period shows when in it, and for how long, something is there.
+The times of a train of short pulses are not logged: its period, phase and pulse width are searched
+for (`find_pulse_trains`).  Pulses of w seconds every P seconds are lines at all multiples of 1/P
+up to about 1/w, each of them too weak to be seen alone.  The sum over the multiples gives the
+period; the residual folded at that period gives phase and width.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from ahrsd.diagnosis.model import Columns, Context
 from ahrsd.samples import Array
 
 _MG = 1e-3
-_TACHOMETER = 1e-3  # part of its reading by which a shaft's speed may be wrong
+_TACHOMETER_ERROR = 1e-3  # relative error of a shaft's speed
 _PERIODS_S = (0.4, 6.0)
 _HIGHEST_HZ = 12.0  # pulses of 40 ms and longer
 _LONGEST_S = 0.25
 _PADDING = 4
-_PERIODS = 4  # of the best by their lines that are folded
-_CLOSER = 6  # steps to either side in which a period is refined
-_BINS, _FINE_BINS = 2, 16  # to a sample, when trains are folded, and when the best is refined
-_FEWEST = 20  # periods in a recording
+_PERIODS = 4  # number of the best periods by their lines that are folded
+_REFINE_STEPS = 6  # steps to either side in the refinement of a period
+_BINS, _FINE_BINS = 2, 16  # per sample: for all candidates, and for the refinement of the best
+_FEWEST_PERIODS = 20  # periods in a recording
 
 
 class MotorCurrentField(Linear):
-    """M4."""
+    """M4: a field linear in a current."""
 
     identifier = "motor_current_field"
     code = "M4"
@@ -60,16 +60,16 @@ class MotorCurrentField(Linear):
     source = "Ampere; ArduPilot #116 and PR 6448, PX4 PR 14457, inav #4820 (dossier M4)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """One per current that was logged."""
-        return design_matrix.per_covariate(readings, "current")
+        """One per logged current."""
+        return design_matrix.settings_per_covariate(readings, "current")
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """I on each axis."""
-        return Columns(mag=design_matrix.on_axes(design_matrix.course_of(readings, setting)))
+        return Columns(mag=design_matrix.on_axes(design_matrix.covariate_series(readings, setting)))
 
 
 class CurrentDerivativeField(Linear):
-    """M5."""
+    """M5: a field linear in the derivative of a current."""
 
     identifier = "current_derivative_field"
     code = "M5"
@@ -91,19 +91,19 @@ class CurrentDerivativeField(Linear):
     source = "preprints 202401.1460 (dossier M5)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """One per current that was logged."""
-        return design_matrix.per_covariate(readings, "current")
+        """One per logged current."""
+        return design_matrix.settings_per_covariate(readings, "current")
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """dI/dt on each axis."""
         change = time_series.derivative(
-            design_matrix.course_of(readings, setting), readings.time_s, readings.dt_s
+            design_matrix.covariate_series(readings, setting), readings.time_s, readings.dt_s
         )
         return Columns(mag=design_matrix.on_axes(change))
 
 
 class SpeedField(Linear):
-    """M6."""
+    """M6: a field by speed or shaft speed."""
 
     identifier = "speed_field"
     code = "M6"
@@ -124,22 +124,26 @@ class SpeedField(Linear):
     source = "Remote Sensing 15:4164 (dossier M6)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Each speed, straight and squared; each shaft in thousands of turns."""
+        """Each speed, linear and squared; each shaft in thousands of turns a minute."""
         speeds = [
             setting
             for power in (1, 2)
-            for setting in design_matrix.per_covariate(readings, "speed", power=power, unit=1.0)
+            for setting in design_matrix.settings_per_covariate(
+                readings, "speed", power=power, unit=1.0
+            )
         ]
-        return (*design_matrix.per_covariate(readings, "rpm", power=1, unit=1e3), *speeds)
+        return (*design_matrix.settings_per_covariate(readings, "rpm", power=1, unit=1e3), *speeds)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """f(v) on each axis."""
-        course = (design_matrix.course_of(readings, setting) / setting["unit"]) ** setting["power"]
+        course = (design_matrix.covariate_series(readings, setting) / setting["unit"]) ** setting[
+            "power"
+        ]
         return Columns(mag=design_matrix.on_axes(course))
 
 
 class SyncPulses(Linear):
-    """M9."""
+    """M9: pulses of a transmitter."""
 
     identifier = "sync_pulses"
     code = "M9"
@@ -159,26 +163,28 @@ class SyncPulses(Linear):
     quick = True
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """One per column of pulses, and the likeliest regular train that nobody logged."""
+        """One per column of pulses, and the most likely regular train that is not logged."""
         track = context.track
-        logged = design_matrix.per_covariate(readings_of(context), "ping")
-        return (*logged, *trains(residual_gauss(context), track.time_s, track.step_s))
+        logged = design_matrix.settings_per_covariate(readings_of(context), "ping")
+        return (*logged, *find_pulse_trains(residual_gauss(context), track.time_s, track.step_s))
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """The columns of pulses, else 60 ms every two seconds."""
+        """The columns of pulses; without any, 60 ms every two seconds."""
         start_s = float(readings.time_s[0])
         regular = {"start_s": start_s, "period_s": 2.0, "phase_s": 0.5, "width_s": 0.06}
-        return design_matrix.per_covariate(readings, "ping") or (regular,)
+        return design_matrix.settings_per_covariate(readings, "ping") or (regular,)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The pulses on each axis."""
         if "covariate" in setting:
-            return Columns(mag=design_matrix.on_axes(design_matrix.course_of(readings, setting)))
-        return Columns(mag=design_matrix.on_axes(train(readings.time_s, setting)[:, None]))
+            return Columns(
+                mag=design_matrix.on_axes(design_matrix.covariate_series(readings, setting))
+            )
+        return Columns(mag=design_matrix.on_axes(pulse_train(readings.time_s, setting)[:, None]))
 
 
 class MagBiasTemperature(Linear):
-    """M10; the reference is kept in the setting: the hard iron is that of this temperature."""
+    """M10: an offset by temperature.  The setting keeps the hard iron's reference temperature."""
 
     identifier = "mag_bias_temperature"
     code = "M10"
@@ -199,16 +205,16 @@ class MagBiasTemperature(Linear):
     source = "Sensors 19:1850 (2019), HMC5983 sheet (dossier M10)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """One per thermometer."""
-        return design_matrix.per_covariate(readings, "temperature")
+        """One per logged temperature."""
+        return design_matrix.settings_per_covariate(readings, "temperature")
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """T - T0 on each axis."""
-        return Columns(mag=design_matrix.on_axes(design_matrix.course_of(readings, setting)))
+        return Columns(mag=design_matrix.on_axes(design_matrix.covariate_series(readings, setting)))
 
 
 class MovingIron(Linear):
-    """M23."""
+    """M23: a field by the angle of a joint."""
 
     identifier = "moving_iron"
     code = "M23"
@@ -232,18 +238,18 @@ class MovingIron(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """One per angle."""
-        return design_matrix.per_covariate(readings, "angle")
+        return design_matrix.settings_per_covariate(readings, "angle")
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """cos, then sin, on each axis."""
-        angle = design_matrix.course_of(readings, setting)[:, 0]
+        angle = design_matrix.covariate_series(readings, setting)[:, 0]
         if setting["covariate"].endswith("_deg"):
             angle = np.radians(angle)
         return Columns(mag=design_matrix.on_axes(np.column_stack([np.cos(angle), np.sin(angle)])))
 
 
 class SwitchedDevice(Linear):
-    """M24."""
+    """M24: a field by a logged switch."""
 
     identifier = "switched_device"
     code = "M24"
@@ -265,15 +271,15 @@ class SwitchedDevice(Linear):
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
         """One per switch."""
-        return design_matrix.per_covariate(readings, "switch")
+        return design_matrix.settings_per_covariate(readings, "switch")
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """The switch on each axis."""
-        return Columns(mag=design_matrix.on_axes(design_matrix.course_of(readings, setting)))
+        return Columns(mag=design_matrix.on_axes(design_matrix.covariate_series(readings, setting)))
 
 
 class RotorField(Linear):
-    """M25.  The samples see the shaft's phase itself, so its alias comes out right."""
+    """M25.  The sampled phase of the shaft gives the alias at the right frequency."""
 
     identifier = "rotor_field"
     code = "M25"
@@ -296,7 +302,7 @@ class RotorField(Linear):
     quick = True
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """The shaft and its second harmonic, each at the speed nearby that fits best.
+        """The shaft and its second harmonic, each at the nearby speed that fits best.
 
         A tachometer is right to a few parts in a thousand, and a tenth of a turn a minute is a
         whole turn in ten minutes.
@@ -305,7 +311,7 @@ class RotorField(Linear):
         found = []
         for setting in self.choices(readings):
             phase = setting["harmonic"] * _shaft_phase(readings, setting["covariate"])
-            off_hz, searched = _strongest_near(left, phase, context.track.time_s)
+            off_hz, searched = _frequency_offset(left, phase, context.track.time_s)
             found.append({**setting, "off_hz": off_hz, "searched": searched})
         return tuple(found)
 
@@ -314,7 +320,7 @@ class RotorField(Linear):
         return tuple(
             setting
             for harmonic in (1, 2)
-            for setting in design_matrix.per_covariate(readings, "rpm", harmonic=harmonic)
+            for setting in design_matrix.settings_per_covariate(readings, "rpm", harmonic=harmonic)
         )
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
@@ -325,44 +331,44 @@ class RotorField(Linear):
 
 
 def _shaft_phase(readings: Readings, name: str) -> Array:
-    """Integral of the shaft's rate by the trapezoid rule, rad (N,)."""
+    """Integral of the shaft's rate by the trapezoidal rule, rad (N,)."""
     rate = readings.covariates[name] * 2 * np.pi / 60.0
     step = np.diff(readings.time_s) * (rate[1:] + rate[:-1]) / 2
     return np.concatenate([[0.0], np.cumsum(step)])
 
 
-def _strongest_near(left: Array, phase: Array, time_s: Array) -> tuple[float, int]:
-    """By how many hertz a line in (N, 3) is off the phase (N,), and how many were looked at."""
+def _frequency_offset(residual: Array, phase: Array, time_s: Array) -> tuple[float, int]:
+    """Offset in Hz of a line in (N, 3) from the phase (N,), and the number of offsets tried."""
     since, cycles = time_s - time_s[0], (phase[-1] - phase[0]) / (2 * np.pi)
-    reach = max(1, int(np.ceil(2 * _TACHOMETER * cycles)))
+    reach = max(1, int(np.ceil(2 * _TACHOMETER_ERROR * cycles)))
     off_hz = np.arange(-reach, reach + 1) / (2 * max(since[-1], 1e-9))
-    turned = left * np.exp(-1j * phase)[:, None]
+    turned = residual * np.exp(-1j * phase)[:, None]
     starts = np.arange(0, len(since), max(1, len(since) // (16 * (reach + 1))))
     sums, middle = np.add.reduceat(turned, starts), since[starts]
     power = np.sum(np.abs(np.exp(-2j * np.pi * np.outer(off_hz, middle)) @ sums) ** 2, axis=1)
     best = int(np.argmax(power))
-    return float(off_hz[best]) + time_series.peak(power, best) * float(
+    return float(off_hz[best]) + time_series.parabola_peak_offset(power, best) * float(
         off_hz[1] - off_hz[0]
     ), reach + 1
 
 
-def trains(residual: Array, time_s: Array, step_s: float) -> tuple[Setting, ...]:
-    """The likeliest train of pulses in (N, 3), empty where the recording is too short for one."""
+def find_pulse_trains(residual: Array, time_s: Array, step_s: float) -> tuple[Setting, ...]:
+    """The most likely train of pulses in (N, 3); empty where the recording is too short for one."""
     start_s, span_s = float(time_s[0]), float(time_s[-1] - time_s[0])
-    longest_s = min(_PERIODS_S[1], span_s / _FEWEST)
+    longest_s = min(_PERIODS_S[1], span_s / _FEWEST_PERIODS)
     if longest_s < 2 * _PERIODS_S[0] or len(time_s) < 256:
         return ()
     time_s = time_s - start_s
-    quick = _quick(residual, round(0.5 / step_s))
-    periods, tried = _periods(quick, step_s, span_s, longest_s)
+    fast = _high_pass(residual, round(0.5 / step_s))
+    periods, tried = _candidate_periods(fast, step_s, span_s, longest_s)
     best = max(
-        (_folded(quick, time_s, period_s, step_s, _BINS) for period_s in periods),
+        (_best_folded_window(fast, time_s, period_s, step_s, _BINS) for period_s in periods),
         key=lambda found: found[0],
     )
-    for reach in (1.0, 1.0 / _CLOSER):
-        shift = reach * best[1] ** 2 / (_PADDING * span_s * _HIGHEST_HZ) / _CLOSER
-        near = best[1] + shift * np.arange(-_CLOSER, _CLOSER + 1)
-        folded = (_folded(quick, time_s, float(p), step_s, _FINE_BINS) for p in near)
+    for reach in (1.0, 1.0 / _REFINE_STEPS):
+        shift = reach * best[1] ** 2 / (_PADDING * span_s * _HIGHEST_HZ) / _REFINE_STEPS
+        near = best[1] + shift * np.arange(-_REFINE_STEPS, _REFINE_STEPS + 1)
+        folded = (_best_folded_window(fast, time_s, float(p), step_s, _FINE_BINS) for p in near)
         best = max(folded, key=lambda found: found[0])
     _, period_s, phase_s, width_s = best
     return (
@@ -376,14 +382,14 @@ def trains(residual: Array, time_s: Array, step_s: float) -> tuple[Setting, ...]
     )
 
 
-def train(time_s: Array, setting: Setting) -> Array:
+def pulse_train(time_s: Array, setting: Setting) -> Array:
     """1 in the samples that a pulse hits, else 0, (N,)."""
     since = (time_s - setting["start_s"] - setting["phase_s"]) % setting["period_s"]
     return np.where(since < setting["width_s"], 1.0, 0.0)
 
 
-def _quick(residual: Array, width: int) -> Array:
-    """What is left of (N, 3) when its mean over `width` samples is taken off."""
+def _high_pass(residual: Array, width: int) -> Array:
+    """(N, 3) less its moving mean over `width` samples."""
     total = np.vstack([np.zeros(3), np.cumsum(residual - residual.mean(axis=0), axis=0)])
     rows = np.arange(len(residual))
     first, last = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(rows))
@@ -392,15 +398,17 @@ def _quick(residual: Array, width: int) -> Array:
     )
 
 
-def _periods(quick: Array, step_s: float, span_s: float, longest_s: float) -> tuple[Array, int]:
-    """The periods whose multiples hold most power, and how many were looked at."""
-    count = len(quick)
-    power = np.sum(np.abs(np.fft.rfft(quick, _PADDING * count, axis=0)) ** 2, axis=1)
+def _candidate_periods(
+    fast: Array, step_s: float, span_s: float, longest_s: float
+) -> tuple[Array, int]:
+    """The periods whose multiples hold most power, and the number of periods tried."""
+    count = len(fast)
+    power = np.sum(np.abs(np.fft.rfft(fast, _PADDING * count, axis=0)) ** 2, axis=1)
     spacing_hz = 1.0 / (_PADDING * count * step_s)
     top_hz = min(_HIGHEST_HZ, 0.45 / step_s)
     pieces = np.array_split(power, max(len(power) // 512, 1))
     usual = np.repeat([max(float(np.median(part)), 1e-300) for part in pieces], [*map(len, pieces)])
-    power = np.minimum(power / usual, 50.0)  # one line is no train, however strong
+    power = np.minimum(power / usual, 50.0)  # a single line is no train, however strong
     base_hz = np.arange(1.0 / longest_s, 1.0 / _PERIODS_S[0], 1.0 / (_PADDING * span_s * top_hz))
     score, lines = np.zeros(len(base_hz)), np.floor(top_hz / base_hz)
     for multiple in range(1, int(lines.max()) + 1):
@@ -416,18 +424,18 @@ def _periods(quick: Array, step_s: float, span_s: float, longest_s: float) -> tu
     return np.array(found), len(base_hz)
 
 
-def _folded(
-    quick: Array, time_s: Array, period_s: float, step_s: float, fine: int
+def _best_folded_window(
+    fast: Array, time_s: Array, period_s: float, step_s: float, fine: int
 ) -> tuple[float, float, float, float]:
-    """Power of the best window of the folded residual: (power, period, its phase, its width).
+    """The window of most power in the folded residual: (power, period, its phase, its width).
 
-    fine: bins to a sample; a pulse is a sample at least, or it would hit a few outliers only
+    fine: bins per sample.  A pulse is at least a sample long, or it would fit a few outliers only
     """
     bins = max(8, round(fine * period_s / step_s))
     at = np.minimum((time_s % period_s / period_s * bins).astype(np.intp), bins - 1)
     count = np.bincount(at, minlength=bins).astype(float)
-    sums = np.stack([np.bincount(at, weights=axis, minlength=bins) for axis in quick.T])
-    # twice around, so that a window may reach over the period's end
+    sums = np.stack([np.bincount(at, weights=axis, minlength=bins) for axis in fast.T])
+    # two periods, so that a window may extend over the period's end
     many = np.concatenate([[0.0], np.cumsum(np.tile(count, 2))])
     much = np.concatenate([np.zeros((3, 1)), np.cumsum(np.tile(sums, 2), axis=1)], axis=1)
     best = (-1.0, period_s, 0.0, 0.0)
@@ -435,7 +443,7 @@ def _folded(
         ends = slice(width, width + bins)
         hit = np.maximum(many[ends] - many[:bins], 1.0)
         squares = much[:, ends] - much[:, :bins]
-        squares *= squares  # in place: of all that a survey does at the recorded rate, this is most
+        squares *= squares  # in place: this takes most of the time of a search at the recorded rate
         power = (squares[0] + squares[1] + squares[2]) / hit
         k = int(np.argmax(power))
         if power[k] > best[0]:

@@ -1,10 +1,11 @@
-"""What differs in the world: the field from place to place, from time to time, near iron.
+"""Effects of the world: the field changes with place and time, and near magnetic objects.
 
-All of them are fields n in the world, seen in the sensor frame: D = A R^T f.
+All of them are fields f in the world, in the sensor frame D = A R^T f.
 
-Where a magnetic object is (`found_place`) is told by the size of the field along the way past it.
-The size of the calibrated field does not turn with the sensor.  An object adds to it, nearly, the
-part of its own field along the earth's: u . B(p - p0; k), linear in its moment k for a given place.
+The place of a magnetic object (`locate_dipole`) is estimated from the magnitude of the field along
+the path.  The magnitude of the calibrated field does not depend on the sensor's attitude.  An
+object adds to it, to first order, the component of its field along the earth's: u . B(p - p0; k),
+linear in its moment k for a given place.
 """
 
 from __future__ import annotations
@@ -24,19 +25,20 @@ from ahrsd.samples import Array
 
 _MG = 1e-3
 _NED = ("position_north_m", "position_east_m", "position_down_m")
-#: the world's x axis is magnetic north where the field made it, true north where positions come
-#: from: their difference in degrees, coarsely
+#: the x axis is magnetic north for attitudes and true north for positions: a coarse grid of the
+#: difference, in degrees
 _DECLINATIONS_DEG = (-135.0, -90.0, -45.0, 0.0, 45.0, 90.0, 135.0, 180.0)
 _BUMP_LENGTHS_S = (4.0, 12.0, 36.0)
 _BUMPS = 2
 _DISTANCES_M = (1.0, 3.0)
 _SIDES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+#: metres; least distance of an object from the path
 NEAREST_M = 0.2
-_WAY = 5  # places along the way around which it is sought, too
-_CLEAR = 4.0  # usual departures of the size from which an object is sought
-#: half waves of a slow pulsation, in lengths of the recording, and their phases, coarsely
+_PATH_PLACES = 5  # further places along the path around which it is searched for
+_SIGNIFICANT = 4.0  # usual departures of the magnitude from which an object is located
+#: coarse grids: half waves of a slow pulsation, in lengths of the recording, and their phases
 _HALF_WAVES, _PHASES_DEG = (0.45, 0.7, 1.05), (0.0, 45.0, 90.0, 135.0)
-#: metres in which a field from below falls by e, in ranges of the height, coarsely
+#: coarse grid of the height in which a field from below falls by e, in ranges of the height
 _DECAYS = (0.15, 0.4, 1.0)
 #: entries of a symmetric traceless matrix; the last diagonal one is minus the sum of the others
 _GRADIENT = ("nn", "ee", "ne", "nd", "ed")
@@ -48,12 +50,11 @@ _STARTS_M = (
     (1.5, 1.5, 0.5),
     (-1.5, -1.5, 0.5),
 )
-_TURNS_RAD = (-np.pi / 2, np.pi / 2, np.pi)  # of a frame of positions that is not north's
-_NEAREST_M = 0.2
+_TURNS_RAD = (-np.pi / 2, np.pi / 2, np.pi)  # of a frame of positions that does not point north
 
 
 class FieldGradient(Linear):
-    """W1."""
+    """W1: a field linear in position."""
 
     identifier = "field_gradient"
     code = "W1"
@@ -76,11 +77,11 @@ class FieldGradient(Linear):
     source = "MAINS arXiv 2312.02599, GRSL 2016 (dossier W1)"
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """None where nothing says what is level: positions are in north, east, down."""
+        """None without a level world frame, as positions are north, east, down."""
         return super().settings(context) if context.world_levelled else ()
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """The turn between the world's frame and that of the positions."""
+        """The rotation between the world's frame and that of the positions."""
         place = position_m(readings)
         if place is None:
             return ()
@@ -92,7 +93,7 @@ class FieldGradient(Linear):
         place = position_m(readings)
         if place is None:
             raise ValueError(f"{self.identifier} needs position_north_m and position_east_m")
-        n, e, d = turned_down(place - setting["reference_m"], setting["turn_deg"]).T
+        n, e, d = rotate_about_down(place - setting["reference_m"], setting["turn_deg"]).T
         zero = np.zeros_like(n)
         field = np.stack(
             [
@@ -104,7 +105,7 @@ class FieldGradient(Linear):
             ],
             axis=2,
         )
-        return Columns(mag=_seen(readings, field))
+        return Columns(mag=_as_measured(readings, field))
 
 
 class FieldAnomaly(Linear):
@@ -131,10 +132,10 @@ class FieldAnomaly(Linear):
     ordinary = 8.8
 
     def settings(self, context: Context) -> tuple[Setting, ...]:
-        """Where the calibrated field's size departs most: bumps then, a dipole near that place."""
+        """Where the calibrated field's magnitude departs most: bumps then, dipoles near there."""
         readings = readings_of(context)
-        size = size_departure(context)
-        rows, searched = departures(size, readings)
+        size = field_size_departure(context)
+        rows, searched = largest_departures(size, readings)
         first = float(readings.time_s[0])
         bumps = [
             {
@@ -143,15 +144,15 @@ class FieldAnomaly(Linear):
             }
             for row, length, part in product(rows, _BUMP_LENGTHS_S, (0.35, 0.5, 0.65))
         ]
-        dipoles = _dipoles(context, readings, size, rows)
+        dipoles = _dipole_settings(context, readings, size, rows)
         return tuple({**setting, "searched": searched} for setting in (*bumps, *dipoles))
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """A dipole below the middle of the way, or a bump in the middle of the recording."""
+        """A dipole below the middle of the path, or a bump in the middle of the recording."""
         place = position_m(readings)
         if place is None:
             return ({"onset_s": design_matrix.middle_s(readings), "length_s": 12.0},)
-        return (object_setting(place[len(place) // 2] + [0.0, 0.0, 2.0], 2.0),)
+        return (dipole_setting(place[len(place) // 2] + [0.0, 0.0, 2.0], 2.0),)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """Its field for unit sources along the world's axes."""
@@ -162,13 +163,13 @@ class FieldAnomaly(Linear):
         place = position_m(readings)
         if place is None:
             raise ValueError(f"{self.identifier} needs position_north_m and position_east_m")
-        away = turned_down(place - setting["place_m"], setting.get("turn_deg", 0.0))
+        away = rotate_about_down(place - setting["place_m"], setting.get("turn_deg", 0.0))
         axes = design_matrix.world_axes(readings)
-        return Columns(mag=unit_fields(away, setting["distance_m"], axes))
+        return Columns(mag=unit_dipole_fields(away, setting["distance_m"], axes))
 
 
 class GeomagneticDrift(Linear):
-    """W3."""
+    """W3: a slow change of the earth's field."""
 
     identifier = "geomagnetic_drift"
     code = "W3"
@@ -189,12 +190,12 @@ class GeomagneticDrift(Linear):
     manoeuvre = "all headings throughout; compare with an observatory"
     size = "0.2 to 1 mG a day when quiet, several mG within minutes in storms"
     source = "dossier W3"
-    # north is where the field points: what turns it about the vertical turns the world as well, is
-    # seen by nothing, and would run away in the joint fit (from 2 mG to 25)
+    # the field defines north: a change that turns it about the vertical turns the world as well, is
+    # not observable, and would diverge in the joint fit (from 2 mG to 25)
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """There, or there and back, or half a wave or more of any phase: a slow pulsation."""
-        over = design_matrix.span(readings)
+        """A line, a half wave, or a slow pulsation of half a wave or more at any phase."""
+        over = design_matrix.span_setting(readings)
         waves = tuple(
             {
                 **over,
@@ -207,20 +208,21 @@ class GeomagneticDrift(Linear):
         return ({**over, "shape": "line"}, {**over, "shape": "hump"}, *waves)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """The course on each axis of the world."""
-        part = design_matrix.elapsed(readings, setting)
+        """The time series on each axis of the world."""
+        part = design_matrix.elapsed_fraction(readings, setting)
         if setting["shape"] == "wave":
-            # its phase is that of the middle: there it and the length are known apart
+            # the phase is that of the middle, where it does not correlate with the length
             turns = (part - 0.5) * setting["span_s"] / setting["length_s"]
-            course = np.sin(np.pi * turns + np.radians(setting["turn_deg"]))
+            series = np.sin(np.pi * turns + np.radians(setting["turn_deg"]))
         else:
-            course = part if setting["shape"] == "line" else np.sin(np.pi * np.clip(part, 0, 1))
-        return Columns(mag=design_matrix.in_world(readings, course))
+            series = part if setting["shape"] == "line" else np.sin(np.pi * np.clip(part, 0, 1))
+        return Columns(mag=design_matrix.in_world(readings, series))
 
 
 class AltitudeField(Linear):
-    """W4; `near` falls off like a dipole layer's field, `decay` like that of stripes in the ground.
+    """W4: a field by height.
 
+    `near` falls off like a dipole layer's field, `decay` like that of stripes in the ground.
     Both have slope 1 at the lowest point.
     """
 
@@ -242,8 +244,8 @@ class AltitudeField(Linear):
     source = "Sentry 9N, East Pacific Rise (dossier W4)"
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """Straight in each height; as of something close below where the height is over ground."""
-        found = list(design_matrix.per_covariate(readings, "altitude", shape="line"))
+        """Linear in each height; a nearby source or a decay where the height is above ground."""
+        found = list(design_matrix.settings_per_covariate(readings, "altitude", shape="line"))
         if "position_down_m" in roles.usable_columns(readings.covariates, "position"):
             depth = readings.covariates["position_down_m"]
             line = {"covariate": "position_down_m", "reference": float(depth.mean())}
@@ -260,17 +262,17 @@ class AltitudeField(Linear):
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
         """f on each axis of the world."""
-        course = design_matrix.course_of(readings, setting)
+        series = design_matrix.covariate_series(readings, setting)
         if setting["shape"] == "near":
             lowest = setting["reference"]
-            course = (1 - (lowest / np.maximum(course + lowest, 0.5 * lowest)) ** 3) * lowest / 3
+            series = (1 - (lowest / np.maximum(series + lowest, 0.5 * lowest)) ** 3) * lowest / 3
         if setting["shape"] == "decay":
-            course = -np.expm1(-course / setting["length_m"]) * setting["length_m"]
-        return Columns(mag=design_matrix.in_world(readings, course))
+            series = -np.expm1(-series / setting["length_m"]) * setting["length_m"]
+        return Columns(mag=design_matrix.in_world(readings, series))
 
 
 class FieldStep(Linear):
-    """W7."""
+    """W7: a step of the field in the world."""
 
     identifier = "field_step"
     code = "W7"
@@ -293,12 +295,14 @@ class FieldStep(Linear):
     jumps = True
 
     def choices(self, readings: Readings) -> tuple[Setting, ...]:
-        """A coarse grid of times."""
-        return design_matrix.onsets(readings)
+        """A coarse grid of onset times."""
+        return design_matrix.onset_settings(readings)
 
     def terms(self, readings: Readings, setting: Setting) -> Columns:
-        """1 from the onset on, on each axis of the world."""
-        return Columns(mag=design_matrix.in_world(readings, design_matrix.since(readings, setting)))
+        """A unit step at the onset, on each axis of the world."""
+        return Columns(
+            mag=design_matrix.in_world(readings, design_matrix.after_onset(readings, setting))
+        )
 
 
 @lru_cache(maxsize=2)
@@ -315,16 +319,16 @@ def position_m(readings: Readings) -> Array | None:
     return place if float(np.ptp(place, axis=0).max()) > 0 else None
 
 
-def turned_down(vectors: Array, turn_deg: float) -> Array:
-    """Vectors (N, 3) turned about down."""
+def rotate_about_down(vectors: Array, turn_deg: float) -> Array:
+    """Vectors (N, 3) rotated about down."""
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     return np.asarray(vectors @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T)
 
 
-def size_departure(context: Context) -> Array:
-    """Size of the calibrated field minus its usual value (N,), gauss.
+def field_size_departure(context: Context) -> Array:
+    """Magnitude of the calibrated field minus its median (N,), gauss.
 
-    The size does not turn with the sensor, so nothing but the calibration goes into it.
+    It does not depend on the attitude of the sensor, only on the calibration.
     """
     track, model = context.track, context.model
     field = np.linalg.solve(model.soft_iron, (track.mag_b_gauss - model.hard_iron_gauss).T)
@@ -332,8 +336,8 @@ def size_departure(context: Context) -> Array:
     return np.asarray(np.where(np.isfinite(size), size - np.nanmedian(size), 0.0))
 
 
-def departures(size: Array, readings: Readings) -> tuple[list[int], int]:
-    """Rows where the size departs most, and how many places there were to look at."""
+def largest_departures(size: Array, readings: Readings) -> tuple[list[int], int]:
+    """Rows where the magnitude departs most, and the number of places compared."""
     rows = max(round(_BUMP_LENGTHS_S[0] / 2 / time_series.median_step(readings.dt_s)), 1)
     away = np.abs(time_series.moving_mean(size, readings.dt_s, rows))
     found: list[int] = []
@@ -346,10 +350,10 @@ def departures(size: Array, readings: Readings) -> tuple[list[int], int]:
     return found, max(len(size) // rows, 1)
 
 
-def _dipoles(
+def _dipole_settings(
     context: Context, readings: Readings, size: Array, rows: list[int]
 ) -> tuple[Setting, ...]:
-    """Objects near the way, sought where the size clearly departs, and guessed all around it."""
+    """Dipoles near the path: located where the magnitude clearly departs, and on a grid."""
     place = position_m(readings) if context.world_levelled else None
     if place is None:
         return ()
@@ -358,26 +362,26 @@ def _dipoles(
     found: list[Setting] = []
     for row in rows:
         window = slice(max(row - 2, 0), row + 3)
-        if abs(float(np.mean(size[window]))) > _CLEAR * usual:
-            best = found_place(size, place, field_n, row)
+        if abs(float(np.mean(size[window]))) > _SIGNIFICANT * usual:
+            best = locate_dipole(size, place, field_n, row)
             if best is not None:
                 nearest = float(np.linalg.norm(place - best[0], axis=1).min())
-                found.append(object_setting(best[0], max(nearest, NEAREST_M), np.degrees(best[1])))
+                found.append(dipole_setting(best[0], max(nearest, NEAREST_M), np.degrees(best[1])))
         around = product(_DISTANCES_M, _SIDES)
-        found += [object_setting(place[row] + far * np.array(side), far) for far, side in around]
+        found += [dipole_setting(place[row] + far * np.array(side), far) for far, side in around]
     far = _DISTANCES_M[-1]
-    along = place[:: max(len(place) // _WAY, 1)]
-    found += [object_setting(at + far * np.array(side), far) for at, side in product(along, _SIDES)]
+    along = place[:: max(len(place) // _PATH_PLACES, 1)]
+    found += [dipole_setting(at + far * np.array(side), far) for at, side in product(along, _SIDES)]
     return tuple(found)
 
 
-def _seen(readings: Readings, field_n: Array) -> Array:
+def _as_measured(readings: Readings, field_n: Array) -> Array:
     """Fields of the world (N, 3, p) as the magnetometer reads them."""
     return np.asarray(design_matrix.world_axes(readings) @ field_n)
 
 
-def object_setting(place: Array, distance: float, turn_deg: float = 0.0) -> Setting:
-    """The setting of an object at a place, so far from the nearest of the way."""
+def dipole_setting(place: Array, distance: float, turn_deg: float = 0.0) -> Setting:
+    """The setting of a dipole at a place, at this distance from the nearest point of the path."""
     return {
         "place_m": [round(float(x), 4) for x in place],
         "distance_m": round(distance, 3),
@@ -385,29 +389,30 @@ def object_setting(place: Array, distance: float, turn_deg: float = 0.0) -> Sett
     }
 
 
-def unit_fields(away_m: Array, distance_m: float, axes: Array | None = None) -> Array:
+def unit_dipole_fields(away_m: Array, distance_m: float, axes: Array | None = None) -> Array:
     """Fields (N, 3, 3) of unit moments at offsets (N, 3) from the object.
 
-    A moment is given as the field that it makes beside itself at `distance_m`.
-    axes: (N, 3, 3) the world's axes as the fields are wanted, the world's own if None
+    A moment is given as the field across its axis at `distance_m`.
+    axes: (N, 3, 3) the world's axes in the frame of the result; the world's own if None
     """
     size = np.sqrt(np.einsum("ni,ni->n", away_m, away_m))
-    distance = np.maximum(size, _NEAREST_M / 4)
+    distance = np.maximum(size, NEAREST_M / 4)
     r = away_m / distance[:, None]
     strength = (distance_m / distance) ** 3
-    seen = r if axes is None else np.einsum("nij,nj->ni", axes, r)
-    fields = (3 * strength[:, None] * seen)[:, :, None] * r[:, None, :]
+    direction = r if axes is None else np.einsum("nij,nj->ni", axes, r)
+    fields = (3 * strength[:, None] * direction)[:, :, None] * r[:, None, :]
     fields -= strength[:, None, None] * (np.eye(3) if axes is None else axes)
     return np.asarray(fields)
 
 
-def found_place(
+def locate_dipole(
     size_gauss: Array, place_m: Array, field_n: Array, row: int
 ) -> tuple[Array, float] | None:
-    """The object's place (3,) that explains the size (N,) near `row` best, and the turn about down
-    (rad) from the frame of the positions to that of the field; None where the way is too short.
+    """The place (3,) of a dipole that best explains the magnitude (N,) near `row`, and a rotation.
 
-    place_m: (N, 3) way of the sensor;  field_n: (3,) the earth's field
+    The rotation about down (rad) is from the frame of the positions to that of the field.  None
+    where the path is too short.
+    place_m: (N, 3) path of the sensor;  field_n: (3,) the earth's field
     """
     near = np.linalg.norm(place_m - place_m[row], axis=1) < _REACH_M
     rows = np.flatnonzero(near)
@@ -415,30 +420,36 @@ def found_place(
     if len(rows) < 20:
         return None
     u = field_n / np.linalg.norm(field_n)
-    way, size = place_m[rows], size_gauss[rows]
+    path, size = place_m[rows], size_gauss[rows]
 
-    def left(unknown: Array) -> float:
+    def misfit(unknown: Array) -> float:
         place, turn = unknown[:3], float(unknown[3])
         c, s = np.cos(turn), np.sin(turn)
-        seen = np.array([c * u[0] + s * u[1], c * u[1] - s * u[0], u[2]])
-        columns = np.column_stack([seen @ unit_fields(way - place, 1.0), np.ones(len(way))])
+        direction = np.array([c * u[0] + s * u[1], c * u[1] - s * u[0], u[2]])
+        columns = np.column_stack(
+            [direction @ unit_dipole_fields(path - place, 1.0), np.ones(len(path))]
+        )
         columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         right = columns.T @ size
         ridge = columns.T @ columns + 1e-9 * np.eye(4)
-        outside = max(_NEAREST_M - float(np.linalg.norm(way - place, axis=1).min()), 0.0)
+        outside = max(NEAREST_M - float(np.linalg.norm(path - place, axis=1).min()), 0.0)
         return float(size @ size - right @ np.linalg.solve(ridge, right)) * (1 + outside)
 
     starts = [np.append(place_m[row] + np.array(start), 0.0) for start in _STARTS_M]
-    best = min((_lowest(left, start, 90) for start in starts), key=lambda one: one[0])
-    turned = [_lowest(left, np.append(best[1][:3], best[1][3] + turn), 90) for turn in _TURNS_RAD]
-    best = min((best, *turned), key=lambda one: one[0])
-    found = _lowest(left, best[1], 250)[1]
+    best = min((_minimise(misfit, start, 90) for start in starts), key=lambda one: one[0])
+    rotated = [
+        _minimise(misfit, np.append(best[1][:3], best[1][3] + turn), 90) for turn in _TURNS_RAD
+    ]
+    best = min((best, *rotated), key=lambda one: one[0])
+    found = _minimise(misfit, best[1], 250)[1]
     return found[:3], float(found[3])
 
 
-def _lowest(cost: Callable[[Array], float], start: Array, evaluations: int) -> tuple[float, Array]:
-    """The simplex's lowest cost and where it is."""
-    from scipy.optimize import minimize  # dear to import, and seldom needed
+def _minimise(
+    cost: Callable[[Array], float], start: Array, evaluations: int
+) -> tuple[float, Array]:
+    """The lowest cost of a Nelder-Mead search, and where it is."""
+    from scipy.optimize import minimize  # slow to import, and seldom needed
 
     done = minimize(
         cost,

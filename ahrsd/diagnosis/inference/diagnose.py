@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
-from ahrsd.diagnosis.answer.null_simulations import Answered, beyond_chance
+from ahrsd.diagnosis.answer.null_simulations import FittedDiagnosis, diagnose_beyond_chance
 from ahrsd.diagnosis.calibration_fit.gyro_at_rest import (
     effects_testable_at_rest,
     field_hardly_turns,
@@ -65,19 +65,19 @@ def diagnose(
     """
     known = spec or Spec()
     ask = partial(_answered, spec=known, library=library, simulated=simulated, clocks=True)
-    return replace(beyond_chance(track, ask), recording=recording)
+    return replace(diagnose_beyond_chance(track, ask), recording=recording)
 
 
 def _answered(
     track: Track, spec: Spec, library: Mapping[str, Effect], *, simulated: bool, clocks: bool
-) -> Answered:
+) -> FittedDiagnosis:
     """The answer, whatever is to be expected of it by chance.
 
     clocks: whether a column may run by another clock than the sensor
     """
     asked = prepare(track)
     if (nothing := asked.stopped_diagnosis("", library)) is not None:
-        return Answered(nothing)
+        return FittedDiagnosis(nothing)
     problem, start = begun(asked.corrected_track(), spec)
     came, counted = problem.recorded, asked
     if lost := find_lost_turns_at_start(came, problem.cold):
@@ -113,4 +113,4 @@ def _answered(
         spec_given=spec.sigma_mag_gauss is not None,
         simulated=simulated,
     )
-    return Answered(told, problem, start)
+    return FittedDiagnosis(told, problem, start)

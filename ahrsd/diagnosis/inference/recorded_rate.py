@@ -39,7 +39,7 @@ from ahrsd.diagnosis.inference.search.model_search import (
     beam_search,
 )
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
-from ahrsd.diagnosis.where_and_when.narrow_band import loudest_band, of_band
+from ahrsd.diagnosis.where_and_when.narrow_band import loudest_band, unexplained_band
 from ahrsd.samples import Array
 
 #: how often rows are weighed anew beside what was found
@@ -161,7 +161,7 @@ def _hum(fast: Linearised, best: Hypothesis) -> Unexplained:
     level = replace(best.at, log_noise=np.full(len(log_noise), beside))
     left = fast.residual(best.keys, level)
     band_hz = (rate_hz * low / (2 * count), rate_hz * high / (2 * count))
-    return of_band(fast.context, left, rate_hz, band_hz, nats)
+    return unexplained_band(fast.context, left, rate_hz, band_hz, nats)
 
 
 def at_recorded_rate(slow: Point) -> Point:

@@ -1,1 +1,1 @@
-"""The field's filter, its whitened innovations, and statistics of regressions on them."""
+"""Kalman filter of the field, its whitened innovations, and statistics of regressions on them."""

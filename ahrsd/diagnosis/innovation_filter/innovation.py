@@ -1,33 +1,38 @@
-"""Innovations of the field's filter, whitened, and how they move with any parameter.
+"""Kalman filter of the field: whitened innovations and their derivatives by any parameter.
 
-State: the field in body axes h, and where the null says so the gyro's wandering bias.
+State: the field in body axes h and, where the null model has a gyro-bias random walk, that bias.
 
     predict  h- = Exp(-(w_k - w_b) dt) h+,   process noise (sigma_gyro dt)^2 (|n|^2 I - n n^T)
                                              + q q^T,  q = n x (w_k - w_b) dt s
     update   e = m - A h- - b,  S = A P- A^T + sigma_mag^2 I,  K = P- A^T S^-1,  h+ = h- + K e
 
-A gyro turns the field, it does not stretch it, so its noise is tangential to the sphere |h| = r.
-Tangential to the filter's own h, additive updates lengthen h by |step|^2 / 2 r each: an "external
-field trend" on every recording.  So n is not the filter's h but a nominal field: the readings,
-smoothed both ways in the frame that the gyro carries along, on the sphere, in the middle of the
-step.  The filter is then linear with gains that do not depend on a single innovation, and with the
-gain held the sensitivities are exact (s: deviation of a turn by those of
-`Track.lost_turns`, a Poisson number, in parts of itself):
+s is the standard deviation of a step's turn, as a fraction of that turn, due to `Track.lost_turns`
+(a Poisson number).
+
+A gyro error turns the field and does not stretch it, so the process noise is tangential to the
+sphere |h| = r.  If it were tangential at the filter's own h, each additive update would lengthen h
+by |step|^2 / 2 r, which looks like an external field trend on every recording.  Therefore n is a
+nominal field instead: the readings, smoothed forwards and backwards in the frame that the
+integrated gyro defines (the carried frame), scaled to constant size, at the middle of the step.
+The filter is then linear, its gains depend on no single innovation, and with the gains fixed the
+sensitivities are exact:
 
     T = F H+ - dt [h-]x Jl W_k,   X_k = A T + D_k,   H+ = T - K X_k
 
-Whitened by S = L L^T: under the null L^-1 e = L^-1 X dtheta + white of variance 1.
+Whitening uses S = L L^T: under the null model L^-1 e = L^-1 X dtheta + white noise of variance 1.
 
-These are the derivatives of the innovations, which a descent needs.  To regress on (`regressing`)
-they will not do: turns and foretold fields hold the noise of the gyro that the innovations are made
-of (errors in variables), and of 5 mrad/s beside .1 mG that made a field that turns with the heading
-of 440 nats in nothing.  There F, and h- in the calibration's columns, are of the smoothed rate.
+These are the derivatives of the innovations, as a descent needs them.  They are not suitable as
+regressors: turns and predicted fields contain the same gyro noise as the innovations (errors in
+variables).  With a gyro noise of 5 mrad/s and a magnetometer noise of 0.1 mG, a spurious field by
+heading gained 440 nats.  `filtered_for_regression` therefore computes F, and h- in the
+calibration's columns, from the smoothed rate.
 
-A run's first row starts the field from its reading (`used` is false there): h+ = A^-1 (m - b).
-Where that row has no reading the field starts from the nominal one, unsure by half of its size: the
-first reading decides.
+The first row of a run initialises the field from its reading (`used` is false there):
+h+ = A^-1 (m - b).  If that row has no reading, the field starts from the nominal field with a
+standard deviation of half its size, so that the first reading decides.
 
-Columns pass the filter next to each other, many at once (`batches`, `joined`), zeros on no side.
+Columns pass the filter in batches (`batch_columns`, `join_columns`); a batch holds only columns
+that act on the same sensors, so that no zeros are filtered.
 """
 
 from __future__ import annotations
@@ -43,31 +48,31 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.innovation_filter.parallel_scan import (
     Gains,
     Layout,
-    Linear,
+    LinearModel,
     Recursion,
-    gains,
+    kalman_gains,
     layout_of,
     products_before,
 )
 from ahrsd.diagnosis.model import Columns, NullModel
-from ahrsd.diagnosis.time_series import both_ways
+from ahrsd.diagnosis.time_series import two_sided_sums
 from ahrsd.diagnosis.track import Track
 from ahrsd.estimator.locked import TRACELESS
 from ahrsd.samples import Array
 
-#: gauss; what is left of the nearest reading where it is many hundred rows away: squares of smaller
-#: numbers are none
-_OUT_OF_REACH = 1e-100
+#: gauss; below this the nearest reading, many hundred rows away, has no weight left: squares of
+#: smaller numbers underflow
+_NEGLIGIBLE_GAUSS = 1e-100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Filtered:
-    """A track as the filter saw it; rows as in the track.
+    """Result of one filter run over a track; rows as in the track.
 
     innovation:   (N, 3) gauss, 0 where not `used`;  whitened: (N, 3), variance 1 under the null
     predicted_b:  (N, 3) gauss, the field before each reading;  field_b: after it
-    nominal_b:    (N, 3) gauss, smoothed both ways, constant in size
-    orientation:  (N, 3, 3) body to a frame that the gyro carries along, I at each run's first row
+    nominal_b:    (N, 3) gauss, smoothed forwards and backwards, of constant size
+    orientation:  (N, 3, 3) body to the carried frame (integrated gyro), I at each run's first row
     used:         (N,) false in each run's first row and where there is no reading
     log_likelihood: (N,) of each innovation
     """
@@ -92,26 +97,28 @@ class Filtered:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bearings:
-    """What a run of the filter says of the motion, before any gain; fields as of `Filtered`."""
+class NominalMotion:
+    """Nominal field and integrated orientation, which need no gains; fields as in `Filtered`."""
 
     model: NullModel
     nominal_b: Array
     orientation: Array
 
 
-def bearings(
+def nominal_motion(
     track: Track,
     model: NullModel,
     terms_mag: Array | None = None,
     terms_gyro: Array | None = None,
-) -> Bearings:
-    """The same as `run_filter` has with these arguments, for a tenth of the time."""
-    motion = _motion(track, model, terms_gyro)
-    layout, opens = _laid_out(track)
-    orientation = _orientation(layout, motion.turn, opens)
-    field = _readings(track, model, terms_mag)
-    return Bearings(model, _nominal(field, orientation, layout, model, motion.dt_s), orientation)
+) -> NominalMotion:
+    """What `run_filter` computes of the motion from the same arguments, in a tenth of the time."""
+    motion = _gyro_motion(track, model, terms_gyro)
+    layout, opens = _layout_and_run_starts(track)
+    orientation = _integrate_turns(layout, motion.turn, opens)
+    field = _calibrated_readings(track, model, terms_mag)
+    return NominalMotion(
+        model, _nominal_field(field, orientation, layout, model, motion.dt_s), orientation
+    )
 
 
 def run_filter(
@@ -120,58 +127,62 @@ def run_filter(
     terms_mag: Array | None = None,
     terms_gyro: Array | None = None,
     *,
-    held: Filtered | None = None,
-    sensitive: bool = True,
+    gains_from: Filtered | None = None,
+    with_sensitivities: bool = True,
 ) -> Filtered:
-    """Filter a track.  terms_*: (N, 3) contributions of the named terms, subtracted first.
+    """Run the filter over a track.  terms_*: (N, 3) contributions of effects, subtracted first.
 
-    held: take gains and nominal field of this earlier run (same track), not the model's own
-    sensitive: false where only innovations are wanted, not what `sensitivities` needs
-    Rows whose reading is not finite are passed over.  ValueError where a run has no rows,
-    LinAlgError where the model is so far off that its innovations have no finite size.
+    gains_from: use gains and nominal field of this earlier run over the same track
+    with_sensitivities: false where only innovations are needed, and no `sensitivities`
+    Rows whose reading is not finite have no update.
+    Raises ValueError where a run has no rows, LinAlgError where the model is so far off that its
+    innovations are not finite.
     """
-    field, motion = _readings(track, model, terms_mag), _motion(track, model, terms_gyro)
-    layout, opens = _laid_out(track)
-    blind, orientation = ~_complete(field), _orientation(layout, motion.turn, opens)
-    if held is None:
-        nominal = _nominal(field, orientation, layout, model, motion.dt_s)
-        linear = _linear(model, motion, nominal, opens, blind)
+    field, motion = (
+        _calibrated_readings(track, model, terms_mag),
+        _gyro_motion(track, model, terms_gyro),
+    )
+    layout, opens = _layout_and_run_starts(track)
+    blind, orientation = ~_has_reading(field), _integrate_turns(layout, motion.turn, opens)
+    if gains_from is None:
+        nominal = _nominal_field(field, orientation, layout, model, motion.dt_s)
+        linear = _linear_model(model, motion, nominal, opens, blind)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            found = gains(linear, _runs(track))
+            filter_gains = kalman_gains(linear, _runs(track))
     else:
-        nominal, found = held.nominal_b, held.gains
-    guessed = opens & blind
-    found.gain[guessed] = 0.0
-    field = np.where(guessed[:, None], nominal, field)
+        nominal, filter_gains = gains_from.nominal_b, gains_from.gains
+    from_nominal = opens & blind
+    filter_gains.gain[from_nominal] = 0.0
+    field = np.where(from_nominal[:, None], nominal, field)
     state, used = _transition(motion, nominal, opens, model), ~(opens | blind)
-    readings = np.where((blind & ~guessed)[:, None], 0, field)
-    predicted = _predicted(layout, state, found, model.soft_iron, readings)
+    readings = np.where((blind & ~from_nominal)[:, None], 0, field)
+    predicted = _predicted_fields(layout, state, filter_gains, model.soft_iron, readings)
     innovation = np.where(used[:, None], (field - predicted) @ model.soft_iron, 0.0)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        root = _inverse_root(found.innovation_covariance)
+        root = _inverse_root(filter_gains.innovation_covariance)
     if not np.isfinite(root).all():
         raise np.linalg.LinAlgError("innovations of no finite size: the model is far off")
     root = root * used[:, None, None]
     whitened = np.einsum("nij,nj->ni", root, innovation)
-    needed = (layout, state, found, model.soft_iron, root, motion, predicted)
+    recursion_inputs = (layout, state, filter_gains, model.soft_iron, root, motion, predicted)
     return Filtered(
         track=track,
         model=model,
         innovation=innovation,
         whitened=whitened,
         predicted_b=predicted,
-        field_b=predicted + np.einsum("nij,nj->ni", found.gain[:, :3], innovation),
+        field_b=predicted + np.einsum("nij,nj->ni", filter_gains.gain[:, :3], innovation),
         nominal_b=nominal,
         orientation=orientation,
         used=used,
         log_likelihood=np.where(used, _log_likelihood(whitened, root), 0.0),
-        gains=found,
-        recursion=_sensitivity(*needed) if sensitive else None,
+        gains=filter_gains,
+        recursion=_sensitivity_recursion(*recursion_inputs) if with_sensitivities else None,
     )
 
 
-def _laid_out(track: Track) -> tuple[Layout, NDArray[np.bool]]:
-    """The track's runs as the filter passes them, and (N,) the rows with which a run opens."""
+def _layout_and_run_starts(track: Track) -> tuple[Layout, NDArray[np.bool]]:
+    """Block layout of the track's runs, and (N,) whether a row is the first of its run."""
     layout = layout_of(_runs(track))
     opens = np.zeros(len(track), dtype=bool)
     opens[layout.starts[layout.opens]] = True
@@ -183,7 +194,7 @@ def _runs(track: Track) -> tuple[slice, ...]:
 
 
 def _log_likelihood(whitened: Array, root: Array) -> Array:
-    """Per row; whatever where root (N, 3, 3) is zero."""
+    """(N,) log likelihood of each innovation; undefined where root (N, 3, 3) is zero."""
     likelihood = -0.5 * np.sum(whitened**2, axis=1) - 1.5 * np.log(2 * np.pi)
     with np.errstate(divide="ignore"):
         likelihood += np.sum(np.log(np.diagonal(root, axis1=1, axis2=2)), axis=1)
@@ -191,53 +202,53 @@ def _log_likelihood(whitened: Array, root: Array) -> Array:
 
 
 def sensitivities(filtered: Filtered, columns: Columns) -> Array:
-    """Whitened regressors (N, 3, p): e~(theta) = e~ - X dtheta to first order, gain held.
+    """Whitened regressors (N, 3, p): e~(theta) = e~ - X dtheta to first order, gains fixed.
 
-    ValueError where the columns are empty on both sides, or the run was not `sensitive`.
+    ValueError where the columns are empty for both sensors, or the run has no sensitivities.
     """
     if filtered.recursion is None:
         raise ValueError("this run of the filter was made without sensitivities")
     return filtered.recursion.run(columns.gyro, columns.mag)
 
 
-def regressing(filtered: Filtered, rate_b_rad_s: Array) -> Filtered:
-    """The run with sensitivities and foretold fields that hold no noise of the gyro.
+def filtered_for_regression(filtered: Filtered, rate_b_rad_s: Array) -> Filtered:
+    """The run with sensitivities and predicted fields that contain no gyro noise.
 
     rate_b_rad_s: (N, 3) without bias and without that noise
-    ValueError where the run was not `sensitive`.
+    ValueError where the run has no sensitivities.
     """
     if filtered.recursion is None:
         raise ValueError("this run of the filter was made without sensitivities")
-    turn = _turn(filtered.track, rate_b_rad_s)
-    seen = filtered.model.soft_iron @ turn
+    turn = _turn_matrices(filtered.track, rate_b_rad_s)
+    observed = filtered.model.soft_iron @ turn
     size, matrix = filtered.recursion.states, filtered.recursion.matrix.copy()
-    root = matrix[:, :3, size + 3 :]  # what a field on the reading is whitened by
-    matrix[:, :3, :3] = root @ seen
-    matrix[:, 3:, :3] = -filtered.gains.gain @ seen
+    root = matrix[:, :3, size + 3 :]  # the whitening matrix
+    matrix[:, :3, :3] = root @ observed
+    matrix[:, 3:, :3] = -filtered.gains.gain @ observed
     matrix[:, 3:6, :3] += turn
     return replace(
         filtered,
-        predicted_b=foretold(filtered, rate_b_rad_s),
+        predicted_b=predicted_field(filtered, rate_b_rad_s),
         recursion=Recursion(filtered.recursion.layout, matrix),
     )
 
 
-def foretold(filtered: Filtered, rate_b_rad_s: Array) -> Array:
-    """(N, 3) gauss, the field behind the row before, turned on by these rates (N, 3)."""
+def predicted_field(filtered: Filtered, rate_b_rad_s: Array) -> Array:
+    """(N, 3) gauss, the previous row's updated field, turned by these rates (N, 3)."""
     before = np.roll(filtered.field_b, 1, axis=0)
-    turned = np.einsum("nij,nj->ni", _turn(filtered.track, rate_b_rad_s), before)
+    turned = np.einsum("nij,nj->ni", _turn_matrices(filtered.track, rate_b_rad_s), before)
     return np.where(filtered.used[:, None], turned, filtered.predicted_b)
 
 
-def _turn(track: Track, rate_b_rad_s: Array) -> Array:
-    """(N, 3, 3) Exp(-w dt), 0 in the rows with which runs open."""
+def _turn_matrices(track: Track, rate_b_rad_s: Array) -> Array:
+    """(N, 3, 3) Exp(-w dt), 0 in the first row of each run."""
     turn = so3.exp(-rate_b_rad_s * np.nan_to_num(track.dt_s, nan=0.0)[:, None])
-    turn[_laid_out(track)[1]] = 0.0
+    turn[_layout_and_run_starts(track)[1]] = 0.0
     return turn
 
 
 def nuisance_columns(filtered: Filtered) -> Columns:
-    """The calibration's own 11 columns: soft iron (TRACELESS), hard iron, gyro bias."""
+    """The 11 columns of the calibration: soft iron (TRACELESS), hard iron, gyro bias."""
     count = len(filtered.track)
     mag, gyro = np.zeros((count, 3, 11)), np.zeros((count, 3, 11))
     mag[:, :, :5] = np.einsum("aij,nj->nia", TRACELESS, filtered.predicted_b)
@@ -250,7 +261,8 @@ def nuisance_columns(filtered: Filtered) -> Columns:
 class _Motion:
     """dt_s (N,), 0 where unknown; turn Exp(-w dt) and lever Jl(-w dt) dt, (N, 3, 3).
 
-    off_rad (N, 3): deviation of the turn, along itself, where turns were lost; None where none were
+    off_rad (N, 3): standard deviation of the turn, along the turn itself, where turns were lost;
+    None where none were
     """
 
     dt_s: Array
@@ -259,13 +271,13 @@ class _Motion:
     off_rad: Array | None = None
 
 
-def _readings(track: Track, model: NullModel, terms: Array | None) -> Array:
-    """C (m - b - terms), (N, 3)."""
+def _calibrated_readings(track: Track, model: NullModel, terms: Array | None) -> Array:
+    """C (m - b - terms), (N, 3), with C = A^-1."""
     mag = track.mag_b_gauss if terms is None else track.mag_b_gauss - terms
     return np.asarray((mag - model.hard_iron_gauss) @ np.linalg.inv(model.soft_iron))
 
 
-def _motion(track: Track, model: NullModel, terms: Array | None) -> _Motion:
+def _gyro_motion(track: Track, model: NullModel, terms: Array | None) -> _Motion:
     rate = track.gyro_b_rad_s - model.gyro_bias_rad_s
     if terms is not None:
         rate = rate - terms
@@ -276,15 +288,15 @@ def _motion(track: Track, model: NullModel, terms: Array | None) -> _Motion:
     return _Motion(dt, turn, left * dt[:, None, None], off)
 
 
-def carried_along(track: Track, rate_b_rad_s: Array) -> Array:
-    """(N, 3, 3) body to the frame that these rates carry along, I at each run's first row."""
+def carried_orientation(track: Track, rate_b_rad_s: Array) -> Array:
+    """(N, 3, 3) body to the frame carried along by these rates, I at each run's first row."""
     turn = so3.exp(-rate_b_rad_s * np.nan_to_num(track.dt_s, nan=0.0)[:, None])
-    layout, opens = _laid_out(track)
-    return _orientation(layout, turn, opens)
+    layout, opens = _layout_and_run_starts(track)
+    return _integrate_turns(layout, turn, opens)
 
 
-def _orientation(layout: Layout, turn: Array, opens: NDArray[np.bool]) -> Array:
-    """(N, 3, 3) body to the frame that the gyro carries along: all turns since a run began."""
+def _integrate_turns(layout: Layout, turn: Array, opens: NDArray[np.bool]) -> Array:
+    """(N, 3, 3) body to carried frame: the product of all turns since the run began."""
     turned = np.where(opens[:, None, None], np.eye(3), turn)
     before, total = products_before(layout, turned)
     start = np.empty_like(total)
@@ -296,14 +308,14 @@ def _orientation(layout: Layout, turn: Array, opens: NDArray[np.bool]) -> Array:
     return np.swapaxes(turned @ before @ np.repeat(start, lengths, axis=0), 1, 2)
 
 
-def _nominal(
+def _nominal_field(
     field: Array, orientation: Array, layout: Layout, model: NullModel, dt_s: Array
 ) -> Array:
-    """The field smoothed by exp(-|k| / memory) in the carried frame, of the runs' median size.
+    """Readings smoothed by exp(-|k| / memory) in the carried frame, scaled to their median size.
 
-    Where the nearest reading is too far away for that, a straight line between readings.
+    Rows too far from any reading for that take a straight line between the nearest readings.
     """
-    seen = _complete(field)
+    seen = _has_reading(field)
     carried = np.einsum("nij,nj->ni", orientation, np.where(seen[:, None], field, 0.0))
     size = float(np.median(np.linalg.norm(field[seen], axis=1))) if np.any(seen) else 1.0
     step = model.sigma_gyro_rad_s * float(np.median(dt_s)) * size / model.sigma_mag_gauss
@@ -311,9 +323,9 @@ def _nominal(
     out = np.empty_like(carried)
     firsts = layout.starts[layout.opens]
     for first, last in zip(firsts, [*firsts[1:], len(field)], strict=True):
-        out[first:last] = both_ways(carried[first:last], 1.0 - forget)
+        out[first:last] = two_sided_sums(carried[first:last], 1.0 - forget)
         near = np.flatnonzero(seen[first:last])
-        far = np.flatnonzero(np.max(np.abs(out[first:last]), axis=1) < _OUT_OF_REACH)
+        far = np.flatnonzero(np.max(np.abs(out[first:last]), axis=1) < _NEGLIGIBLE_GAUSS)
         if len(near) and len(far):
             between = [np.interp(far, near, axis) for axis in carried[first + near].T]
             out[first + far] = np.column_stack(between)
@@ -321,35 +333,35 @@ def _nominal(
     return np.asarray(np.einsum("nji,nj->ni", orientation, out))
 
 
-def _complete(field: Array) -> NDArray[np.bool]:
+def _has_reading(field: Array) -> NDArray[np.bool]:
     return np.asarray(np.isfinite(field).all(axis=1), dtype=np.bool)
 
 
-def _lever(motion: _Motion, field_b: Array) -> Array:
-    """-[h]x Jl dt, (N, 3, 3): how the predicted field moves with the gyro's reading error."""
+def _field_per_rate_error(motion: _Motion, field_b: Array) -> Array:
+    """-[h]x Jl dt, (N, 3, 3): derivative of the predicted field by the gyro's error."""
     return np.asarray(-so3.skew(field_b) @ motion.lever)
 
 
 def _transition(
     motion: _Motion, nominal: Array, opens: NDArray[np.bool], model: NullModel
 ) -> Array:
-    """(N, s, s): s is 6 with a wandering gyro bias, else 3."""
+    """(N, s, s): s is 6 with a random walk of the gyro bias, else 3."""
     turn = np.where(opens[:, None, None], 0.0, motion.turn)
     if model.gyro_walk_rad_s_sqrt_s == 0.0:
         return turn
     out = np.tile(np.eye(6), (len(turn), 1, 1))
     out[:, :3, :3] = turn
-    out[:, :3, 3:] = _lever(motion, nominal)
+    out[:, :3, 3:] = _field_per_rate_error(motion, nominal)
     return out
 
 
-def _linear(
+def _linear_model(
     model: NullModel,
     motion: _Motion,
     nominal: Array,
     opens: NDArray[np.bool],
     blind: NDArray[np.bool],
-) -> Linear:
+) -> LinearModel:
     transition = _transition(motion, nominal, opens, model)
     before = np.einsum("nij,nj->ni", motion.turn, np.roll(nominal, 1, axis=0))
     middle = nominal + np.where(opens[:, None], nominal, before)
@@ -365,17 +377,21 @@ def _linear(
         process[:, [3, 4, 5], [3, 4, 5]] = model.gyro_walk_rad_s_sqrt_s**2 * motion.dt_s[:, None]
     C = np.linalg.inv(model.soft_iron)
     process[opens, :3, :3] = model.sigma_mag_gauss**2 * C @ C.T
-    lost = opens & blind
-    process[lost, :3, :3] = np.eye(3) * (priors.UNSEEN_FIELD * size[lost, :, None]) ** 2
-    return Linear(transition, process, model.soft_iron, model.sigma_mag_gauss**2, opens, blind)
+    unread_start = opens & blind
+    process[unread_start, :3, :3] = (
+        np.eye(3) * (priors.UNSEEN_FIELD * size[unread_start, :, None]) ** 2
+    )
+    return LinearModel(transition, process, model.soft_iron, model.sigma_mag_gauss**2, opens, blind)
 
 
-def _predicted(layout: Layout, state: Array, found: Gains, A: Array, field: Array) -> Array:
+def _predicted_fields(
+    layout: Layout, state: Array, filter_gains: Gains, A: Array, field: Array
+) -> Array:
     """Predicted fields (N, 3); in a run's first row the reading itself."""
     size = state.shape[-1]
     opens = layout.starts[layout.opens]
-    gain = (found.gain.reshape(-1, 3) @ A).reshape(found.gain.shape)
-    gain[opens, :3] = np.eye(3)  # whatever soft iron the gains were made for
+    gain = (filter_gains.gain.reshape(-1, 3) @ A).reshape(filter_gains.gain.shape)
+    gain[opens, :3] = np.eye(3)  # independent of the soft iron that the gains were made for
     matrix = np.zeros((len(state), 3 + size, size + 6))
     matrix[:, :3, :size] = state[:, :3]
     matrix[:, 3:, :size] = state - gain @ state[:, :3]
@@ -385,10 +401,10 @@ def _predicted(layout: Layout, state: Array, found: Gains, A: Array, field: Arra
     return predicted
 
 
-def _sensitivity(
+def _sensitivity_recursion(
     layout: Layout,
     state: Array,
-    found: Gains,
+    filter_gains: Gains,
     A: Array,
     root: Array,
     motion: _Motion,
@@ -398,10 +414,10 @@ def _sensitivity(
     size = state.shape[-1]
     driven = np.zeros((len(state), size, size + 6))
     driven[:, :, :size] = state
-    driven[:, :3, size : size + 3] = _lever(motion, predicted)
-    seen = A @ driven[:, :3]
-    seen[:, :, size + 3 :] += np.eye(3)
-    matrix = np.concatenate([root @ seen, driven - found.gain @ seen], axis=1)
+    driven[:, :3, size : size + 3] = _field_per_rate_error(motion, predicted)
+    observed = A @ driven[:, :3]
+    observed[:, :, size + 3 :] += np.eye(3)
+    matrix = np.concatenate([root @ observed, driven - filter_gains.gain @ observed], axis=1)
     return Recursion(layout, matrix)
 
 
@@ -420,8 +436,8 @@ def _inverse_root(S: Array) -> Array:
     return out
 
 
-def batches(columns: Sequence[Columns], most: int) -> list[list[int]]:
-    """Numbers of the columns, those of one side together, no more than `most` wide if possible."""
+def batch_columns(columns: Sequence[Columns], most: int) -> list[list[int]]:
+    """Indices of the columns, batched by sensor, at most `most` wide where possible."""
     out: list[list[int]] = []
     sides = [(part.mag is None, part.gyro is None) for part in columns]
     for side in dict.fromkeys(sides):
@@ -436,8 +452,8 @@ def batches(columns: Sequence[Columns], most: int) -> list[list[int]]:
     return out
 
 
-def joined(parts: Sequence[Columns]) -> Columns:
-    """Columns of one batch next to each other."""
+def join_columns(parts: Sequence[Columns]) -> Columns:
+    """The columns of one batch side by side."""
     if len(parts) == 1:
         return parts[0]
     mag = [part.mag for part in parts if part.mag is not None]

@@ -1,30 +1,30 @@
-"""Linear recursions and Kalman gains over all samples in blocks that advance together, exactly.
+"""Linear recursions and Kalman gains over all samples, exact, in blocks that advance in parallel.
 
     x_k = S_k x_(k-1) + U_k z_k          S (s, s) per sample, x (s, p): one column per parameter
 
-A Python loop over N samples is slow, numpy over N / n blocks is not: each block of n ~ sqrt(N)
-consecutive samples starts from zero, all blocks take their j-th step together, and since the
-recursion is linear the states at the block boundaries are chained afterwards and their effect is
-added with the product of the S before each sample.
+A Python loop over N samples is slow; numpy over N / n blocks is not.  Each block of n ~ sqrt(N)
+consecutive samples starts from zero, and all blocks take their j-th step together.  As the
+recursion is linear, the states at the block boundaries are chained afterwards, and the product of
+the S before each sample adds their effect.
 `tests/diagnosis/innovation_filter/test_innovation.py` compares with the plain loop.
 
-Kalman gains of a linear model (`gains`):
+Kalman gains of a linear model (`kalman_gains`):
 
     P-_k = S_k P_(k-1) S_k^T + Q_k,   S = H P- H^T + R,   K = P- H^T S^-1,   P_k = P- - K S K^T
 
-with H = [A 0] and R = sigma^2 I.  A block's whole effect on the covariance is the triple (T, C, J)
-of p(x_end | x_start) ~ N(T x_start, C) and of the information J that its readings hold on x_start
-(Sarkka & Garcia-Fernandez, IEEE TAC 66(1), 2021, eq. 10-14): the filter from P = 0 gives it, and
+with H = [A 0] and R = sigma^2 I.  The effect of a block on the covariance is a triple (T, C, J):
+p(x_end | x_start) ~ N(T x_start, C), and J is the information that its readings hold on x_start
+(Sarkka & Garcia-Fernandez, IEEE TAC 66(1), 2021, eq. 10-14).  The filter from P = 0 gives it, and
 
     P_end = T P (I + J P)^-1 T^T + C
 
-chains the blocks, and one such triple behind another is a triple again:
+chains the blocks.  Two successive triples combine to a triple:
 
     T = Tj (I + Ci Jj)^-1 Ti
     C = Tj (I + Ci Jj)^-1 Ci Tj^T + Cj
     J = Ti^T (I + Jj Ci)^-1 Jj Ti + Ji
 
-A second pass from the true starts gives every gain.
+A second pass from the true starting covariances gives every gain.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from scipy.linalg.lapack import dtbtrs
 
 from ahrsd.samples import Array
 
-#: columns up to which one triangular system with a band is quicker than the blocks
+#: columns up to which one banded triangular system is faster than the blocks
 NARROW = 12
 #: rows of a block: a step costs nearly the same for hundreds of blocks as for a few
 STEPS = 24
@@ -47,8 +47,8 @@ STEPS = 24
 class Layout:
     """B blocks of consecutive samples, none of which spans two runs; n is the longest.
 
-    starts, ends: (B,) first row and row behind the last
-    opens:        (B,) whether the block is its run's first
+    starts, ends: (B,) first row and one behind the last
+    opens:        (B,) whether the block is the first of its run
     rows:         (n, B) row of each block's j-th step; N (behind the end) where it has none
     """
 
@@ -57,9 +57,9 @@ class Layout:
     opens: NDArray[np.bool]
     rows: NDArray[np.intp]
 
-    def padded(self, values: Array, rest: Array | float) -> Array:
-        """(n, B, ...) of (N, ...): step by step; `rest` where a block has ended."""
-        tail = np.broadcast_to(np.asarray(rest, np.float64), values.shape[1:])
+    def padded(self, values: Array, fill: Array | float) -> Array:
+        """(n, B, ...) of (N, ...), step by step; `fill` where a block has ended."""
+        tail = np.broadcast_to(np.asarray(fill, np.float64), values.shape[1:])
         return np.asarray(np.concatenate([values, tail[None]])[self.rows])
 
     def unpadded(self, values: Array) -> Array:
@@ -71,9 +71,9 @@ class Layout:
 
 
 def layout_of(runs: tuple[slice, ...], longest: int | None = None) -> Layout:
-    """Blocks of nearly equal length in every run, about as many as there are steps in one.
+    """Blocks of nearly equal length in every run, about as many as a block has steps.
 
-    longest: rows of a block at most, where not as many
+    longest: most rows of a block, if given
     """
     count = sum(run.stop - run.start for run in runs)
     longest = longest or max(16, round(np.sqrt(count)))
@@ -109,8 +109,8 @@ def products_before(layout: Layout, steps: Array) -> tuple[Array, Array]:
 class Recursion:
     """x_k = S_k x_(k-1) + U_k z_k from x = 0, with outputs y_k = Y_k x_(k-1) + V_k z_k.
 
-    matrix: (N, 3 + s, s + z) the rows [Y V; S U]; z is 6: what is driven by gyro (3), mag (3)
-    made:   what was built from it, once
+    matrix: (N, 3 + s, s + z) the rows [Y V; S U]; z is 6: inputs of gyro (3) and mag (3)
+    made:   cache of what was built from it
     """
 
     layout: Layout
@@ -119,7 +119,7 @@ class Recursion:
 
     @property
     def states(self) -> int:
-        """s."""
+        """Number of states, s."""
         return int(self.matrix.shape[-1]) - 6
 
     def run(self, gyro: Array | None, mag: Array | None) -> Array:
@@ -128,11 +128,11 @@ class Recursion:
         if given is None:
             raise ValueError("a recursion needs an input")
         if given.shape[2] <= NARROW:
-            return self._banded(gyro, mag)
-        return self._stepped(gyro, mag, given.shape[2])
+            return self._run_banded(gyro, mag)
+        return self._run_blocks(gyro, mag, given.shape[2])
 
-    def _banded(self, gyro: Array | None, mag: Array | None) -> Array:
-        """Few columns: the states of all rows solve a triangular system with a band."""
+    def _run_banded(self, gyro: Array | None, mag: Array | None) -> Array:
+        """For few columns: the states of all rows solve one banded triangular system."""
         s = self.states
         first, last = s + 3 * (gyro is None), s + 6 - 3 * (mag is None)
         inputs = np.concatenate([part for part in (gyro, mag) if part is not None], axis=1)
@@ -144,7 +144,7 @@ class Recursion:
         return out
 
     def _band(self) -> Array:
-        """(2 s, N s) subdiagonals of what maps the states to what drives them, I - S one down."""
+        """(2 s, N s) subdiagonals of the matrix that maps the states to their inputs."""
         if "band" not in self.made:
             s, count = self.states, len(self.matrix)
             band = np.zeros((2 * s, count, s))
@@ -153,15 +153,15 @@ class Recursion:
             self.made["band"] = band.reshape(2 * s, -1)
         return self.made["band"]
 
-    def _stepped(self, gyro: Array | None, mag: Array | None, p: int) -> Array:
-        """Many columns, p: all blocks from zero, and then what their true starts add."""
+    def _run_blocks(self, gyro: Array | None, mag: Array | None, p: int) -> Array:
+        """For many columns, p: all blocks from zero, then the effect of their true starts."""
         count, s, rows = len(self.matrix), self.states, self.layout.rows
-        steps = self._padded(gyro is not None, mag is not None)
+        steps = self._padded_steps(gyro is not None, mag is not None)
         width = steps.shape[-1]
         out = np.empty((count + 1, 3, p))
         work = np.zeros((rows.shape[1], width, p))
         for row, step in zip(rows, steps, strict=True):
-            at = np.minimum(row, count - 1)  # what stands behind a block's end is not looked at
+            at = np.minimum(row, count - 1)  # values behind a block's end are not used
             if gyro is not None:
                 work[:, s : s + 3] = gyro[at]
             if mag is not None:
@@ -169,23 +169,23 @@ class Recursion:
             done = step @ work
             out[row] = done[:, :3]
             work[:, :s] = done[:, 3:]
-        self._chain(out[:-1], work[:, :s])
+        self._add_block_starts(out[:-1], work[:, :s])
         return out[:-1]
 
-    def _padded(self, gyro: bool, mag: bool) -> Array:
-        """(n, B, 3 + s, s + 3 or 6) the matrix step by step, its columns of the inputs given."""
+    def _padded_steps(self, gyro: bool, mag: bool) -> Array:
+        """(n, B, 3 + s, s + 3 or 6) the matrix step by step, columns of the given inputs."""
         key = f"steps{' gyro' * gyro}{' mag' * mag}"
         if key not in self.made:
             s = self.states
             columns = [*range(s), *[*range(s, s + 3)] * gyro, *[*range(s + 3, s + 6)] * mag]
-            rest = np.zeros(self.matrix.shape[1:])
-            rest[3:, :s] = np.eye(s)
-            kept = self.layout.padded(self.matrix, rest)[:, :, :, columns]
-            self.made[key] = np.ascontiguousarray(kept)
+            fill = np.zeros(self.matrix.shape[1:])
+            fill[3:, :s] = np.eye(s)
+            selected = self.layout.padded(self.matrix, fill)[:, :, :, columns]
+            self.made[key] = np.ascontiguousarray(selected)
         return self.made[key]
 
-    def _chain(self, out: Array, ends: Array) -> None:
-        """Add what each block's true starting state contributes, in place."""
+    def _add_block_starts(self, out: Array, ends: Array) -> None:
+        """Add the contribution of each block's true starting state, in place."""
         if "reach" not in self.made:
             s = self.states
             before, self.made["total"] = products_before(self.layout, self.matrix[:, 3:, :s])
@@ -200,13 +200,13 @@ class Recursion:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Linear:
-    """The model of every sample.
+class LinearModel:
+    """The state-space model of every sample.
 
-    transition: (N, s, s); of a run's first row it drops what that row knows anew
-    process:    (N, s, s); of a run's first row the covariance that its reading leaves
+    transition: (N, s, s); in a run's first row it drops the states that this row initialises
+    process:    (N, s, s); in a run's first row the covariance after its reading
     soft_iron:  A (3, 3);  variance: sigma_mag^2
-    opens:      (N,) a run's first row: the state is taken from the reading
+    opens:      (N,) first row of a run: the state is taken from the reading
     blind:      (N,) no reading in this row
     """
 
@@ -220,16 +220,16 @@ class Linear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gains:
-    """gain K (N, s, 3); innovation_covariance (N, 3, 3); covariance behind each row is not kept."""
+    """gain K (N, s, 3); innovation_covariance (N, 3, 3); the state's covariance is not kept."""
 
     gain: Array
     innovation_covariance: Array
 
 
-def gains(model: Linear, runs: tuple[slice, ...]) -> Gains:
+def kalman_gains(model: LinearModel, runs: tuple[slice, ...]) -> Gains:
     """Gains of all rows of the gap-free runs."""
     sweep = _Sweep(model, layout_of(runs, STEPS))
-    starts = _starts(*sweep.element())
+    starts = _start_covariances(*sweep.element())
     gain, S = sweep.filter(starts)
     gain[model.blind] = 0.0
     gain[model.opens, :3] = np.linalg.inv(model.soft_iron)
@@ -237,10 +237,10 @@ def gains(model: Linear, runs: tuple[slice, ...]) -> Gains:
     return Gains(gain, S)
 
 
-def _starts(T: Array, C: Array, J: Array) -> Array:
+def _start_covariances(T: Array, C: Array, J: Array) -> Array:
     """Covariance at the start of each block (s, s, B); the first block opens a run.
 
-    Blocks are chained by twos, fours, ...: from the first to each of them all in log2(B) rounds.
+    Prefix combination in log2(B) rounds: blocks are combined by twos, fours, and so on.
     """
     size, _, count = C.shape
     identity = np.eye(size)[:, :, None]
@@ -249,16 +249,16 @@ def _starts(T: Array, C: Array, J: Array) -> Array:
         before, after = (slice(None, -reach), slice(reach, None))
         Ti, Ci, Ji = (part[:, :, before] for part in (T, C, J))
         Tj, Cj, Jj = (part[:, :, after] for part in (T, C, J))
-        through = _solved(
-            identity + _times(Jj, Ci), np.concatenate([_turned(Tj), _times(Jj, Ti)], 1)
+        through = _solve(
+            identity + _product(Jj, Ci), np.concatenate([_transpose(Tj), _product(Jj, Ti)], 1)
         )
-        carried, seen = _turned(through[:, :size]), through[:, size:]
+        carried, seen = _transpose(through[:, :size]), through[:, size:]
         T, C, J = (
             np.concatenate([part[:, :, :reach], chained], axis=2)
             for part, chained in (
-                (T, _times(carried, Ti)),
-                (C, _symmetric(_times(_times(carried, Ci), _turned(Tj)) + Cj)),
-                (J, _symmetric(_times(_turned(Ti), seen) + Ji)),
+                (T, _product(carried, Ti)),
+                (C, _symmetric(_product(_product(carried, Ci), _transpose(Tj)) + Cj)),
+                (J, _symmetric(_product(_transpose(Ti), seen) + Ji)),
             )
         )
         reach *= 2
@@ -266,9 +266,9 @@ def _starts(T: Array, C: Array, J: Array) -> Array:
 
 
 class _Sweep:
-    """All blocks, step by step.  Matrices are (i, j, B): thousands of 3 x 3 are quicker so."""
+    """All blocks, step by step.  Matrices are (i, j, B): faster for thousands of 3 x 3."""
 
-    def __init__(self, model: Linear, layout: Layout) -> None:
+    def __init__(self, model: LinearModel, layout: Layout) -> None:
         self._size = model.transition.shape[-1]
         self._layout = layout
         self._A = model.soft_iron
@@ -278,15 +278,15 @@ class _Sweep:
         self._blind = layout.padded((model.blind | model.opens).astype(float), 1.0) > 0
         self._any_blind = np.any(self._blind, axis=1)
 
-    def _prior(self, j: int, P: Array) -> tuple[Array, Array, Array]:
-        """P-, A P-[:3] as (3, s, B), and S of step j, from P behind step j - 1."""
+    def _predict(self, j: int, P: Array) -> tuple[Array, Array, Array]:
+        """P-, A P-[:3] as (3, s, B), and S of step j, from P after step j - 1."""
         step = self._steps[j]
-        moved = _times(step, P)
+        moved = _product(step, P)
         prior = np.einsum("ikb,jkb->ijb", moved, step) + self._process[j]
-        cross = self._seen(prior)
+        cross = self._observe(prior)
         return prior, cross, np.einsum("ikb,kj->ijb", cross[:, :3], self._A) + self._R
 
-    def _seen(self, states: Array) -> Array:
+    def _observe(self, states: Array) -> Array:
         """A X[:3], (3, s, B)."""
         field = states[:3]
         return np.asarray((self._A @ field.reshape(3, -1)).reshape(field.shape))
@@ -298,10 +298,10 @@ class _Sweep:
         J = np.zeros_like(C)
         T: Array = np.repeat(np.eye(size)[:, :, None], blocks, axis=2)
         for j in range(count):
-            prior, cross, S = self._prior(j, C)
-            moved = _times(self._steps[j], T)
-            seen = self._seen(moved)
-            both = _times(inverse(S), np.concatenate([cross, seen], axis=1))
+            prior, cross, S = self._predict(j, C)
+            moved = _product(self._steps[j], T)
+            seen = self._observe(moved)
+            both = _product(inverse_3x3(S), np.concatenate([cross, seen], axis=1))
             if self._any_blind[j]:
                 both[:, :, self._blind[j]] = 0.0
             back = np.einsum("kib,kjb->ijb", cross, both)
@@ -317,8 +317,8 @@ class _Sweep:
         S = np.empty((count, 3, 3, blocks))
         P = starts
         for j in range(count):
-            prior, cross, S[j] = self._prior(j, P)
-            gain[j] = _times(inverse(S[j]), cross)
+            prior, cross, S[j] = self._predict(j, P)
+            gain[j] = _product(inverse_3x3(S[j]), cross)
             if self._any_blind[j]:
                 gain[j][:, :, self._blind[j]] = 0.0
             P = _symmetric(prior - np.einsum("kib,kjb->ijb", gain[j], cross))
@@ -326,17 +326,17 @@ class _Sweep:
         return unpadded(gain.transpose(0, 3, 2, 1)), unpadded(S.transpose(0, 3, 1, 2))
 
 
-def _times(left: Array, right: Array) -> Array:
+def _product(left: Array, right: Array) -> Array:
     """(i, j, B) products of (i, k, B) and (k, j, B)."""
     return np.asarray(np.einsum("ikb,kjb->ijb", left, right))
 
 
-def _turned(matrices: Array) -> Array:
+def _transpose(matrices: Array) -> Array:
     """(j, i, B) of (i, j, B)."""
     return np.swapaxes(matrices, 0, 1)
 
 
-def _solved(left: Array, right: Array) -> Array:
+def _solve(left: Array, right: Array) -> Array:
     """(s, j, B) left^-1 right of (s, s, B) and (s, j, B)."""
     out = np.linalg.solve(np.moveaxis(left, 2, 0), np.moveaxis(right, 2, 0))
     return np.ascontiguousarray(np.moveaxis(out, 0, 2))
@@ -347,18 +347,21 @@ def _blocks_last(matrices: Array) -> Array:
     return np.ascontiguousarray(np.moveaxis(matrices, -3, -1))
 
 
-#: entries of a 3 x 3 matrix, row by row, whose products make up its cofactors, row by row
-_FIRST = np.array([4, 5, 3, 7, 8, 6, 1, 2, 0]), np.array([8, 6, 7, 2, 0, 1, 5, 3, 4])
-_SECOND = np.array([5, 3, 4, 8, 6, 7, 2, 0, 1]), np.array([7, 8, 6, 1, 2, 0, 4, 5, 3])
+#: indices of the entries of a 3 x 3 matrix whose products, added and subtracted, are its cofactors
+_COFACTOR_PLUS = np.array([4, 5, 3, 7, 8, 6, 1, 2, 0]), np.array([8, 6, 7, 2, 0, 1, 5, 3, 4])
+_COFACTOR_MINUS = np.array([5, 3, 4, 8, 6, 7, 2, 0, 1]), np.array([7, 8, 6, 1, 2, 0, 4, 5, 3])
 
 
-def inverse(S: Array) -> Array:
-    """(3, 3, B) of well-conditioned (3, 3, B), by cofactors: LAPACK is called for each."""
+def inverse_3x3(S: Array) -> Array:
+    """(3, 3, B) inverses by cofactors, for well-conditioned matrices: faster than LAPACK."""
     flat = S.reshape(9, -1)
-    cofactors = flat[_FIRST[0]] * flat[_FIRST[1]] - flat[_SECOND[0]] * flat[_SECOND[1]]
+    cofactors = (
+        flat[_COFACTOR_PLUS[0]] * flat[_COFACTOR_PLUS[1]]
+        - flat[_COFACTOR_MINUS[0]] * flat[_COFACTOR_MINUS[1]]
+    )
     determinant = np.einsum("ib,ib->b", flat[:3], cofactors[:3])
-    return _turned((cofactors / determinant).reshape(S.shape))
+    return _transpose((cofactors / determinant).reshape(S.shape))
 
 
 def _symmetric(P: Array) -> Array:
-    return np.asarray((P + _turned(P)) / 2)
+    return np.asarray((P + _transpose(P)) / 2)

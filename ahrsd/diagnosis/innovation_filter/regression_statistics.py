@@ -1,24 +1,23 @@
 """Statistics of a regression on innovations: tail probabilities, scores, Bayes factors.
 
-Tail probabilities are special functions: importing scipy's statistics costs more time than a short
-recording's search for names.
+The tail probabilities use special functions, because importing scipy.stats takes more time than
+the effect search of a short recording.
 
-A score (`Score`) is that of one group of columns, everything else projected out.  In units of one
-prior deviation per parameter (theta = scale * phi) the projected information is diagonalised, G = V
-diag(l) V^T; directions that one prior deviation would not show (l < 1) are left out, so what is
-said has the degrees of freedom that the motion offers and no others.
+A score (`Score`) is that of one group of columns, all others projected out.  In units of one prior
+deviation per parameter (theta = scale * phi) the projected information is diagonalised, G = V
+diag(l) V^T.  Directions that one prior deviation would not show (l < 1) are left out, so that the
+degrees of freedom are those that the motion makes observable.
 
-A Bayes factor (`log_bayes`) is against the calibration alone.  A group with information l_i and
-score s_i in its observable directions, in prior deviations, and prior N(0, k^2) has
+A Bayes factor (`log_bayes_factor`) is relative to the calibration alone.  A group with information
+l_i and score s_i in its observable directions, in prior deviations, and prior N(0, k^2) has
 
     log BF(k) = 1/2 sum_i s_i^2 / (l_i + k^-2) - 1/2 sum_i log(1 + k^2 l_i)
 
 averaged over the sizes k of `priors.EFFECT_GRID`: how large an effect is on a given vehicle is
 hardly known.  The same field may be a hundredth of a usual coefficient per ampere (the motor draws
-fifty) and a third of one per turn of its shaft; the sizes reach far enough down that neither pays
-for its unit.
-The second sum is the price of a parameter, by which the one-parameter time lag beats nine
-eddy-current coefficients that contain it.
+fifty) and a third of one per turn of its shaft.  The grid reaches far enough down that neither is
+penalised for its unit. The second sum is the Occam penalty of the parameters, by which the
+one-parameter time lag wins over nine eddy-current coefficients that contain it.
 """
 
 from __future__ import annotations
@@ -32,27 +31,27 @@ from scipy import special
 from ahrsd.diagnosis import priors
 from ahrsd.samples import Array
 
-#: Directions with less information than this share of the group's own are dropped: not observable.
+#: directions with less than this share of the group's own information count as not observable
 _RANK_SHARE = 1e-7
 
 
 def chi2_above(value: float, freedom: float) -> float:
-    """Probability that a chi-square of `freedom` is larger."""
+    """Probability that a chi-square of `freedom` exceeds the value."""
     return float(special.chdtrc(freedom, value))
 
 
 def chi2_below(value: float, freedom: float) -> float:
-    """Probability that a chi-square of `freedom` is smaller."""
+    """Probability that a chi-square of `freedom` is below the value."""
     return float(special.chdtr(freedom, value))
 
 
 def kolmogorov_above(value: float) -> float:
-    """Probability that Kolmogorov's distance, times the root of the number, is larger."""
+    """Probability that Kolmogorov's distance times the root of the count exceeds the value."""
     return float(special.kolmogorov(value))
 
 
 def student_quantile(share: float, freedom: float) -> float:
-    """What a Student-t of `freedom` is below with this probability."""
+    """The quantile of a Student-t of `freedom` at probability `share`."""
     return float(special.stdtrit(freedom, share))
 
 
@@ -66,7 +65,7 @@ def student_log_density(values: Array, freedom: float) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Score:
-    """What the data say on one group; r observable directions of its p parameters.
+    """Score of one group of columns; r observable directions of its p parameters.
 
     basis:       (p, r) theta = basis @ z, z in prior deviations
     information: (r,) of z;  score: (r,)
@@ -78,7 +77,7 @@ class Score:
 
     @property
     def rank(self) -> int:
-        """Observable directions."""
+        """Number of observable directions."""
         return len(self.information)
 
     @property
@@ -87,7 +86,7 @@ class Score:
         return np.asarray(self.basis @ (self.score / self.information))
 
 
-def total_score(G: Array, s: Array, information: Array, scale: Array) -> Score:
+def projected_score(G: Array, s: Array, information: Array, scale: Array) -> Score:
     """The score of one group from its projected information (p, p) and score (p,).
 
     information: (p,) before anything was projected out
@@ -100,8 +99,8 @@ def total_score(G: Array, s: Array, information: Array, scale: Array) -> Score:
     return Score(scale[:, None] * V, values[kept], (s * scale) @ V)
 
 
-def solve(G: Array, right: Array) -> Array:
-    """G^+ right for a positive semi-definite G, columns scaled to one unit of information."""
+def solve_semidefinite(G: Array, right: Array) -> Array:
+    """G^+ right for a positive semi-definite G, columns scaled to unit information."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(G), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(G * scale[:, None] * scale)
     kept = values > _RANK_SHARE * 1e-3 * len(values)
@@ -110,7 +109,7 @@ def solve(G: Array, right: Array) -> Array:
     return np.asarray(scale[:, None] * (basis @ inner))
 
 
-def log_bayes(what: Score) -> float:
+def log_bayes_factor(what: Score) -> float:
     """Log Bayes factor of the group against its absence, nats."""
     if what.rank == 0:
         return 0.0
@@ -120,26 +119,28 @@ def log_bayes(what: Score) -> float:
     return float(np.logaddexp.reduce(terms) - np.log(len(priors.EFFECT_GRID)))
 
 
-def posterior(
+def posterior_probabilities(
     log_evidence: Mapping[str, float], log_prior: Mapping[str, float]
 ) -> dict[str, float]:
     """Probabilities of the hypotheses; they sum to 1.  A missing prior is log 1."""
-    names = list(log_evidence)
-    values = np.array([log_evidence[name] + log_prior.get(name, 0.0) for name in names])
+    hypotheses = list(log_evidence)
+    values = np.array(
+        [log_evidence[hypothesis] + log_prior.get(hypothesis, 0.0) for hypothesis in hypotheses]
+    )
     share = np.exp(values - np.max(values, initial=-np.inf))
-    return dict(zip(names, (share / share.sum()).tolist(), strict=True))
+    return dict(zip(hypotheses, (share / share.sum()).tolist(), strict=True))
 
 
-#: peaks of the smoothed spectrum below this are its own scatter
+#: lower peaks of the smoothed spectrum are its own scatter
 CLEAR_PEAK = 1.35
 
 
 def spectral_peak(innovation: Array, rate_hz: float, reach_s: float = 3.0) -> float:
-    """Power of whitened innovations (N, 3) where their spectrum is strongest over white noise's.
+    """Largest power density of whitened innovations (N, 3), relative to white noise.
 
-    Bartlett's spectrum over `reach_s`, averaged over the axes, at least 1: correlated noise of a
-    second or so counts in full, the slow and small traces of an effect near its limit hardly do.
-    The filter takes the slowest noise away, so the peak is seldom at zero frequency.
+    Bartlett's spectrum over `reach_s`, averaged over the axes, at least 1.  Noise correlated over
+    about a second counts in full; the slow and small traces of an effect near its detection limit
+    hardly do. The filter takes the slowest noise away, so the peak is seldom at zero frequency.
     """
     reach = min(max(1, round(reach_s * rate_hz)), len(innovation) // 4)
     size = 1 << (len(innovation) + reach).bit_length()

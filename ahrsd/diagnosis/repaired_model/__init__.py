@@ -1,1 +1,1 @@
-"""The repaired model: as a file, and forward, into and out of readings."""
+"""The repaired model: as a file, and as a forward model that adds or removes effects."""

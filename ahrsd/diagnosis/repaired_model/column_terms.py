@@ -1,6 +1,6 @@
-"""Terms that a column of the vehicle gives by itself, sample by sample: a current's field.
+"""Effects that logged columns alone determine, sample by sample, such as the field of a current.
 
-Apart from the forward model, which a running daemon that takes such terms out does not load.
+Separate from the forward model, so that a daemon that subtracts such effects does not load it.
 """
 
 from __future__ import annotations
@@ -14,31 +14,33 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.model import Term
 from ahrsd.samples import Array
 
-_PROBE = 64
+_PROBE_ROWS = 64
 
 
 def follows_a_column(term: Term) -> bool:
-    """Whether columns alone give the term's effect, each sample by itself.
+    """Whether columns alone determine the effect, each sample by itself.
 
-    Asked of the effect: readings in which everything but time and columns is unknown must give
-    finite numbers, and the same ones in two halves as in one piece.
+    Tested on the effect itself: with all but time and columns unknown its contribution must be
+    finite, and the same in two halves as in one piece.
     """
     name = term.setting.get("covariate")
     if EFFECTS[term.identifier].kind != "mean" or not isinstance(name, str) or name == "accel":
         return False
-    time_s = np.arange(_PROBE, dtype=np.float64)
-    dt_s = np.ones(_PROBE)
-    column = np.random.default_rng(1).normal(20.0, 5.0, _PROBE)
+    time_s = np.arange(_PROBE_ROWS, dtype=np.float64)
+    dt_s = np.ones(_PROBE_ROWS)
+    column = np.random.default_rng(1).normal(20.0, 5.0, _PROBE_ROWS)
     whole, first, second = (
-        added(term, time_s[rows], dt_s[rows], {name: column[rows]})
-        for rows in (slice(None), slice(_PROBE // 2), slice(_PROBE // 2, None))
+        column_contribution(term, time_s[rows], dt_s[rows], {name: column[rows]})
+        for rows in (slice(None), slice(_PROBE_ROWS // 2), slice(_PROBE_ROWS // 2, None))
     )
     joined = np.concatenate([first, second], axis=1)
     return bool(np.isfinite(whole).all() and np.allclose(joined, whole, rtol=1e-9))
 
 
-def added(term: Term, time_s: Array, dt_s: Array, columns: Mapping[str, Array]) -> Array:
-    """(2, N, 3): what the term adds to field and rate; nan where it needs more than columns."""
+def column_contribution(
+    term: Term, time_s: Array, dt_s: Array, columns: Mapping[str, Array]
+) -> Array:
+    """(2, N, 3): what the effect adds to field and rate; nan where it needs more than columns."""
     count, nothing = len(time_s), np.full((len(time_s), 3), np.nan)
     if term.setting["covariate"] not in columns:
         return np.full((2, count, 3), np.nan)
@@ -50,6 +52,6 @@ def added(term: Term, time_s: Array, dt_s: Array, columns: Mapping[str, Array]) 
     )  # fmt: skip
     try:
         made = EFFECTS[term.identifier].simulate(silent, term.value, term.setting)
-    except KeyError:  # a setting that this effect needs is not in the file
+    except KeyError:  # the file lacks a setting that this effect needs
         return np.full((2, count, 3), np.nan)
     return np.stack([made.mag_b_gauss, made.gyro_b_rad_s])

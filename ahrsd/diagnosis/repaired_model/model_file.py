@@ -1,6 +1,6 @@
-"""The repaired model as text: calibration, noise and named terms (schema ahrsd.model/1).
+"""The repaired model as text: calibration, noise and effects (schema ahrsd.model/1).
 
-Reading and writing files is the caller's; this module turns text into values and back.
+The caller reads and writes files; this module converts text to values and back.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ahrsd.diagnosis.answer.diagnosis import Diagnosis
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.model import Noise, NullModel, Term
-from ahrsd.diagnosis.repaired_model.forward import noise_of
+from ahrsd.diagnosis.repaired_model.forward import model_noise
 from ahrsd.samples import Array
 
 SCHEMA = "ahrsd.model/1"
@@ -26,7 +26,7 @@ _LEVELS = ("mag_gauss", "gyro_rad_s", "gyro_walk_rad_s_sqrt_s")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RepairedModel:
-    """What explains a recording: calibration, noise, and what was left out of the calibration."""
+    """What explains a recording: calibration, noise and effects."""
 
     calibration: NullModel
     noise: Noise
@@ -35,7 +35,7 @@ class RepairedModel:
 
 
 def to_text(model: RepairedModel, library: Mapping[str, Effect] = EFFECTS) -> str:
-    """The model as JSON, ready to be written."""
+    """The model as JSON text."""
     calibration = model.calibration
     body = {
         "schema": SCHEMA,
@@ -53,7 +53,7 @@ def to_text(model: RepairedModel, library: Mapping[str, Effect] = EFFECTS) -> st
 
 
 def from_text(text: str, library: Mapping[str, Effect] = EFFECTS) -> RepairedModel:
-    """The model of a file's text.
+    """Parse the text of a model file.
 
     Raises ValueError in one line: no JSON, another schema, a missing key, an unknown effect.
     """
@@ -63,11 +63,11 @@ def from_text(text: str, library: Mapping[str, Effect] = EFFECTS) -> RepairedMod
         raise ValueError(f"is no JSON: {error}") from None
     if not isinstance(body, dict) or body.get("schema") != SCHEMA:
         raise ValueError(f"is no model: its schema must be {SCHEMA!r}")
-    noise = _noise(body)
+    noise = _parse_noise(body)
     calibration = NullModel(
-        soft_iron=_numbers(body, "calibration", "soft_iron", (3, 3)),
-        hard_iron_gauss=_numbers(body, "calibration", "hard_iron_gauss", (3,)),
-        gyro_bias_rad_s=_numbers(body, "calibration", "gyro_bias_rad_s", (3,)),
+        soft_iron=_parse_array(body, "calibration", "soft_iron", (3, 3)),
+        hard_iron_gauss=_parse_array(body, "calibration", "hard_iron_gauss", (3,)),
+        gyro_bias_rad_s=_parse_array(body, "calibration", "gyro_bias_rad_s", (3,)),
         sigma_mag_gauss=noise.mag_gauss,
         sigma_gyro_rad_s=noise.gyro_rad_s,
         gyro_walk_rad_s_sqrt_s=noise.gyro_walk_rad_s_sqrt_s,
@@ -78,33 +78,35 @@ def from_text(text: str, library: Mapping[str, Effect] = EFFECTS) -> RepairedMod
     return RepairedModel(
         calibration,
         noise,
-        tuple(_term(entry, number, library) for number, entry in enumerate(terms)),
+        tuple(_parse_term(entry, number, library) for number, entry in enumerate(terms)),
         str(body.get("recording", "")),
     )
 
 
-def of_diagnosis(found: Diagnosis) -> RepairedModel:
+def repaired_model_of(found: Diagnosis) -> RepairedModel:
     """The repaired model of a diagnosis.  ValueError where it has none."""
     if found.model is None:
         raise ValueError("the diagnosis has no model: the recording could not be fitted")
-    noise = found.noise or noise_of(found.model)
+    noise = found.noise or model_noise(found.model)
     return RepairedModel(found.model, noise, found.terms, found.recording)
 
 
 def _noise_json(noise: Noise) -> dict[str, object]:
-    """Levels and colour; the freedom of heavy tails only where there are any."""
+    """Levels and colour; the freedom of the Student-t only where it is finite."""
     out = {name: getattr(noise, name) for name in (*_LEVELS, "colour")}
     return out | ({"freedom": noise.freedom} if np.isfinite(noise.freedom) else {})
 
 
-def _noise(body: dict[str, Any]) -> Noise:
-    mag, gyro, walk = (_number(body, "noise", name) for name in _LEVELS)
+def _parse_noise(body: dict[str, Any]) -> Noise:
+    mag, gyro, walk = (_parse_number(body, "noise", name) for name in _LEVELS)
     colour = body["noise"].get("colour")
     if not isinstance(colour, list):
         raise ValueError("noise.colour must be a list of numbers")
     by_row = {str(k): value for k, value in enumerate(colour)}
-    taps = tuple(_finite(by_row, key, "noise.colour") for key in by_row)
-    freedom = _number(body, "noise", "freedom") if "freedom" in body["noise"] else float("inf")
+    taps = tuple(_finite_number(by_row, key, "noise.colour") for key in by_row)
+    freedom = (
+        _parse_number(body, "noise", "freedom") if "freedom" in body["noise"] else float("inf")
+    )
     if freedom <= _LEAST_FREEDOM:
         raise ValueError(f"noise.freedom: more than {_LEAST_FREEDOM:g} is needed")
     return Noise(mag, gyro, walk, taps, freedom)
@@ -121,8 +123,8 @@ def _term_json(term: Term, effect: Effect) -> dict[str, object]:
     }
 
 
-def _term(entry: object, number: int, library: Mapping[str, Effect]) -> Term:
-    """A term; its parameters by name, so that their order in the file does not matter."""
+def _parse_term(entry: object, number: int, library: Mapping[str, Effect]) -> Term:
+    """A term; its parameters are found by name, in any order."""
     if not isinstance(entry, dict):
         raise ValueError(f"terms[{number}] is no object")
     name = str(entry.get("effect"))
@@ -137,27 +139,27 @@ def _term(entry: object, number: int, library: Mapping[str, Effect]) -> Term:
     if set(by_name) != set(wanted):
         raise ValueError(f"terms[{number}]: the parameters of {name} are {', '.join(wanted)}")
     value, std = (
-        np.array([_finite(by_name[p], key, f"terms[{number}].{p}") for p in wanted])
+        np.array([_finite_number(by_name[p], key, f"terms[{number}].{p}") for p in wanted])
         for key in ("value", "std")
     )
     return Term(name, value, std, setting)
 
 
-def _number(body: dict[str, Any], part: str, key: str) -> float:
+def _parse_number(body: dict[str, Any], part: str, key: str) -> float:
     section = body.get(part)
     if not isinstance(section, dict):
         raise ValueError(f"{part} is missing")
-    return _finite(section, key, part)
+    return _finite_number(section, key, part)
 
 
-def _finite(section: dict[str, Any], key: str, where: str) -> float:
+def _finite_number(section: dict[str, Any], key: str, where: str) -> float:
     number = section.get(key)
     if isinstance(number, bool) or not isinstance(number, int | float) or not np.isfinite(number):
         raise ValueError(f"{where}.{key}: {number!r} is no finite number")
     return float(number)
 
 
-def _numbers(body: dict[str, Any], part: str, key: str, shape: tuple[int, ...]) -> Array:
+def _parse_array(body: dict[str, Any], part: str, key: str, shape: tuple[int, ...]) -> Array:
     section = body.get(part)
     given = section.get(key) if isinstance(section, dict) else None
     try:

@@ -1,1 +1,1 @@
-"""Where, when and under which conditions readings and model differ."""
+"""In which intervals, frames and conditions readings and model differ."""

@@ -1,7 +1,7 @@
-"""Where a named term acts: when, on which axes, in which regime of what was logged.
+"""Where an effect acts: intervals in time, sensor axes, and range of the logged covariate.
 
-When is where a recovered course departs from its usual level (`departures`), the one that is in
-force for longest.
+For a time series of coefficients the intervals are those in which it departs from its usual level
+(`departure_intervals`), which is the level that lasts longest.
 """
 
 from __future__ import annotations
@@ -14,46 +14,51 @@ from ahrsd.diagnosis.answer.diagnosis import Where
 from ahrsd.diagnosis.columns.roles import label
 from ahrsd.diagnosis.effects.effect import Setting
 from ahrsd.diagnosis.track import Track
-from ahrsd.diagnosis.where_and_when.locate import segments
+from ahrsd.diagnosis.where_and_when.locate import equal_segments
 from ahrsd.samples import Array
 
 AXES = ("x", "y", "z")
-_STRETCHES = 100
+_SEGMENTS = 100
 
 
-def where_of(track: Track, added: Array, setting: Setting, frame: str) -> Where:
-    """The address of a term that adds (N, 3) gauss or rad/s to the readings."""
+def locate_contribution(track: Track, added: Array, setting: Setting, frame: str) -> Where:
+    """The `Where` of an effect that adds (N, 3) gauss or rad/s to the readings."""
     spread = np.sqrt(np.mean(added**2, axis=0))
     axes = tuple(AXES[k] for k in range(3) if spread[k] > priors.ACTS_ON_AXIS * spread.max())
     frequency = setting.get("frequency_hz")
     width = 1.0 / max(track.duration_s, 1e-9)
     return Where(
-        _when(track, added, setting),
+        _active_intervals(track, added, setting),
         axes,
         frame,
-        _regime(track, added, setting),
+        _regime_text(track, added, setting),
         None if frequency is None else (float(frequency) - width, float(frequency) + width),
     )
 
 
-def _when(track: Track, added: Array, setting: Setting) -> tuple[tuple[float, float], ...]:
+def _active_intervals(
+    track: Track, added: Array, setting: Setting
+) -> tuple[tuple[float, float], ...]:
+    """From the onset on, if the setting has one; else the segments with most of the effect."""
     if "onset_s" in setting and "length_s" not in setting:
         return ((float(setting["onset_s"]), float(setting.get("end_s", track.time_s[-1]))),)
-    cut = segments(track.time_s, _STRETCHES)
+    segments = equal_segments(track.time_s, _SEGMENTS)
     size = np.array(
         [
-            np.sqrt(np.mean(added[cut.index == k] ** 2)) if (cut.index == k).any() else 0.0
-            for k in range(len(cut))
+            np.sqrt(np.mean(added[segments.index == k] ** 2))
+            if (segments.index == k).any()
+            else 0.0
+            for k in range(len(segments))
         ]
     )
-    found = spans(cut.edges_s, size > priors.ACTS_IN_STRETCH * size.max())
+    found = joined_intervals(segments.edges_s, size > priors.ACTS_IN_STRETCH * size.max())
     if sum(b - a for a, b in found) > priors.ACTS_EVERYWHERE * track.duration_s:
         found = [(float(track.time_s[0]), float(track.time_s[-1]))]
     return tuple(found)
 
 
-def _regime(track: Track, added: Array, setting: Setting) -> str | None:
-    """`motor_current_a > 6`: the covariate's upper range, where the term acts most."""
+def _regime_text(track: Track, added: Array, setting: Setting) -> str | None:
+    """`motor_current_a > 6`: the upper range of the covariate, where the effect adds most."""
     name = setting.get("covariate")
     values = track.covariates.get(str(name))
     if values is None or not np.isfinite(values).any():
@@ -67,15 +72,17 @@ def _regime(track: Track, added: Array, setting: Setting) -> str | None:
     return f"{label(str(name))} < {high:.3g}" if below else f"follows {label(str(name))}"
 
 
-def departures(edges_s: Array, course: Array, deviation: Array) -> list[tuple[float, float]]:
-    """Spans in which a course (J, axes) is away from the level that is in force for longest.
+def departure_intervals(
+    edges_s: Array, series: Array, deviation: Array
+) -> list[tuple[float, float]]:
+    """Intervals in which a time series (J, axes) departs from the level that lasts longest.
 
-    Away: by more than `DEPARTED` of the largest departure and 3 deviations (J,), and on either side
-    as far as the course still shows it (`reaching`).  The whole span where the course has no usual
-    level: where none is in force for 40 % of the time.
+    A segment departs if it is further away than `DEPARTED` of the largest departure and 3 standard
+    deviations (J,).  Each interval is extended as far as the departure is visible
+    (`extend_departures`).  The whole time is returned if no level lasts for 40 % of it.
     """
     length = np.diff(edges_s)
-    distance = np.linalg.norm(course[:, None] - course[None], axis=2)
+    distance = np.linalg.norm(series[:, None] - series[None], axis=2)
     largest = float(distance.max(initial=0.0))
     if largest == 0.0:
         return [(float(edges_s[0]), float(edges_s[-1]))]
@@ -83,26 +90,28 @@ def departures(edges_s: Array, course: Array, deviation: Array) -> list[tuple[fl
         priors.DEPARTED * largest, 3.0 * np.minimum.outer(deviation, deviation)
     )
     usual = alike @ length
-    home = int(np.argmax(usual))
-    if usual[home] < 0.4 * length.sum():
+    usual_segment = int(np.argmax(usual))
+    if usual[usual_segment] < 0.4 * length.sum():
         return [(float(edges_s[0]), float(edges_s[-1]))]
-    usual_course = np.average(course[alike[home]], axis=0)
-    return spans(edges_s, reaching(~alike[home], course - usual_course, deviation))
+    usual_course = np.average(series[alike[usual_segment]], axis=0)
+    return joined_intervals(
+        edges_s, extend_departures(~alike[usual_segment], series - usual_course, deviation)
+    )
 
 
-def reaching(inside: Array, course: Array, deviation: Array) -> Array:
-    """(J,) `inside` (J,) with the segments beside each span that still go its way.
+def extend_departures(inside: Array, series: Array, deviation: Array) -> Array:
+    """(J,) `inside` (J,), with each interval extended by the segments that still depart likewise.
 
-    What comes and goes slowly has no level of its own at its beginning and end: a segment belongs
-    to it as long as its course (J, axes) is `STILL_DEPARTED` deviations (J,) away in the span's
-    direction.
+    A source that comes and goes slowly has no sharp beginning and end.  A segment therefore
+    belongs to the interval as long as the time series (J, axes) is more than `STILL_DEPARTED`
+    standard deviations (J,) away in the direction of the interval's mean.
     """
     out = np.asarray(inside, bool).copy()
     padded = np.concatenate([[False], out, [False]]).astype(int)
     starts, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)
     for start, end in zip(starts, ends, strict=True):
-        mean = course[start:end].mean(axis=0)
-        along = course @ mean / max(float(np.linalg.norm(mean)), 1e-300) / deviation
+        mean = series[start:end].mean(axis=0)
+        along = series @ mean / max(float(np.linalg.norm(mean)), 1e-300) / deviation
         before = np.flatnonzero(along[:start] <= priors.STILL_DEPARTED)
         after = np.flatnonzero(along[end:] <= priors.STILL_DEPARTED)
         out[before[-1] + 1 if len(before) else 0 : start] = True
@@ -110,7 +119,7 @@ def reaching(inside: Array, course: Array, deviation: Array) -> Array:
     return out
 
 
-def spans(edges_s: Array, inside: NDArray[np.bool] | Array) -> list[tuple[float, float]]:
+def joined_intervals(edges_s: Array, inside: NDArray[np.bool] | Array) -> list[tuple[float, float]]:
     """Joined (start, end) of the segments that are inside."""
     padded = np.concatenate([[False], np.asarray(inside, bool), [False]]).astype(int)
     starts, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)

@@ -1,11 +1,12 @@
-"""Where readings and model differ, without a name for it: three frames, segment by segment.
+"""Piecewise constant fields and rates in three frames, segment by segment: no effect is assumed.
 
-    sensor   a field that rides with the vehicle         D = e_i 1[segment]
-    world    a field that stays outside and turns with R D = A R_nb^T e_i 1[segment]
+    sensor   a field fixed to the vehicle                D = e_i 1[segment]
+    world    a field fixed in the world                  D = A R_nb^T e_i 1[segment]
     gyro     an error of the rate                        W = e_i 1[segment]
 
-A singular value decomposition of a frame's segments x axes says whether one source with one
-direction is enough, and gives that source's course in time, to be compared with what was logged.
+A singular value decomposition of a frame's segments x axes says whether a single source of
+constant direction is enough, and gives the time series of that source, to be compared with logged
+columns.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ FRAMES: tuple[Frame, ...] = ("sensor", "world", "gyro")
 
 SEGMENT_S = 20.0
 SEGMENTS = (6, 24)
-#: of a recording's stretches one in so many is its beginning
+#: one in so many of a recording's segments is its beginning
 FIRST_SHARE = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segments:
-    """A recording cut in J stretches.  edges_s: (J + 1,);  index: (N,) the stretch of a sample."""
+    """A recording cut into J segments.  edges_s: (J + 1,);  index: (N,) the segment of a sample."""
 
     edges_s: Array
     index: NDArray[np.intp]
@@ -41,7 +42,7 @@ class Segments:
 
     @property
     def length_s(self) -> float:
-        """Mean length of a stretch."""
+        """Mean length of a segment."""
         return float(self.edges_s[-1] - self.edges_s[0]) / max(len(self), 1)
 
     @property
@@ -50,19 +51,19 @@ class Segments:
         return np.asarray((self.edges_s[1:] + self.edges_s[:-1]) / 2)
 
 
-def segments(time_s: Array, count: int) -> Segments:
-    """`count` stretches of equal length."""
+def equal_segments(time_s: Array, count: int) -> Segments:
+    """`count` segments of equal length."""
     return segments_between(time_s, np.linspace(time_s[0], time_s[-1], count + 1))
 
 
-def coarse_cut(track: Track) -> Segments:
-    """Stretches of about 20 s, shorter and longer on short and long recordings."""
+def coarse_segments(track: Track) -> Segments:
+    """Segments of about 20 s, shorter on short and longer on long recordings."""
     count = int(np.clip(round(track.duration_s / SEGMENT_S), *SEGMENTS))
-    return segments(track.time_s, count)
+    return equal_segments(track.time_s, count)
 
 
 def segments_between(time_s: Array, edges_s: Array) -> Segments:
-    """Stretches between the given edges; samples outside belong to none (index -1)."""
+    """Segments between the given edges; samples outside belong to none (index -1)."""
     index = np.searchsorted(edges_s, time_s, side="right") - 1
     index[time_s == edges_s[-1]] = len(edges_s) - 2
     index[index >= len(edges_s) - 1] = -1
@@ -88,11 +89,11 @@ def unit_columns(context: Context, frame: Frame) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Located:
-    """What one frame's segments say.
+    """Result of the segments of one frame.
 
     evidence: log Bayes factor, nats
     course:   (J, 3) posterior mean of the coefficients, gauss or rad/s, of zero weighted mean
-    deviation: (J,) of a coefficient
+    deviation: (J,) standard deviation of a coefficient
     direction: (3,) unit vector of the strongest single source
     """
 
@@ -105,20 +106,21 @@ class Located:
 
     @property
     def source(self) -> Array:
-        """(J,) the single source's course in time."""
+        """(J,) time series of the single source."""
         return np.asarray(self.course @ self.direction)
 
 
-def single_source(course: Array, deviation: Array) -> tuple[Array, float]:
-    """Unit vector (3,) along which a course (J, 3) moves most, and the share of what moves there.
+def single_source_direction(series: Array, deviation: Array) -> tuple[Array, float]:
+    """Unit vector (3,) along which a series (J, 3) varies most, and its share of the variance.
 
-    It points to where the course goes from its beginning: what runs later is seldom on at first.
+    Its sign is such that the series rises from its beginning: a device that runs later is seldom
+    on at the start.
     """
     weight = 1.0 / np.maximum(deviation, 1e-12)
-    centred = (course - np.average(course, axis=0, weights=weight**2)) * weight[:, None]
+    centred = (series - np.average(series, axis=0, weights=weight**2)) * weight[:, None]
     _, sizes, axes = np.linalg.svd(centred, full_matrices=False)
     power = sizes**2
-    along = course @ axes[0]
+    along = series @ axes[0]
     first = max(1, len(along) // FIRST_SHARE)
     later = np.average(along, weights=weight**2) - np.average(
         along[:first], weights=weight[:first] ** 2
@@ -127,7 +129,7 @@ def single_source(course: Array, deviation: Array) -> tuple[Array, float]:
     return np.asarray(direction), float(power[0] / max(power.sum(), 1e-300))
 
 
-def course_of(track: Track, covariate: Array, cut: Segments) -> Array:
+def segment_means(track: Track, covariate: Array, cut: Segments) -> Array:
     """(J,) mean of a logged column over each segment; nan where it has no value."""
     out = np.full(len(cut), np.nan)
     for j in range(len(cut)):
@@ -139,21 +141,21 @@ def course_of(track: Track, covariate: Array, cut: Segments) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """A logged channel that moves with a recovered course: correlation and how rare that is."""
+    """A logged channel that correlates with a source: correlation, and its p-value."""
 
     channel: str
     correlation: float
     p_value: float
 
 
-def matches(track: Track, located: Located) -> tuple[Match, ...]:
-    """Logged channels by how well they follow the recovered course, best first.
+def matching_channels(track: Track, located: Located) -> tuple[Match, ...]:
+    """Logged channels by their correlation with the single source, largest first.
 
-    The p-value is the share of circular shifts of the channel that follow it at least as well.
+    The p-value is the share of circular shifts of the channel that correlate at least as well.
     """
     found = []
     for channel, values in track.covariates.items():
-        logged = course_of(track, values, located.cut)
+        logged = segment_means(track, values, located.cut)
         known = np.isfinite(logged)
         if known.sum() < 6 or np.ptp(logged[known]) == 0:
             continue

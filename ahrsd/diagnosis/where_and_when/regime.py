@@ -1,14 +1,15 @@
-"""Under which conditions: residual field by heading, tilt, rate and every logged column.
+"""Residual field by condition: heading, tilt, rate and every logged column.
 
-Each quantity is cut into bins with equally many samples; a field in sensor axes per bin is one
-group of columns.  What follows the heading but not the time is a misfit of the calibration's form;
-what follows a logged column is a hint at that column.
+Each quantity is cut into bins of equally many samples, and a constant field in sensor axes per bin
+is one group of columns.  A residual that follows the heading but not the time is a wrong form of
+the calibration; one that follows a logged column points to that column.
 
-A field on the vehicle may be a function of the heading (`heading_columns`): harmonics, of which no
-name has all.  A turret that keeps its direction, a crane, a boom that swings back turn against the
-vehicle: iron that turns with the heading, once or several times.  In time it comes and goes with
-every turn, within seconds, and is no one source, so that it counts as the colour of the noise.  By
-heading it is the same each time.  The calibration takes what soft iron does.
+A field on the vehicle may also be a function of the heading (`heading_columns`), in harmonics that
+no single effect of the library has.  A turret that keeps its direction, a crane or a boom that
+swings back turn against the vehicle, and their iron turns with the heading, once or several times.
+In time such a field comes and goes with every turn, within seconds, and has no constant direction,
+so that it counts as coloured noise.  By heading it repeats itself.  The calibration takes the part
+that a soft iron explains.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from ahrsd.samples import Array
 
 BINS = {"heading_deg": 12}
 OTHER_BINS = 6
-#: waves in a turn, at most; the variance of each falls with the square of its number
+#: most harmonics of heading; the amplitude of each falls with its number
 HARMONICS = 6
 
 
@@ -39,11 +40,11 @@ class Regime:
 
     @property
     def group(self) -> str:
-        """Its group in a Gram."""
+        """Its key in a group of columns."""
         return f"regime {self.quantity}"
 
     def words(self, inside: NDArray[np.bool]) -> str:
-        """The bins that are inside, as text: `heading_deg 200 to 260`."""
+        """The selected bins as text: `heading_deg 200 to 260`."""
         padded = np.concatenate([[False], inside, [False]]).astype(int)
         starts, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)
         parts = [
@@ -53,17 +54,17 @@ class Regime:
 
 
 def regimes(context: Context) -> tuple[Regime, ...]:
-    """Attitude (where the world is levelled), rate and logged columns that move."""
+    """Attitude (where the world frame is level), rate, and logged columns that vary."""
     R = context.R_nb
     quantities = {"rate_rad_s": np.linalg.norm(context.rate_b_rad_s, axis=1)}
     quantities["heading_deg"] = np.degrees(context.heading_rad) % 360.0
     if context.world_levelled:
         quantities["pitch_deg"] = np.degrees(-np.arcsin(np.clip(R[:, 2, 0], -1.0, 1.0)))
         quantities["roll_deg"] = np.degrees(np.arctan2(R[:, 2, 1], R[:, 2, 2]))
-    found = [_binned(name, values) for name, values in quantities.items()]
+    found = [_bin_quantity(name, values) for name, values in quantities.items()]
     for name, values in context.track.covariates.items():
         if np.isfinite(values).mean() > 0.5:
-            found.append(_binned(name, values))
+            found.append(_bin_quantity(name, values))
     return tuple(regime for regime in found if regime is not None)
 
 
@@ -76,7 +77,7 @@ def regime_columns(regime: Regime) -> Columns:
     return Columns(mag=out.reshape(len(regime.index), 3, -1))
 
 
-def _binned(name: str, values: Array) -> Regime | None:
+def _bin_quantity(name: str, values: Array) -> Regime | None:
     known = np.isfinite(values)
     span = float(np.ptp(values[known])) if known.any() else 0.0
     if span <= priors.REGIME_RANGE.get(name, 0.0):
@@ -90,7 +91,7 @@ def _binned(name: str, values: Array) -> Regime | None:
 
 
 def heading_columns(context: Context) -> Columns:
-    """A field in the sensor's axes, 3 columns a wave, wave-major, each of its prior deviation."""
+    """A field in sensor axes by harmonics of heading: 3 columns a harmonic, scaled to the prior."""
     order = np.arange(1, HARMONICS + 1)
     phase = context.heading_rad[:, None] * order
     waves = np.concatenate([np.cos(phase) / order, np.sin(phase) / order], axis=1)

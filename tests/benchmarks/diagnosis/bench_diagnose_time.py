@@ -47,11 +47,12 @@ KINDS = {
 #: functions that are timed, in the order in which they run, and the modules that call them
 PHASES = {
     **dict.fromkeys(
-        ("prepare", "build_problem", "fit_null", "find_lost_turns_at_start", "find_wrong_clock"), engine
+        ("prepare", "build_problem", "fit_null", "find_lost_turns_at_start", "find_wrong_clock"),
+        engine,
     ),
     "fit_richest_model": richest_model,
     **dict.fromkeys(("answered", "quick"), both_rates),
-    **dict.fromkeys(("lost_beside", "whole_answer", "beyond_chance"), engine),
+    **dict.fromkeys(("lost_beside", "whole_answer", "diagnose_beyond_chance"), engine),
 }
 
 

@@ -7,10 +7,10 @@ import pytest
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.answer.added_field import (
-    calibration_of,
-    deviation,
-    heading_off_deg,
-    less_calibration,
+    calibration_basis,
+    heading_deviation_deg,
+    project_out_calibration,
+    rms_about_mean,
 )
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.model import Context
@@ -23,10 +23,10 @@ def context() -> Context:
 
 
 def test_iron_is_calibration_and_no_remainder(context: Context) -> None:
-    take = calibration_of(context)
+    take = calibration_basis(context)
     iron = context.field_b @ np.array([[0.1, 0.02, 0], [0.02, -0.1, 0.03], [0, 0.03, 0]]) + 0.05
-    assert deviation(iron) > 0.01
-    assert deviation(less_calibration(iron, take)) < 1e-12
+    assert rms_about_mean(iron) > 0.01
+    assert rms_about_mean(project_out_calibration(iron, take)) < 1e-12
 
 
 def test_a_heading_is_off_by_the_field_across(context: Context) -> None:
@@ -36,6 +36,8 @@ def test_a_heading_is_off_by_the_field_across(context: Context) -> None:
     across = np.array([-read[1], read[0], 0.0]) / level
     sign = np.where(np.arange(len(context.track)) % 2, 1.0, -1.0)[:, None]
     added = np.einsum("nji,j->ni", context.R_nb, 5e-3 * across) * sign
-    assert heading_off_deg(added, context) == pytest.approx(np.degrees(5e-3 / level), rel=0.02)
+    assert heading_deviation_deg(added, context) == pytest.approx(
+        np.degrees(5e-3 / level), rel=0.02
+    )
     along = np.einsum("nji,j->ni", context.R_nb, 5e-3 * read / np.linalg.norm(read)) * sign
-    assert heading_off_deg(along, context) < 0.05 * heading_off_deg(added, context)
+    assert heading_deviation_deg(along, context) < 0.05 * heading_deviation_deg(added, context)

@@ -12,18 +12,18 @@ from tracks import experiment, track_of, true_model
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Unexplained, Where
 from ahrsd.diagnosis.answer.null_simulations import (
-    Answered,
-    bent,
-    beyond_chance,
-    copy_of,
-    loudness,
-    motion_of,
-    times_beyond,
+    FittedDiagnosis,
+    calibration_bend,
+    diagnose_beyond_chance,
+    gyro_to_mag_noise,
+    noise_free_motion,
+    required_ratio,
+    simulated_copy,
 )
 from ahrsd.diagnosis.answer.text import verdict
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import build_problem
-from ahrsd.diagnosis.repaired_model.forward import noise_of
+from ahrsd.diagnosis.repaired_model.forward import model_noise
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.simulation import Experiment
 
@@ -49,7 +49,7 @@ def _made(
     )
 
 
-def _stepped() -> tuple[Track, Callable[[float], Answered]]:
+def _stepped() -> tuple[Track, Callable[[float], FittedDiagnosis]]:
     """A track with a step, and an answer that tells something unknown in it of so many nats."""
     track = track_of(_made(1e-4, 5e-2, samples=1000))
     since = (np.arange(len(track)) >= 500)[:, None]
@@ -58,9 +58,11 @@ def _stepped() -> tuple[Track, Callable[[float], Answered]]:
     start = fit_null(problem.track, problem.spec, cold)
     where = Where(((60.0, 120.0),), ("x", "y"), "sensor")
 
-    def answered(nats: float) -> Answered:
+    def answered(nats: float) -> FittedDiagnosis:
         left = Unexplained(True, where, evidence_nats=nats)
-        return Answered(Diagnosis("step.csv", None, True, 1e-9, (), left, {}), problem, start)
+        return FittedDiagnosis(
+            Diagnosis("step.csv", None, True, 1e-9, (), left, {}), problem, start
+        )
 
     return track, answered
 
@@ -70,12 +72,12 @@ def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> 
     """How much of such chance makes is then not known either."""
     track, answered = _stepped()
 
-    def ask(asked: Track) -> Answered:
+    def ask(asked: Track) -> FittedDiagnosis:
         if asked is not track:
             raise np.linalg.LinAlgError("Eigenvalues did not converge")
         return answered(2000.0)
 
-    found = beyond_chance(track, ask)
+    found = diagnose_beyond_chance(track, ask)
     assert not found.unexplained.detected
     assert verdict(found) == (
         "no verdict: a simulation of the model alone with this noise cannot be diagnosed"
@@ -99,13 +101,13 @@ def test_what_simulations_show_is_said_beside_what_is_told(
     track, answered = _stepped()
     copies = list[Track]()
 
-    def ask(one: Track) -> Answered:
+    def ask(one: Track) -> FittedDiagnosis:
         if one is track:
             return answered(nats)
         copies.append(one)
         return answered(12.0)
 
-    found = beyond_chance(track, ask)
+    found = diagnose_beyond_chance(track, ask)
     assert found.unexplained.detected == is_told
     assert len(copies) == asked
     (note,) = found.notes[:1]
@@ -118,15 +120,15 @@ def test_what_simulations_show_is_said_beside_what_is_told(
 )
 def test_times_beyond_the_largest_of_several(copies: int, chance: float, times: float) -> None:
     """Of exponential draws: n! / ((1 + t) ... (n + t))."""
-    assert times_beyond(copies, chance) == pytest.approx(times, rel=1e-3)
+    assert required_ratio(copies, chance) == pytest.approx(times, rel=1e-3)
 
 
 def test_with_every_early_look_one_in_94_of_what_chance_makes_is_told() -> None:
     """Of exponential draws beside five others: 1 in 126 at the last, 1 in 1000 at each before."""
     told, *others = np.random.default_rng(5).exponential(size=(6, 500_000))
     largest = np.maximum.accumulate(others)
-    early = [times_beyond(count, priors.CHANCE_EARLY_P) for count in (1, 2, 3, 4)]
-    beyond = told > np.array([*early, times_beyond(5, priors.CHANCE_P)])[:, None] * largest
+    early = [required_ratio(count, priors.CHANCE_EARLY_P) for count in (1, 2, 3, 4)]
+    beyond = told > np.array([*early, required_ratio(5, priors.CHANCE_P)])[:, None] * largest
     assert np.mean(beyond[-1]) == pytest.approx(1 / 126, rel=0.05)
     assert np.mean(beyond.any(axis=0)) == pytest.approx(1 / 94, rel=0.05)
 
@@ -137,7 +139,7 @@ def test_with_every_early_look_one_in_94_of_what_chance_makes_is_told() -> None:
 def test_how_loud_a_gyro_is(sigma_mag: float, sigma_gyro: float, ratio: float) -> None:
     """Of half a gauss, 25 times a second: 50 mrad/s turn it by 1 mG."""
     made = _made(sigma_mag, sigma_gyro)
-    assert loudness(track_of(made), true_model(made)) == pytest.approx(ratio, rel=0.1)
+    assert gyro_to_mag_noise(track_of(made), true_model(made)) == pytest.approx(ratio, rel=0.1)
 
 
 @pytest.mark.parametrize(("scenario", "is_bent"), [("lam", True), ("wam", False), ("mam", False)])
@@ -146,18 +148,20 @@ def test_the_noise_bends_a_calibration_that_the_motion_hardly_shows(
 ) -> None:
     """Slow turns with a tilt of a few degrees; the same noise beside larger ones moves nothing."""
     problem, cold = build_problem(track_of(_made(1e-3, 5e-3, scenario, 2)), Spec())
-    moved = bent(fit_null(problem.track, problem.spec, cold, walk=False))
+    moved = calibration_bend(fit_null(problem.track, problem.spec, cold, walk=False))
     assert moved == pytest.approx(0.62, abs=0.1) if is_bent else moved < 0.1
 
 
 def test_a_copy_has_the_motion_the_noise_and_the_stamps() -> None:
     made = _made(1e-4, 5e-2)
     track, model = track_of(made), true_model(made)
-    truth = motion_of(track, model)
+    truth = noise_free_motion(track, model)
     clean = track_of(_made(0.0, 0.0)).gyro_b_rad_s
     assert np.std(truth.gyro_b_rad_s - clean) < 0.1 * 5e-2
-    one = copy_of(track, truth, noise_of(model), seed=3)
+    one = simulated_copy(track, truth, model_noise(model), seed=3)
     assert np.array_equal(one.time_s, track.time_s)
     assert np.std(one.gyro_b_rad_s - truth.gyro_b_rad_s) == pytest.approx(5e-2, rel=0.03)
     assert np.std(one.mag_b_gauss - truth.mag_b_gauss) == pytest.approx(1e-4, rel=0.03)
-    assert np.array_equal(one.mag_b_gauss, copy_of(track, truth, noise_of(model), 3).mag_b_gauss)
+    assert np.array_equal(
+        one.mag_b_gauss, simulated_copy(track, truth, model_noise(model), 3).mag_b_gauss
+    )

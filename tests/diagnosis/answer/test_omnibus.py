@@ -9,7 +9,7 @@ from scipy import stats
 from tracks import experiment, track_of, true_model
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.answer.omnibus import Test, omnibus, variance_test
+from ahrsd.diagnosis.answer.omnibus import Test, omnibus_tests, variance_test
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
@@ -38,7 +38,7 @@ def test_probabilities_are_uniform_on_nulls() -> None:
     found: dict[str, list[float]] = {}
     for seed in range(40):
         done = _filtered(seed)
-        for test in omnibus(done, _context(done)):
+        for test in omnibus_tests(done, _context(done)):
             found.setdefault(test.name, []).append(test.p_value)
     assert set(found) == {
         "normalised_innovation",
@@ -57,7 +57,7 @@ def test_probabilities_are_uniform_on_nulls() -> None:
 
 def test_noise_that_is_larger_than_said() -> None:
     rng = np.random.default_rng(0)
-    tests = _named(omnibus(_filtered(1, 6e-4 * rng.standard_normal((1500, 3)))))
+    tests = _named(omnibus_tests(_filtered(1, 6e-4 * rng.standard_normal((1500, 3)))))
     assert tests["normalised_innovation"].p_value < 1e-6
     assert tests["normalised_innovation"].value > 1.2
     assert tests["ljung_box"].p_value > 1e-3
@@ -66,17 +66,17 @@ def test_noise_that_is_larger_than_said() -> None:
 def test_a_slow_field_and_a_fast_line_are_not_white() -> None:
     t = np.arange(1500) * 0.04
     slow = 3e-3 * np.sin(2 * np.pi * 0.3 * t)[:, None] * np.array([1.0, 0.0, 1.0])
-    tests = _named(omnibus(_filtered(1, slow)))
+    tests = _named(omnibus_tests(_filtered(1, slow)))
     assert tests["ljung_box"].p_value < 1e-6
     assert tests["cumulative_periodogram"].p_value < 1e-6
     fast = 1e-3 * np.sin(2 * np.pi * 9.3 * t)[:, None] * np.array([0.0, 1.0, 0.0])
-    assert _named(omnibus(_filtered(1, fast)))["cumulative_periodogram"].p_value < 1e-4
+    assert _named(omnibus_tests(_filtered(1, fast)))["cumulative_periodogram"].p_value < 1e-4
 
 
 def test_tails_are_not_normal() -> None:
     rng = np.random.default_rng(3)
     hit = 8e-3 * rng.standard_normal((1500, 3)) * (rng.random((1500, 1)) < 0.01)
-    assert _named(omnibus(_filtered(1, hit)))["normality"].p_value < 1e-9
+    assert _named(omnibus_tests(_filtered(1, hit)))["normality"].p_value < 1e-9
 
 
 def test_scatter_that_follows_a_column_names_it() -> None:
@@ -93,7 +93,7 @@ def test_scatter_that_follows_a_column_names_it() -> None:
 
 def test_too_few_samples_give_no_tests() -> None:
     made = experiment(samples=60)
-    assert omnibus(run_filter(track_of(made), true_model(made))) == ()
+    assert omnibus_tests(run_filter(track_of(made), true_model(made))) == ()
 
 
 def test_noise_that_is_only_assumed_is_not_tested() -> None:
@@ -102,9 +102,9 @@ def test_noise_that_is_only_assumed_is_not_tested() -> None:
     model = replace(true_model(made), sigma_mag_gauss=priors.FLOOR_MAG_GAUSS)
     done = run_filter(track_of(made), model)
     assert float(np.mean(done.whitened[done.used] ** 2)) < 0.75
-    assert omnibus(done, _context(done)) == ()
+    assert omnibus_tests(done, _context(done)) == ()
     louder = experiment(
         "mam", seed=0, samples=1500, sigma_mag=priors.FLOOR_MAG_GAUSS, sigma_gyro=5e-3
     )
     done = run_filter(track_of(louder), model)
-    assert {test.p_value > 1e-4 for test in omnibus(done, _context(done))} == {True}
+    assert {test.p_value > 1e-4 for test in omnibus_tests(done, _context(done))} == {True}

@@ -17,13 +17,13 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Where,
 )
 from ahrsd.diagnosis.answer.text import (
-    TOLD,
-    UNTOLD,
-    in_one_sentence,
-    lines,
-    ordinary_left,
+    REPORTED_SETTINGS,
+    UNREPORTED_SETTINGS,
+    answer_lines,
+    component_lines,
+    ordinary_residual,
+    ordinary_text,
     setting_text,
-    size_lines,
     verdict,
 )
 from ahrsd.diagnosis.effects.library import EFFECTS
@@ -84,8 +84,8 @@ def test_what_is_ordinary_is_no_mismatch_and_is_not_silent():
         "1.3 deg of heading (95 % of 20 untouched recordings have less than 27 mG, 2.6 deg)"
     )
     assert said.endswith("; p = 1e-20 that there is none")
-    assert "remaining residual, ordinary:" in lines(one)
-    assert not any(line.startswith("unknown, here") for line in lines(one))
+    assert "remaining residual, ordinary:" in answer_lines(one)
+    assert not any(line.startswith("unknown, here") for line in answer_lines(one))
 
 
 def test_what_is_unknown_is_told_with_direction_frequencies_and_size():
@@ -93,7 +93,7 @@ def test_what_is_unknown_is_told_with_direction_frequencies_and_size():
         ((0.0, 110.0),), ("x", "y"), "sensor", band_hz=(0.26, 2.08), direction=(0.6, -0.8, 0.0)
     )
     left = Unexplained(True, where, None, 4.19e-4, "gauss", evidence_nats=40.0)
-    said = lines(Diagnosis("walk.csv", None, True, 1e-17, (), left, {}))
+    said = answer_lines(Diagnosis("walk.csv", None, True, 1e-17, (), left, {}))
     at = said.index("unknown, here (nothing in the library explains it):")
     assert said[at + 1 : at + 4] == [
         "   where      0.0-110.0 s; axes x y; turns with the vehicle; 0.26-2.08 Hz",
@@ -110,13 +110,13 @@ def test_a_name_beside_what_is_ordinary_is_a_mismatch():
     assert verdict(one).startswith(
         "MISMATCH: 1 effect left out (p = 1e-20); the remaining residual is"
     )
-    assert ordinary_left(one) is one.unexplained.ordinary
+    assert ordinary_residual(one) is one.unexplained.ordinary
 
 
 def test_what_is_beyond_is_unknown_and_says_by_how_much():
     one = found(left(80e-3, within=False))
-    assert ordinary_left(one) is None
-    said = "\n".join(lines(one))
+    assert ordinary_residual(one) is None
+    said = "\n".join(answer_lines(one))
     assert said.startswith("walk.csv: MISMATCH: an unknown cause (p = 1e-20)")
     assert "component  a field by attitude: 80 mG, 8 deg of heading, 100 nats" in said
     assert "why        beyond the ordinary: a field by attitude, 80 mG where up to" in said
@@ -139,8 +139,8 @@ def test_the_page_says_which_of_both_it_is(tmp_path):
 
 def test_what_no_component_holds_is_told_as_a_whole():
     one = replace(left(0.0, there=False), field_gauss=3e-3, heading_deg=0.4)
-    assert size_lines(one) == ["3 mG, 0.4 deg of heading, in no single component"]
-    assert "3 mG, 0.4 deg of heading" in in_one_sentence(one)
+    assert component_lines(one) == ["3 mG, 0.4 deg of heading, in no single component"]
+    assert "3 mG, 0.4 deg of heading" in ordinary_text(one)
 
 
 @pytest.mark.parametrize("name", list(EFFECTS))
@@ -148,8 +148,8 @@ def test_each_part_of_a_setting_is_told_or_left_out_for_a_reason(name):
     context, readings = moving(5)
     settings = [*EFFECTS[name].settings(context), EFFECTS[name].example(readings, 1.0)[1]]
     keys = {key for setting in settings for key in setting}
-    assert keys <= TOLD.keys() | UNTOLD.keys()
-    assert not TOLD.keys() & UNTOLD.keys()
+    assert keys <= REPORTED_SETTINGS.keys() | UNREPORTED_SETTINGS.keys()
+    assert not REPORTED_SETTINGS.keys() & UNREPORTED_SETTINGS.keys()
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.columns import roles
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.model import Term
-from ahrsd.diagnosis.repaired_model.forward import contribution
+from ahrsd.diagnosis.repaired_model.forward import terms_contribution
 
 CONTRACT = Path(__file__).parents[3] / ".." / "shared" / "reference" / "contract.md"
 MEAN = [name for name, effect in EFFECTS.items() if effect.kind == "mean"]
@@ -58,7 +58,9 @@ def test_every_effect_can_be_computed_where_everything_is_logged(name):
     effect = EFFECTS[name]
     value, setting = effect.example(readings, 1.0)
     assert value == pytest.approx(np.array(effect.typical))
-    added = contribution(context, [Term(name, np.asarray(value), np.zeros(len(value)), setting)])
+    added = terms_contribution(
+        context, [Term(name, np.asarray(value), np.zeros(len(value)), setting)]
+    )
     assert max(np.abs(part).max() for part in added) > 1e-6
     for columns in (effect.columns(context, setting),):
         for part in (columns.mag, columns.gyro):
@@ -175,7 +177,7 @@ def test_an_effect_does_not_reach_over_a_gap():
     """What stands behind a gap is the same whatever went before it."""
     _, readings = moving(7, rows=200, gap_at=100)
     rows = np.arange(200) >= 100
-    alone = time_series.kept(readings, rows)
+    alone = time_series.select_rows(readings, rows)
     for name in ("eddy_current", "viscous_magnetisation", "mag_time_lag", "mag_low_pass",
                  "gyro_time_lag", "gyro_integration", "current_derivative_field",
                  "mag_sample_hold"):  # fmt: skip

@@ -9,7 +9,7 @@ import pytest
 from effect_motion import FIELD_N, SOFT_IRON, moving
 
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.effects.sensor_element import aliased, lines
+from ahrsd.diagnosis.effects.sensor_element import alias_frequency, spectral_lines
 
 
 def seen(context, mag):
@@ -29,9 +29,9 @@ def test_a_line_is_found_where_it_is():
 
 
 def test_mains_are_named_by_their_alias():
-    assert aliased(60.0, 25.0) == pytest.approx(10.0)
-    assert aliased(50.0, 25.0) == 0.0
-    assert aliased(50.0, 40.0) == pytest.approx(10.0)
+    assert alias_frequency(60.0, 25.0) == pytest.approx(10.0)
+    assert alias_frequency(50.0, 25.0) == 0.0
+    assert alias_frequency(50.0, 40.0) == pytest.approx(10.0)
     context, readings = moving(2, rows=2000, rate_hz=40.0)
     mag = readings.mag_b_gauss + 1e-3 * np.sin(2 * np.pi * 50.0 * readings.time_s)[:, None]
     noisy = mag + 1e-4 * np.random.default_rng(1).standard_normal((2000, 3))
@@ -140,7 +140,7 @@ def test_a_line_that_keeps_step_with_the_samples_is_no_outside_field(frequency_h
     residual = np.random.default_rng(2).normal(size=(4000, 3))
     residual[:, 1] += 0.5 * np.cos(2 * np.pi * frequency_hz * time_s)
     dt_s = np.r_[np.nan, np.diff(time_s)]
-    at = [line["frequency_hz"] for line in lines(residual, np.zeros((4000, 3)), dt_s)]
+    at = [line["frequency_hz"] for line in spectral_lines(residual, np.zeros((4000, 3)), dt_s)]
     assert len(at) == 2
     assert any(abs(one - frequency_hz) < 2e-3 for one in at) == found
 
@@ -158,7 +158,7 @@ def test_a_line_at_the_rate_at_which_the_vehicle_turns_to_and_fro_is_none(turns_
     residual = rng.normal(size=(4000, 3))
     residual[:, 1] += 0.5 * np.cos(2 * np.pi * line_hz * time_s)
     dt_s = np.r_[np.nan, np.diff(time_s)]
-    at = [line["frequency_hz"] for line in lines(residual, gyro, dt_s)]
+    at = [line["frequency_hz"] for line in spectral_lines(residual, gyro, dt_s)]
     assert any(abs(one - line_hz) < 5e-3 for one in at) == found
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tracks import experiment, track_of
 
-from ahrsd.diagnosis.answer.text import lines, verdict
+from ahrsd.diagnosis.answer.text import answer_lines, verdict
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.simulation import Experiment
 
@@ -60,7 +60,7 @@ def test_where_no_simulation_can_be_fitted_neither_yes_nor_no_is_said(monkeypatc
     assert verdict(found) == (
         "no verdict: of 16 simulations of the model alone with this noise only 0 can be fitted"
     )
-    assert "would have shown" not in "\n".join(lines(found))
+    assert "would have shown" not in "\n".join(answer_lines(found))
     assert found.to_json()["undecided"].startswith("of 16 simulations")
 
 

@@ -12,7 +12,7 @@ from tracks import experiment, track_of, true_model
 from ahrsd.diagnosis.calibration_fit.resampling import average_groups
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.model import Noise, Term
-from ahrsd.diagnosis.repaired_model.forward import simulated
+from ahrsd.diagnosis.repaired_model.forward import simulate_readings
 from ahrsd.diagnosis.repaired_model.injection import readings_of
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
@@ -155,7 +155,7 @@ def _late(seed: int, shape: str, lag_s: float) -> Track:
     truth = readings_of(made, {})
     lag = Term("mag_time_lag", np.array([lag_s]), np.zeros(1), {})
     late = SHAPES[shape](made.samples.time_s - lag_s)
-    mag = simulated(truth, [lag], Noise(1e-3, 5e-4), seed).mag_b_gauss + np.outer(late, K)
+    mag = simulate_readings(truth, [lag], Noise(1e-3, 5e-4), seed).mag_b_gauss + np.outer(late, K)
     return replace(track_of(made), mag_b_gauss=mag, covariates={"motor_current_a": current})
 
 

@@ -12,14 +12,17 @@ from ahrsd.diagnosis import time_series
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.model import Term
-from ahrsd.diagnosis.repaired_model.forward import contribution
+from ahrsd.diagnosis.repaired_model.forward import terms_contribution
 
 
 def test_play_begins_where_it_was_left() -> None:
     values = np.array([[0.0], [0.2], [-0.3], [-0.8], [1.0], [0.9]])
-    middle = time_series.play(values, 0.5, (1.0,))[:, 0]
+    middle = time_series.play_operator(values, 0.5, (1.0,))[:, 0]
     np.testing.assert_allclose(middle, [0.5, 0.5, 0.2, -0.3, 0.5, 0.5], atol=1e-12)
-    assert time_series.play(values, 0.5, (0.0,)).tolist() == time_series.play(values, 0.5).tolist()
+    assert (
+        time_series.play_operator(values, 0.5, (0.0,)).tolist()
+        == time_series.play_operator(values, 0.5).tolist()
+    )
 
 
 @pytest.mark.slow
@@ -29,7 +32,7 @@ def test_the_memory_is_found_and_nothing_else_is_named(memory) -> None:
     setting = {"radius_gauss": 0.03, "memory": memory}
     value = np.array([2e-3, 2.5e-3, 3e-3])
     term = Term("hysteresis", value, np.zeros(3), setting)
-    added, _ = contribution(fit_null(track).context(), [term])
+    added, _ = terms_contribution(fit_null(track).context(), [term])
     found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
     assert [one.effect for one in found.findings] == ["hysteresis"]
     assert not found.unexplained.detected
@@ -51,7 +54,7 @@ def test_iron_that_had_not_settled_is_no_step_and_no_drift() -> None:
     setting = {"time_constant_s": 25.0, "memory": (0.3, -0.25, 0.2)}
     value = np.array([0.02, 0.012, -0.008, 0.004, -0.006, 0.005])
     term = Term("viscous_magnetisation", value, np.zeros(6), setting)
-    added, _ = contribution(fit_null(track).context(), [term])
+    added, _ = terms_contribution(fit_null(track).context(), [term])
     found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
     assert [one.effect for one in found.findings] == ["viscous_magnetisation"]
     assert not found.unexplained.detected

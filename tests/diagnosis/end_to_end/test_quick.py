@@ -12,7 +12,7 @@ from ahrsd.diagnosis.calibration_fit.null_fit import cold_start, fit_null
 from ahrsd.diagnosis.calibration_fit.resampling import working_factor
 from ahrsd.diagnosis.effects.effect import readings_of
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.effects.sensor_sources import train, trains
+from ahrsd.diagnosis.effects.sensor_sources import find_pulse_trains, pulse_train
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Spec, Track
 
@@ -33,10 +33,10 @@ def test_a_train_of_pulses_is_found_with_period_phase_and_width() -> None:
     time_s = 1e6 + np.arange(8000) / RATE_HZ
     truth = {"start_s": 1e6, "period_s": 1.7313, "phase_s": 0.62, "width_s": 0.07}
     noise = 1e-3 * rng.standard_normal((8000, 3))
-    pulses = train(time_s, truth)[:, None] * 1.5e-3 * np.array([0.6, -0.48, 0.64])
-    (found,) = trains(noise + pulses, time_s, 1 / RATE_HZ)
+    pulses = pulse_train(time_s, truth)[:, None] * 1.5e-3 * np.array([0.6, -0.48, 0.64])
+    (found,) = find_pulse_trains(noise + pulses, time_s, 1 / RATE_HZ)
     assert abs(found["period_s"] - 1.7313) < 2e-4
-    assert np.mean(train(time_s, found) != train(time_s, truth)) < 0.02
+    assert np.mean(pulse_train(time_s, found) != pulse_train(time_s, truth)) < 0.02
     assert found["searched"] > 1000
 
 
@@ -45,10 +45,10 @@ def test_strong_pulses_leave_no_edge_of_theirs_behind() -> None:
     rng = np.random.default_rng(2)
     time_s = np.arange(15_000) / 50.0
     truth = {"start_s": 0.0, "period_s": 1.40335, "phase_s": 1.241, "width_s": 0.06}
-    pulses = train(time_s, truth)[:, None] * 9e-3 * np.array([0.1, 0.6, 0.79])
-    (found,) = trains(1e-3 * rng.standard_normal((15_000, 3)) + pulses, time_s, 0.02)
+    pulses = pulse_train(time_s, truth)[:, None] * 9e-3 * np.array([0.1, 0.6, 0.79])
+    (found,) = find_pulse_trains(1e-3 * rng.standard_normal((15_000, 3)) + pulses, time_s, 0.02)
     assert abs(found["period_s"] - 1.40335) < 1e-5
-    assert np.count_nonzero(train(time_s, found) != train(time_s, truth)) <= 2
+    assert np.count_nonzero(pulse_train(time_s, found) != pulse_train(time_s, truth)) <= 2
 
 
 @pytest.mark.parametrize("seed", [3, 4])
@@ -56,13 +56,13 @@ def test_a_pulse_lasts_a_sample_at_least_and_its_search_is_paid(seed: int) -> No
     """Narrower ones would hit nothing but the outliers of a heavy tail."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(8000) / RATE_HZ
-    (found,) = trains(1e-3 * rng.standard_t(3, (8000, 3)), time_s, 1 / RATE_HZ)
+    (found,) = find_pulse_trains(1e-3 * rng.standard_t(3, (8000, 3)), time_s, 1 / RATE_HZ)
     assert found["width_s"] >= 0.99 / RATE_HZ
     assert found["searched"] > 1000 * found["period_s"] * RATE_HZ * 16
 
 
 def test_a_short_recording_holds_no_train() -> None:
-    assert trains(np.zeros((200, 3)), np.arange(200) / RATE_HZ, 1 / RATE_HZ) == ()
+    assert find_pulse_trains(np.zeros((200, 3)), np.arange(200) / RATE_HZ, 1 / RATE_HZ) == ()
 
 
 @pytest.mark.slow

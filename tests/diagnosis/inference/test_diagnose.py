@@ -16,8 +16,8 @@ from tracks import experiment, track_of
 
 from ahrsd import so3
 from ahrsd.diagnosis.inference.diagnose import diagnose
-from ahrsd.diagnosis.repaired_model.forward import context_along, contribution
-from ahrsd.diagnosis.repaired_model.model_file import from_text, of_diagnosis, to_text
+from ahrsd.diagnosis.repaired_model.forward import context_along, terms_contribution
+from ahrsd.diagnosis.repaired_model.model_file import from_text, repaired_model_of, to_text
 from ahrsd.diagnosis.track import NothingToFit
 from ahrsd.simulation import ScenarioSettings, simulate
 
@@ -183,9 +183,9 @@ def test_a_delay_of_any_kind_is_in_the_repaired_model_as_it_was(name, strength):
     assert term.identifier == name
     _, value, _ = one.truth[0]
     np.testing.assert_allclose(term.value, value, rtol=0.06)
-    kept = from_text(to_text(of_diagnosis(found)))
+    kept = from_text(to_text(repaired_model_of(found)))
     clean = context_along(one.track, kept.calibration)
-    mag, gyro = contribution(clean, kept.terms)
+    mag, gyro = terms_contribution(clean, kept.terms)
     # as large as the field turns in that time
     if name == "mag_low_pass":
         late = np.linalg.norm(clean.field_dot_b, axis=1) * float(value[0])

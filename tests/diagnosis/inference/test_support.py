@@ -10,7 +10,11 @@ from scipy.special import chdtri
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.answer.added_field import calibration_of, deviation, less_calibration
+from ahrsd.diagnosis.answer.added_field import (
+    calibration_basis,
+    project_out_calibration,
+    rms_about_mean,
+)
 from ahrsd.diagnosis.answer.diagnosis import Assumed, Finding, Heldout, OnPriors, Where
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import build_problem
@@ -295,7 +299,7 @@ def test_sizes_of_what_is_left_are_those_that_were_put_in(track):
     parts = {one.component: one for one in found.components}
     at_s, times = all_sets.made.context.track.time_s, track.time_s
     rows = np.column_stack([np.interp(at_s, times, column) for column in world.T])
-    put_in = deviation(less_calibration(rows, calibration_of(all_sets.made.context)))
+    put_in = rms_about_mean(project_out_calibration(rows, calibration_basis(all_sets.made.context)))
     assert found.within
     # the filter follows what is slow: the likeliest course is smaller than the true one, never more
     assert 0.5 * put_in < parts["world_course"].size < 1.1 * put_in

@@ -15,8 +15,8 @@ from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.innovation_filter.context import (
     bandwidth_hz,
     build_context,
-    force_without_noise,
-    rate_by_others,
+    denoised_force,
+    rate_without_own_row,
     smoothed_rate,
 )
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
@@ -170,7 +170,7 @@ def test_a_column_of_rates_has_nothing_of_its_own_rows_noise() -> None:
     own = np.sum(smooth * noise, axis=0) / np.sum(clean**2, axis=0)
     assert np.all(own > 6e-3)  # sigma of each: 0.05 / 0.07 / sqrt(N) = 1.6e-3
     width = 1.0 / (2 * np.pi * bandwidth_hz(clean + noise, runs, 0.04, 0.05) * 0.04)
-    others = rate_by_others(clean + noise, smooth, width)
+    others = rate_without_own_row(clean + noise, smooth, width)
     share = np.sum(others * noise, axis=0) / np.sum(clean**2, axis=0)
     np.testing.assert_allclose(share, 0.0, atol=5e-3)
     inner = slice(250, -250)
@@ -187,14 +187,14 @@ def test_an_axis_that_does_not_turn_keeps_its_mean_row_by_row() -> None:
     smooth = smoothed_rate(rate, runs, 0.04, 0.02)
     assert np.ptp(smooth[:, 0]) == 0.0
     width = 1.0 / (2 * np.pi * bandwidth_hz(rate, runs, 0.04, 0.02) * 0.04)
-    others = rate_by_others(rate, smooth, width)
+    others = rate_without_own_row(rate, smooth, width)
     np.testing.assert_array_equal(others[:, 0], smooth[:, 0])
     assert np.all(np.std(others - smooth, axis=0)[1:] > 0.0)
 
 
 def test_quick_rates_are_not_taken_from_their_neighbours() -> None:
     rate = np.random.default_rng(1).standard_normal((100, 3))
-    assert rate_by_others(rate, rate, 1.0) is rate
+    assert rate_without_own_row(rate, rate, 1.0) is rate
 
 
 def swaying(count: int = 8000) -> np.ndarray:
@@ -206,7 +206,7 @@ def swaying(count: int = 8000) -> np.ndarray:
 def test_a_slow_force_is_kept_and_the_noise_is_not() -> None:
     force = swaying()
     noise = 0.2 * np.random.default_rng(1).standard_normal(force.shape)
-    found = force_without_noise(force + noise, [slice(0, len(force))])
+    found = denoised_force(force + noise, [slice(0, len(force))])
     assert np.sqrt(np.mean((found - force) ** 2)) < 0.25 * 0.2
     # nothing of the force has gone with the noise (the third axis sways no more than the noise)
     along = np.sum((found - found.mean(0)) * (force - force.mean(0)), axis=0)
@@ -215,7 +215,7 @@ def test_a_slow_force_is_kept_and_the_noise_is_not() -> None:
 
 def test_at_rest_there_is_one_force() -> None:
     noise = 0.2 * np.random.default_rng(2).standard_normal((4000, 3))
-    found = force_without_noise(np.array([0.1, -0.2, -9.8]) + noise, [slice(0, 4000)])
+    found = denoised_force(np.array([0.1, -0.2, -9.8]) + noise, [slice(0, 4000)])
     assert found.std(axis=0).max() < 0.01
 
 
@@ -224,6 +224,6 @@ def test_runs_are_apart_and_what_is_short_or_has_holes_is_as_it_was() -> None:
     force[400:] += 50.0
     runs = [slice(0, 400), slice(400, 450), slice(450, 600)]
     force[500, 1] = np.nan
-    found = force_without_noise(force, runs)
+    found = denoised_force(force, runs)
     np.testing.assert_array_equal(found[400:], force[400:])
     np.testing.assert_allclose(found[:400], force[:400], atol=0.02)

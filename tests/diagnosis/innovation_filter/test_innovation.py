@@ -15,11 +15,11 @@ from tracks import experiment, moved_model, track_of, true_model
 from ahrsd import so3
 from ahrsd.diagnosis.innovation_filter.innovation import (
     Filtered,
-    batches,
-    bearings,
-    joined,
+    batch_columns,
+    filtered_for_regression,
+    join_columns,
+    nominal_motion,
     nuisance_columns,
-    regressing,
     run_filter,
     sensitivities,
 )
@@ -174,8 +174,8 @@ def test_sensitivities_equal_finite_differences_with_the_gain_held(
     for at in range(11):
         step = np.zeros(11)
         step[at] = 1e-6
-        up = run_filter(track, moved_model(model, step), held=done).whitened
-        down = run_filter(track, moved_model(model, -step), held=done).whitened
+        up = run_filter(track, moved_model(model, step), gains_from=done).whitened
+        down = run_filter(track, moved_model(model, -step), gains_from=done).whitened
         numeric = -(up - down) / 2e-6
         assert np.abs(X[:, :, at] - numeric).max() < tolerance * max(1.0, np.abs(numeric).max())
 
@@ -185,7 +185,7 @@ def test_what_is_regressed_on_is_the_derivative_where_the_rates_have_no_noise() 
     track, model = _with_gap(track_of(made), 240, 15), true_model(made)
     done = run_filter(track, model)
     columns = nuisance_columns(done)
-    same = regressing(done, track.gyro_b_rad_s - model.gyro_bias_rad_s)
+    same = filtered_for_regression(done, track.gyro_b_rad_s - model.gyro_bias_rad_s)
     X = sensitivities(done, columns)
     assert np.abs(sensitivities(same, columns) - X).max() < 1e-9 * np.abs(X).max()
 
@@ -204,7 +204,9 @@ def test_sensitivities_of_terms_on_both_sides() -> None:
     )
     assert np.abs(both - alone).max() < 1e-9 * np.abs(both).max()
     up, down = (
-        run_filter(track, model, s * columns.mag[:, :, 0], s * columns.gyro[:, :, 0], held=done)
+        run_filter(
+            track, model, s * columns.mag[:, :, 0], s * columns.gyro[:, :, 0], gains_from=done
+        )
         for s in (1e-6, -1e-6)
     )
     numeric = -(up.whitened - down.whitened) / 2e-6
@@ -231,7 +233,7 @@ def test_bearings_are_those_of_the_run() -> None:
     made = experiment(samples=500)
     track, model = _with_gap(track_of(made), 240, 15), true_model(made)
     mag, gyro = np.random.default_rng(6).standard_normal((2, len(track), 3)) * 1e-3
-    done, quick = run_filter(track, model, mag, gyro), bearings(track, model, mag, gyro)
+    done, quick = run_filter(track, model, mag, gyro), nominal_motion(track, model, mag, gyro)
     assert np.array_equal(quick.nominal_b, done.nominal_b)
     assert np.array_equal(quick.orientation, done.orientation)
 
@@ -333,10 +335,10 @@ def test_batches_are_of_one_side_and_no_wider_than_wanted() -> None:
         of(gyro=5),
         of(mag=1),
     ]
-    found = batches(columns, 7)
+    found = batch_columns(columns, 7)
     assert found == [[0, 2], [4], [6], [1, 5], [3]]
     for batch in found:
-        together = joined([columns[k] for k in batch])
+        together = join_columns([columns[k] for k in batch])
         for part, k in ((together.mag, "mag"), (together.gyro, "gyro")):
             own = [getattr(columns[number], k) for number in batch]
             if part is None:

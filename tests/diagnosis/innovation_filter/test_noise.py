@@ -12,11 +12,11 @@ from tracks import experiment, track_of, true_model
 from ahrsd.diagnosis.innovation_filter.innovation import Filtered, run_filter
 from ahrsd.diagnosis.innovation_filter.noise import (
     Colour,
+    block_variances,
     colour_before_filter,
-    colour_of,
-    freedom_of,
+    fit_colour,
     level_facts,
-    levels,
+    tail_freedom,
 )
 from ahrsd.samples import Array
 
@@ -41,14 +41,14 @@ def _red(seed: int, power: float, samples: int = 4000, memory_s: float = 1.0) ->
 def test_white_innovations_have_no_colour_and_no_tails() -> None:
     for seed in range(4):
         done = _filtered(seed)
-        assert colour_of(done).order == 0
-        assert freedom_of(done) > 20
+        assert fit_colour(done).order == 0
+        assert tail_freedom(done) > 20
         assert level_facts(done, spec_given=True) == []
 
 
 def test_colour_is_found() -> None:
     done = _filtered(0, _red(0, 0.3))
-    colour = colour_of(done)
+    colour = fit_colour(done)
     assert colour.order >= 1
     gain = colour.coefficients.sum()
     assert colour.variance / (1 - gain) ** 2 > 2  # the power at low frequency
@@ -66,7 +66,7 @@ def test_heavy_tails() -> None:
     t4 = rng.standard_t(5, (6000, 3)) * 1e-3 / np.sqrt(5 / 3)
     model = replace(true_model(made), sigma_mag_gauss=1e-3)
     done = run_filter(replace(track, mag_b_gauss=track.mag_b_gauss + t4), model)
-    assert 4 < freedom_of(done) < 10
+    assert 4 < tail_freedom(done) < 10
     assert level_facts(done) == []
 
 
@@ -141,7 +141,7 @@ def test_a_few_outliers_are_no_level_above_the_data_sheet(seed: int) -> None:
     rng = np.random.default_rng([seed, 8])
     extra = np.where(rng.random((4000, 1)) < 0.003, 15e-3 * rng.standard_normal((4000, 3)), 0.0)
     done = _filtered(seed, extra)
-    _, variance, size = levels(done)
+    _, variance, size = block_variances(done)
     assert np.average(variance, weights=size) > 1.3  # the power is well above
     assert level_facts(done, spec_given=True) == []
 
@@ -163,7 +163,7 @@ def test_a_field_that_stands_still_bit_by_bit_has_no_noise_to_judge() -> None:
     model = replace(done.model, gyro_bias_rad_s=np.zeros(3))
     filtered = run_filter(still, model)
     assert level_facts(filtered, spec_given=True) == []
-    assert colour_of(filtered).order == 0
+    assert fit_colour(filtered).order == 0
 
 
 def test_motion_without_a_gyro_is_no_burst() -> None:
@@ -179,7 +179,7 @@ def test_a_slow_field_is_no_noise() -> None:
     done = _filtered(3, bump)
     assert done.normalised_innovation > 3
     assert level_facts(done, spec_given=True) == []
-    _, variance, _ = levels(done)
+    _, variance, _ = block_variances(done)
     assert variance.max() < 2
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ahrsd.diagnosis.innovation_filter.parallel_scan import inverse, layout_of
+from ahrsd.diagnosis.innovation_filter.parallel_scan import inverse_3x3, layout_of
 
 
 def test_layout_covers_every_row_once() -> None:
@@ -18,5 +18,5 @@ def test_the_inverse_is_one() -> None:
     rng = np.random.default_rng(1)
     root = rng.normal(size=(200, 3, 3)) + 3.0 * np.eye(3)
     S = root @ np.swapaxes(root, 1, 2)
-    found = np.moveaxis(inverse(np.moveaxis(S, 0, 2)), 2, 0)
+    found = np.moveaxis(inverse_3x3(np.moveaxis(S, 0, 2)), 2, 0)
     np.testing.assert_allclose(found, np.linalg.inv(S), rtol=1e-9, atol=1e-9)

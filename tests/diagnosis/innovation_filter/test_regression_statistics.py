@@ -11,10 +11,10 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.innovation_filter import regression_statistics
 from ahrsd.diagnosis.innovation_filter.regression_statistics import (
-    log_bayes,
-    posterior,
-    solve,
-    total_score,
+    log_bayes_factor,
+    posterior_probabilities,
+    projected_score,
+    solve_semidefinite,
 )
 
 VALUES = np.random.default_rng(0).standard_normal((500, 3))
@@ -26,14 +26,14 @@ def test_a_direction_counts_where_one_prior_deviation_would_show():
     scale = np.array([one.scale for one in effect.parameters])
     G = np.diag([0.1, 0.1, 1e-4]) / np.outer(scale, scale)
     s = np.array([3.0, 0.0, 0.0]) / scale
-    assert total_score(G, s, np.diag(G), scale).rank == 0
-    what = total_score(100 * G, 100 * s, np.diag(G), scale)
+    assert projected_score(G, s, np.diag(G), scale).rank == 0
+    what = projected_score(100 * G, 100 * s, np.diag(G), scale)
     assert what.rank == 2
     np.testing.assert_allclose(what.value, [30 * scale[0], 0.0, 0.0], atol=1e-12)
 
 
 def test_posterior_sums_to_one_and_follows_the_odds():
-    found = posterior({"a": 3.0, "b": 0.0, "c": 0.0}, {"c": -1.0})
+    found = posterior_probabilities({"a": 3.0, "b": 0.0, "c": 0.0}, {"c": -1.0})
     assert sum(found.values()) == pytest.approx(1.0, abs=1e-12)
     assert found["a"] / found["b"] == pytest.approx(np.exp(3.0))
     assert found["b"] / found["c"] == pytest.approx(np.e)
@@ -41,12 +41,14 @@ def test_posterior_sums_to_one_and_follows_the_odds():
 
 def test_a_direction_without_information_is_left_at_zero():
     G = np.diag([4.0, 1.0, 0.0]) + 0.0
-    np.testing.assert_allclose(solve(G, np.array([[8.0], [3.0], [0.0]]))[:, 0], [2.0, 3.0, 0.0])
+    np.testing.assert_allclose(
+        solve_semidefinite(G, np.array([[8.0], [3.0], [0.0]]))[:, 0], [2.0, 3.0, 0.0]
+    )
 
 
 def scored(X, e, scale):
     """The score of columns (n, p) in unit noise (n,)."""
-    return total_score(X.T @ X, X.T @ e, np.einsum("ij,ij->j", X, X), np.asarray(scale))
+    return projected_score(X.T @ X, X.T @ e, np.einsum("ij,ij->j", X, X), np.asarray(scale))
 
 
 def slow(rng, width):
@@ -64,15 +66,15 @@ def test_evidence_is_the_closed_form_of_one_size():
         for k in priors.EFFECT_GRID
     ]
     expected = np.logaddexp.reduce(sized) - np.log(len(priors.EFFECT_GRID))
-    assert log_bayes(what) == pytest.approx(expected, rel=1e-12)
+    assert log_bayes_factor(what) == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_smaller_family_wins_over_one_that_contains_it():
     rng = np.random.default_rng(7)
     X = slow(rng, 4)
     e = 0.05 * X[:, 0] + rng.standard_normal(4800)
-    one = log_bayes(scored(X[:, :1], e, np.ones(1)))
-    four = log_bayes(scored(X, e, np.ones(4)))
+    one = log_bayes_factor(scored(X[:, :1], e, np.ones(1)))
+    four = log_bayes_factor(scored(X, e, np.ones(4)))
     assert one > four + 3 > 20
 
 
@@ -84,7 +86,7 @@ def test_a_coefficient_pays_nothing_for_its_unit():
     small = scored(X, e, np.full(3, 1.0))  # a value of 3 % of the usual one
     usual = scored(X, e, np.full(3, 0.1))
     assert small.value == pytest.approx(usual.value)
-    assert log_bayes(small) == pytest.approx(log_bayes(usual), abs=0.6)
+    assert log_bayes_factor(small) == pytest.approx(log_bayes_factor(usual), abs=0.6)
 
 
 def test_probabilities_are_those_of_the_distributions():

@@ -34,7 +34,7 @@ def test_the_truth_turns_exactly_as_its_rate_says():
         field_b=context.field_b + 2e-3 * rng.standard_normal((900, 3)),
         R_nb=drift @ context.R_nb,
     )
-    truth = forward.truth_along(shaken)
+    truth = forward.noise_free_readings(shaken)
     within = np.isfinite(truth.dt_s)
     turn = so3.exp(-truth.rate_b_rad_s[within] * truth.dt_s[within][:, None])
     before = truth.field_b[np.flatnonzero(within) - 1]
@@ -52,7 +52,7 @@ def test_the_truth_turns_exactly_as_its_rate_says():
 
 def test_a_perfect_context_is_its_own_truth():
     context, readings = moving(2)
-    truth = forward.truth_along(context)
+    truth = forward.noise_free_readings(context)
     assert truth.field_b == pytest.approx(readings.field_b, abs=1e-10)
     assert truth.rate_b_rad_s[1:] == pytest.approx(readings.rate_b_rad_s[1:], abs=1e-9)
     assert truth.R_nb == pytest.approx(readings.R_nb, abs=1e-9)
@@ -60,16 +60,16 @@ def test_a_perfect_context_is_its_own_truth():
 
 def test_simulated_noise_is_what_the_filter_expects():
     context, _ = moving(3, rows=4000)
-    truth = forward.truth_along(context)
-    noise = forward.noise_of(context.model)
-    made = forward.simulated(truth, noise=noise, seed=7)
-    track = forward.track_of(made, context.track)
+    truth = forward.noise_free_readings(context)
+    noise = forward.model_noise(context.model)
+    made = forward.simulate_readings(truth, noise=noise, seed=7)
+    track = forward.track_from_readings(made, context.track)
     filtered = run_filter(track, context.model)
     assert filtered.normalised_innovation == pytest.approx(1.0, abs=0.04)
-    assert forward.noise_of(context.model, filtered) == noise
-    again = forward.simulated(truth, noise=noise, seed=7)
+    assert forward.model_noise(context.model, filtered) == noise
+    again = forward.simulate_readings(truth, noise=noise, seed=7)
     assert np.array_equal(again.mag_b_gauss, made.mag_b_gauss)
-    other = forward.simulated(truth, noise=noise, seed=8)
+    other = forward.simulate_readings(truth, noise=noise, seed=8)
     assert not np.array_equal(other.mag_b_gauss, made.mag_b_gauss)
 
 
@@ -77,10 +77,10 @@ def test_coloured_noise_is_made_and_found_again():
     context, _ = moving(4, rows=6000)
     model = context.model
     noise = Noise(model.sigma_mag_gauss, model.sigma_gyro_rad_s, 0.0, (0.5, 0.2))
-    made = forward.simulated(forward.truth_along(context), noise=noise, seed=1)
+    made = forward.simulate_readings(forward.noise_free_readings(context), noise=noise, seed=1)
     left = made.mag_b_gauss - context.field_b @ SOFT_IRON.T - HARD_IRON
     assert left.std() == pytest.approx(noise.mag_gauss, rel=0.05)
-    found = forward.noise_of(model, run_filter(forward.track_of(made), model)).colour
+    found = forward.model_noise(model, run_filter(forward.track_from_readings(made), model)).colour
     assert len(found) >= 2
     assert np.sum(found) == pytest.approx(0.7, abs=0.1)
 
@@ -96,13 +96,13 @@ def test_noise_that_cannot_be(values, said):
 
 def test_terms_come_before_the_noise_and_clipping_behind_it():
     context, _ = moving(5)
-    truth = forward.truth_along(context)
+    truth = forward.noise_free_readings(context)
     noise = Noise(1e-3, 1e-3)
     wanted = terms(truth, "mag_saturation", "motor_current_field")
-    made = forward.simulated(truth, wanted, noise, seed=2)
+    made = forward.simulate_readings(truth, wanted, noise, seed=2)
     assert np.abs(made.mag_b_gauss).max() == 0.4
-    free = forward.simulated(truth, wanted[1:], noise, seed=2)
-    plain = forward.simulated(truth, (), noise, seed=2)
+    free = forward.simulate_readings(truth, wanted[1:], noise, seed=2)
+    plain = forward.simulate_readings(truth, (), noise, seed=2)
     inside = np.abs(free.mag_b_gauss) < 0.4
     assert made.mag_b_gauss[inside] == pytest.approx(free.mag_b_gauss[inside])
     current = truth.covariates["motor_current_a"][:, None]
@@ -123,8 +123,8 @@ def test_a_model_file_reads_back_as_it_was_written():
         assert (old.identifier, old.setting) == (new.identifier, new.setting)
         assert np.array_equal(old.value, new.value)
         assert np.array_equal(old.deviation, new.deviation)
-    truth = forward.truth_along(context)
-    first, second = (forward.simulated(truth, m.terms, m.noise, 3) for m in (model, back))
+    truth = forward.noise_free_readings(context)
+    first, second = (forward.simulate_readings(truth, m.terms, m.noise, 3) for m in (model, back))
     assert np.array_equal(first.mag_b_gauss, second.mag_b_gauss)
 
 

@@ -123,7 +123,7 @@ def repaired(tmp_path, source):
     value = np.array([2e-3, 0.0, 0.0])
     term = Term("motor_current_field", value, 0.1 * np.abs(value), setting)
     path = tmp_path / "model.json"
-    path.write_text(to_text(RepairedModel(model, forward.noise_of(model), (term,), source.name)))
+    path.write_text(to_text(RepairedModel(model, forward.model_noise(model), (term,), source.name)))
     return path, value
 
 

@@ -13,11 +13,11 @@ from ahrsd.diagnosis.model import Noise, Term
 from ahrsd.diagnosis.repaired_model import injection
 from ahrsd.diagnosis.repaired_model.forward import (
     context_along,
-    simulated,
-    truth_along,
-    without,
+    noise_free_readings,
+    remove_terms,
+    simulate_readings,
 )
-from ahrsd.diagnosis.repaired_model.forward import track_of as track_from
+from ahrsd.diagnosis.repaired_model.forward import track_from_readings as track_from
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, to_text
 
 LEFT = ("mag_quantisation", "dropped_samples", "noise_level")
@@ -50,10 +50,10 @@ def term_of(name, readings, strength=1.0):
 def test_what_an_effect_added_is_gone(name, share):
     made = experiment("wam", samples=1500)
     model, track = true_model(made), with_columns(track_of(made), [name])
-    clean = truth_along(context_along(track, model))
+    clean = noise_free_readings(context_along(track, model))
     term = term_of(name, clean)
-    dirty = simulated(clean, [term])
-    mended, left = without(track_from(dirty, track), model, [term])
+    dirty = simulate_readings(clean, [term])
+    mended, left = remove_terms(track_from(dirty, track), model, [term])
     assert left == ()
     for after, before, true in (
         (mended.mag_b_gauss, dirty.mag_b_gauss, clean.mag_b_gauss),
@@ -67,7 +67,7 @@ def test_what_no_number_takes_out_comes_back_by_name():
     made = experiment("wam", samples=500)
     track, model = track_of(made), true_model(made)
     terms = [Term(name, np.zeros(1), np.zeros(1), {}) for name in LEFT]
-    same, left = without(track, model, terms)
+    same, left = remove_terms(track, model, terms)
     assert same is track
     assert left == LEFT
 
@@ -76,7 +76,7 @@ def test_a_column_that_is_missing_is_named():
     made = experiment("wam", samples=500)
     term = Term("motor_current_field", np.ones(3), np.zeros(3), {"covariate": "motor_current_a"})
     with pytest.raises(ValueError, match="motor_current_field needs the column motor_current_a"):
-        without(track_of(made), true_model(made), [term])
+        remove_terms(track_of(made), true_model(made), [term])
 
 
 def test_calibrate_with_the_model_gives_the_calibration_without_the_effect(run, tmp_path, capsys):

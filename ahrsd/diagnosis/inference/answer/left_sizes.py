@@ -15,10 +15,10 @@ import numpy as np
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.added_field import (
-    calibration_of,
-    deviation,
-    heading_off_deg,
-    less_calibration,
+    calibration_basis,
+    heading_deviation_deg,
+    project_out_calibration,
+    rms_about_mean,
 )
 from ahrsd.diagnosis.answer.diagnosis import (
     Component,
@@ -110,16 +110,16 @@ def left_sizes(
         if key not in keys and is_ordinary(all_sets, best, key)
     ]
     context = all_sets.made.context
-    take, nats = calibration_of(context), _nats(all_sets, best)
+    take, nats = calibration_basis(context), _nats(all_sets, best)
     whole = {unit: np.zeros((len(context.track), 3)) for unit in ("gauss", "rad/s")}
     parts = []
     besides = [key for key in keys if key not in all_sets.remainder]
     for key in (*all_sets.remainder, *besides, *untold):
         added, unit = contribution_of(all_sets, best, key)
-        added = less_calibration(added, take) if unit == "gauss" else added
+        added = project_out_calibration(added, take) if unit == "gauss" else added
         whole[unit] += added
-        size, frame = deviation(added), all_sets.component(key).frame
-        heading_deg = heading_off_deg(added, context) if unit == "gauss" else None
+        size, frame = rms_about_mean(added), all_sets.component(key).frame
+        heading_deg = heading_deviation_deg(added, context) if unit == "gauss" else None
         up_to = size * _to_limit(all_sets, best, key)
         there = nats[key] > priors.ODDS_REAL
         row = Component(
@@ -139,11 +139,11 @@ def left_sizes(
     return Ordinary(
         within=why is None,
         why=why,
-        field_gauss=deviation(whole["gauss"]),
+        field_gauss=rms_about_mean(whole["gauss"]),
         field_up_to_gauss=_together([one.up_to for one in fields]),
-        heading_deg=heading_off_deg(whole["gauss"], context),
+        heading_deg=heading_deviation_deg(whole["gauss"], context),
         heading_up_to_deg=_together(headings),
-        gyro_rad_s=deviation(whole["rad/s"]),
+        gyro_rad_s=rms_about_mean(whole["rad/s"]),
         gyro_up_to_rad_s=_together([one.up_to for one in parts if one.unit != "gauss"]),
         recordings=priors.RECORDINGS,
         components=tuple(parts),
@@ -224,7 +224,7 @@ def with_channels(
         return left
     frame, track = left.where.frame, found.all_sets.made.context.track
     like = [one for course in courses if course.frame == frame
-            for one in locate.matches(track, course)]  # fmt: skip
+            for one in locate.matching_channels(track, course)]  # fmt: skip
     follows = tuple(
         Suspect(one.channel, one.correlation, one.p_value)
         for one in like

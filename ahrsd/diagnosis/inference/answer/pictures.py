@@ -14,7 +14,13 @@ from ahrsd.diagnosis.inference.decision.members import coefficients, contributio
 from ahrsd.diagnosis.inference.likelihood.linearisation import step_to_maximum
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.diagnosis.inference.search_rounds import Searched
-from ahrsd.diagnosis.where_and_when.locate import FRAMES, Frame, Located, coarse_cut, single_source
+from ahrsd.diagnosis.where_and_when.locate import (
+    FRAMES,
+    Frame,
+    Located,
+    coarse_segments,
+    single_source_direction,
+)
 from ahrsd.samples import Array
 
 
@@ -66,11 +72,11 @@ def _course(all_sets: Hypotheses, best: Hypothesis, frame: Frame) -> Located:
     with_it = best if there else all_sets.judge(best.names | {key}, best)
     without = all_sets.judge(best.names - {key}, best) if there else best
     value, unsure = (part.reshape(-1, 3) for part in coefficients(all_sets, with_it, key))
-    cut = coarse_cut(track)
+    cut = coarse_segments(track)
     phase = np.pi * (cut.middle_s - track.time_s[0]) / track.duration_s
     waves = np.cos(phase[:, None] * np.arange(1, len(value) + 1))
     course, deviation = waves @ value, np.sqrt(np.mean(waves**2 @ unsure**2, axis=1))
-    direction, _ = single_source(course, deviation)
+    direction, _ = single_source_direction(course, deviation)
     nats = max(with_it.at.nats - without.at.nats, 0.0)
     return Located(
         frame=frame,

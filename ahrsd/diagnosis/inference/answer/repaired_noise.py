@@ -15,7 +15,7 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import (
     Finding,
 )
-from ahrsd.diagnosis.answer.predictive_checks import usual_noise
+from ahrsd.diagnosis.answer.predictive_checks import constant_level_noise
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.data_quality.facts import (
     Fact,
@@ -52,7 +52,7 @@ def repaired_noise(
     fit = NullFit(done.model, done, True, np.zeros((11, 11)), point.terms_mag, point.terms_gyro)
     # a delay is out of the track, and what only the recorded rate shows out of the recording
     kept = [term for term in answer.terms if not library[term.identifier].delay]
-    return usual_noise(fit, loud, (*kept, *rounding(facts)), library)
+    return constant_level_noise(fit, loud, (*kept, *rounding(facts)), library)
 
 
 def _with_names_alone(found: Searched) -> Point:

@@ -22,13 +22,18 @@ from scipy.fft import idct
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Check, RegimeMap, Whiteness
-from ahrsd.diagnosis.answer.omnibus import omnibus
-from ahrsd.diagnosis.answer.predictive_checks import COPIES, bands, scene_of, statistics
+from ahrsd.diagnosis.answer.omnibus import omnibus_tests
+from ahrsd.diagnosis.answer.predictive_checks import (
+    COPIES,
+    build_scene,
+    predictive_bands,
+    residual_statistics,
+)
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
 from ahrsd.diagnosis.inference.likelihood.linearisation import CALIBRATION, Linearised, cosine_rows
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
-from ahrsd.diagnosis.innovation_filter.innovation import batches, joined, sensitivities
-from ahrsd.diagnosis.innovation_filter.noise import freedom_of
+from ahrsd.diagnosis.innovation_filter.innovation import batch_columns, join_columns, sensitivities
+from ahrsd.diagnosis.innovation_filter.noise import tail_freedom
 from ahrsd.diagnosis.model import Columns
 from ahrsd.diagnosis.where_and_when.regime import regime_columns, regimes
 from ahrsd.samples import Array
@@ -100,22 +105,26 @@ def _compared(
 ) -> tuple[dict[str, float], dict[str, float], dict[str, tuple[float, float]]]:
     """Statistics before and after, and the bands of copies."""
     rows = found.rows
-    scene, shape = scene_of(rows.made.context), (-1, 3)
+    scene, shape = build_scene(rows.made.context), (-1, 3)
 
     def stated(left: Array) -> dict[str, float]:
-        return statistics(rows.in_track(left.reshape(shape)), scene)
+        return residual_statistics(rows.in_track(left.reshape(shape)), scene)
 
     rng = np.random.default_rng(0)
     e = _drawn(rng, found, (len(found.after), COPIES))
     w = rng.standard_normal((rows.X.shape[2], COPIES)) * found.whole.deviation[:, None]
     copies = found.whole.left(e + found.whole.X @ w)
-    return stated(found.before), stated(found.after), bands([stated(one) for one in copies.T])
+    return (
+        stated(found.before),
+        stated(found.after),
+        predictive_bands([stated(one) for one in copies.T]),
+    )
 
 
 def _drawn(rng: np.random.Generator, found: Residuals, shape: tuple[int, int]) -> Array:
     """White noise of unit variance, its tails those of what is left."""
     filtered = found.rows.made.point.filtered
-    freedom = freedom_of(replace(filtered, whitened=found.whitened))
+    freedom = tail_freedom(replace(filtered, whitened=found.whitened))
     e = rng.standard_normal(shape)
     if np.isfinite(freedom):
         e *= np.sqrt((freedom - 2.0) / rng.chisquare(freedom, shape))
@@ -158,10 +167,10 @@ def whiteness(start: NullFit, found: Residuals) -> dict[str, Whiteness]:
     """Tests that need no idea of what may be wrong, of the null and of what the answer leaves."""
     context = found.rows.made.context
     left = replace(found.rows.made.point.filtered, whitened=found.whitened)
-    later = {test.name: test.p_value for test in omnibus(left, context)}
+    later = {test.name: test.p_value for test in omnibus_tests(left, context)}
     return {
         test.name: Whiteness(test.words, test.p_value, later.get(test.name, 1.0))
-        for test in omnibus(start.filtered, start.context())
+        for test in omnibus_tests(start.filtered, start.context())
     }
 
 
@@ -196,8 +205,8 @@ class WhiteRows:
     def passed(self, columns: Sequence[Columns]) -> Array:
         """(N, 3, p) columns of any kind as the filter and this noise leave them."""
         made, found = self.made, []
-        for batch in batches(columns, _BATCH):
-            cube = sensitivities(made.regressing, joined([columns[k] for k in batch]))
+        for batch in batch_columns(columns, _BATCH):
+            cube = sensitivities(made.regressing, join_columns([columns[k] for k in batch]))
             cube = made.whiten_axes(cosine_rows(cube / made.point.loud.amplitude[:, None, None]))
             found.append((batch, self.like(cube)))
         cut = {

@@ -19,7 +19,7 @@ from ahrsd.diagnosis.inference.components.gaussian_process import (
     GaussianProcessLaw,
     gaussian_process,
 )
-from ahrsd.diagnosis.model import Columns, Context, directions
+from ahrsd.diagnosis.model import Columns, Context, unit_vectors
 from ahrsd.diagnosis.where_and_when.regime import heading_columns
 from ahrsd.estimator.locked import harmonics, on_each_axis
 from ahrsd.samples import Array
@@ -94,7 +94,7 @@ def coefficient_factors(
     order = np.arange(1, _FACTOR_MODES + 1)
     phase = np.pi * (time_s - time_s[0]) / (time_s[-1] - time_s[0])
     law_in_time = GaussianProcessLaw(order.astype(float), 1.0, most=priors.VARIES_MOST)
-    unit = directions(context.field_b)
+    unit = unit_vectors(context.field_b)
     degree_1_and_2 = np.column_stack([np.sqrt(3.0) * unit, harmonics(context.field_b)[:, :5]])
     low, high = (np.array([np.log(one)]) for one in (priors.COURSE_SIZES[0], priors.VARIES_MOST))
     law_in_attitude = ScaledLaw(np.ones(degree_1_and_2.shape[1]), low, high)

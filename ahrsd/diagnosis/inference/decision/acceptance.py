@@ -36,7 +36,7 @@ from ahrsd.diagnosis.inference.search.model_search import (
     sets_with_merged_steps,
     step_alternatives,
 )
-from ahrsd.diagnosis.where_and_when.locate import single_source
+from ahrsd.diagnosis.where_and_when.locate import single_source_direction
 
 
 def accept_members(
@@ -276,7 +276,9 @@ def _drop_parts_of_unknown_source(
     unknown = [key for key in set(members) - set(effects) if not is_ordinary(all_sets, best, key)]
     contributions = {key: contribution_of(all_sets, best, key)[0] for key in (*effects, *unknown)}
     for key in sorted(unknown, key=lambda one: -odds[one]):
-        direction, share = single_source(contributions[key], np.ones(len(contributions[key])))
+        direction, share = single_source_direction(
+            contributions[key], np.ones(len(contributions[key]))
+        )
         if share < priors.MAINLY_ONE:
             continue
         aligned = [one for one in effects if acts_along(direction, contributions[one])]

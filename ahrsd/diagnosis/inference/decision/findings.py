@@ -32,7 +32,7 @@ from ahrsd.diagnosis.inference.search.model_search import (
 )
 from ahrsd.diagnosis.inference.search.near_settings import perturbed_settings, with_setting_slopes
 from ahrsd.diagnosis.model import Term
-from ahrsd.diagnosis.where_and_when.address import where_of
+from ahrsd.diagnosis.where_and_when.address import locate_contribution
 from ahrsd.samples import Array
 
 
@@ -160,7 +160,9 @@ def _effect_probabilities(
 def _locate(all_sets: Hypotheses, best: Hypothesis, key: str, frame: str) -> Where:
     """When, on which axes and in which regime a member acts, described in a frame."""
     member, track = all_sets.component(key), all_sets.made.context.track
-    return where_of(track, contribution_of(all_sets, best, key)[0], member.setting, frame)
+    return locate_contribution(
+        track, contribution_of(all_sets, best, key)[0], member.setting, frame
+    )
 
 
 def drift_finding(

@@ -96,7 +96,10 @@ def nats_of_remainder(all_sets: Hypotheses, best: Hypothesis) -> float:
 def cost_if_left_out(all_sets: Hypotheses, best: Hypothesis, key: str) -> Cost:
     """How far off the calibration of the set would be without a member."""
     made = all_sets.made
-    prior_mean, current = calibration_prior(made.point.problem.track).mean, made.point.filtered.model
+    prior_mean, current = (
+        calibration_prior(made.point.problem.track).mean,
+        made.point.filtered.model,
+    )
     reduced = all_sets.judge(all_sets.without_member(best.names, key), best)
     model_without, model_with = (
         model_from_coefficients(coefficients(all_sets, one, CALIBRATION)[0] + prior_mean, current)

@@ -19,8 +19,8 @@ from ahrsd.diagnosis.inference.decision.members import (
 )
 from ahrsd.diagnosis.inference.likelihood.directed_noise import DirectedNoise
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Space
-from ahrsd.diagnosis.where_and_when.address import AXES, departures
-from ahrsd.diagnosis.where_and_when.locate import Frame, single_source, unit_columns
+from ahrsd.diagnosis.where_and_when.address import AXES, departure_intervals
+from ahrsd.diagnosis.where_and_when.locate import Frame, single_source_direction, unit_columns
 from ahrsd.samples import Array
 
 #: times at which a curve is sampled over a recording, and at least in an interval
@@ -116,7 +116,7 @@ def directed_noise_source(
 
 def acts_along(direction: Array, contribution: Array) -> bool:
     """Whether a contribution (N, 3) has one direction, within `SAME_DIRECTION` of the given one."""
-    own_direction, share = single_source(contribution, np.ones(len(contribution)))
+    own_direction, share = single_source_direction(contribution, np.ones(len(contribution)))
     return bool(
         share > priors.ONE_SOURCE and abs(own_direction @ direction) > priors.SAME_DIRECTION
     )
@@ -135,7 +135,7 @@ def _describe_free_process(
     cosines = np.cos(phase_rad[:, None] * order)
     values = cosines @ modes
     deviation = np.sqrt(np.mean(cosines**2 @ mode_deviation**2, axis=1))
-    intervals = departures(edges, values, deviation)
+    intervals = departure_intervals(edges, values, deviation)
     spans = intervals or [(float(time_s[0]), float(time_s[-1]))]
     return _describe_values(at, values, component.frame, odds, tuple(spans))
 
@@ -162,7 +162,7 @@ def _describe_members(
         edges = np.array(component.setting["edges_s"])
         levels = interpolated((edges[1:] + edges[:-1]) / 2)
         deviation = float(np.max(coefficients(all_sets, best, keys[0])[1]))
-        spans = tuple(departures(edges, levels, np.full(len(levels), deviation)))
+        spans = tuple(departure_intervals(edges, levels, np.full(len(levels), deviation)))
     return _describe_values(at, interpolated(at), component.frame, odds, spans)
 
 
@@ -170,7 +170,7 @@ def _describe_values(
     at: Array, values: Array, frame: str, nats: float, spans: tuple[tuple[float, float], ...]
 ) -> Unexplained:
     """Values (k, 3) at times (k,) as something unexplained."""
-    direction, share = single_source(values, np.ones(len(at)))
+    direction, share = single_source_direction(values, np.ones(len(at)))
     along_direction = values @ direction
     spread = values.std(axis=0)
     axes = tuple(axis for axis, size in zip(AXES, spread, strict=True) if size > 0.3 * spread.max())

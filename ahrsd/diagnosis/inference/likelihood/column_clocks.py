@@ -13,7 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.columns.clocks import ColumnClock, column_at_clock, most_probable_clock, find_shifted_columns
+from ahrsd.diagnosis.columns.clocks import (
+    ColumnClock,
+    column_at_clock,
+    find_shifted_columns,
+    most_probable_clock,
+)
 from ahrsd.diagnosis.effects.design_matrix import on_axes
 from ahrsd.diagnosis.inference.components.component import Component, ScaledLaw
 from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
@@ -25,7 +30,7 @@ from ahrsd.diagnosis.inference.likelihood.richest_model import (
     psi_by_key,
 )
 from ahrsd.diagnosis.model import Columns
-from ahrsd.diagnosis.where_and_when.locate import Located, segments
+from ahrsd.diagnosis.where_and_when.locate import Located, equal_segments
 
 _FREE_FIELD = FREE_PROCESSES[0]
 
@@ -47,7 +52,7 @@ def find_wrong_clock(fitted: FittedPoint) -> ColumnClock | None:
 def _free_field(fitted: FittedPoint) -> Located:
     """The free field on the sensor, interval by interval."""
     base, track = fitted.base, fitted.base.made.context.track
-    cut = segments(track.time_s, max(2, int(track.duration_s / priors.ON_TIME_S)))
+    cut = equal_segments(track.time_s, max(2, int(track.duration_s / priors.ON_TIME_S)))
     value, coefficient_deviation = (
         coefficients_by_key(base.made, base.whole, at)[_FREE_FIELD].reshape(-1, 3)
         for at in (fitted.at, replace(fitted.at, mean=fitted.at.deviation))

@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.inference.likelihood.noise_model import octave_edges
-from ahrsd.diagnosis.model import directions
+from ahrsd.diagnosis.model import unit_vectors
 from ahrsd.samples import Array
 
 #: number of starts of the maximisation: the most probable of the three axes and each octave's
@@ -81,7 +81,7 @@ def fit_directed_noise(
     count = len(residual)
     edges = octave_edges(count)
     bands = [(max(1, int(a)), int(b)) for a, b in itertools.pairwise(edges)]
-    unit = directions(field_b)
+    unit = unit_vectors(field_b)
     along_field = np.sum(residual * unit, axis=1, keepdims=True) * unit
     cosines, along_cosines = (
         np.asarray(dct(one, axis=0, norm="ortho")) for one in (residual, along_field)

@@ -25,10 +25,10 @@ from ahrsd.diagnosis.inference.likelihood.evidence import ModelFit, Products
 from ahrsd.diagnosis.innovation_filter.context import build_context
 from ahrsd.diagnosis.innovation_filter.innovation import (
     Filtered,
-    batches,
-    joined,
+    batch_columns,
+    filtered_for_regression,
+    join_columns,
     nuisance_columns,
-    regressing,
     run_filter,
     sensitivities,
 )
@@ -132,8 +132,8 @@ class Linearised:
         distinct = list(reversed(first.values()))
         parts = [Columns(one.columns.mag, one.columns.gyro) for one in distinct]
         amplitude = self.point.loud.amplitude[:, None, None]
-        for batch in batches(parts, self._batch_width()):
-            cube = sensitivities(self.regressing, joined([parts[k] for k in batch]))
+        for batch in batch_columns(parts, self._batch_width()):
+            cube = sensitivities(self.regressing, join_columns([parts[k] for k in batch]))
             rows = cosine_rows(np.divide(cube, amplitude, dtype=np.float32, casting="same_kind"))
             self.batches.append(self.whiten_axes(rows))
             start = 0
@@ -366,7 +366,9 @@ def refilter_with_columns(point: Point, components: Sequence[Component]) -> Poin
     if not subtracted and point.terms_mag is None and point.terms_gyro is None:
         return point
     mag, gyro = total_contribution(len(point.filtered.track), known, subtracted)
-    filtered = run_filter(point.problem.track, point.filtered.model, mag, gyro, held=point.filtered)
+    filtered = run_filter(
+        point.problem.track, point.filtered.model, mag, gyro, gains_from=point.filtered
+    )
     return replace(point, filtered=filtered, values=values, terms_mag=mag, terms_gyro=gyro)
 
 
@@ -405,7 +407,9 @@ def refit_filter_noise(point: Point) -> Point:
     problem, mag, gyro = point.problem, point.terms_mag, point.terms_gyro
     model = point.filtered.model
     filtered = run_filter(problem.track, model, mag, gyro)
-    refitted = _cap_noise(noise_fit.estimate_noise(filtered, problem.spec, mag, gyro, walk=False), model)
+    refitted = _cap_noise(
+        noise_fit.estimate_noise(filtered, problem.spec, mag, gyro, walk=False), model
+    )
     return replace(point, filtered=run_filter(problem.track, refitted, mag, gyro))
 
 
@@ -417,7 +421,7 @@ def linearise(
     context: from which all columns are computed
     band_hz: band in which the noise may have any power
     """
-    regressing_filter = regressing(point.filtered, context.rate_b_rad_s)
+    regressing_filter = filtered_for_regression(point.filtered, context.rate_b_rad_s)
     count = transform_length(len(point.filtered.whitened))
     scaled = point.filtered.whitened / point.loud.amplitude[:, None]
     white = cosine_rows(scaled[:, :, None])[:, 0]
@@ -509,10 +513,10 @@ def step_to_maximum(
     mag, gyro = total_contribution(len(made.context.track), known, subtracted)
     on_sensor = {key: value for key, value in subtracted.items() if known[key].frame == "sensor"}
     lag_s = sum(float(values[key][0]) for key in point.exact if key in values)
-    problem = problem.averaged_beside(
+    problem = problem.averaged_with(
         total_contribution(len(made.context.track), known, on_sensor)[0], model, lag_s
     )
-    filtered = run_filter(problem.track, model, mag, gyro, held=point.filtered)
+    filtered = run_filter(problem.track, model, mag, gyro, gains_from=point.filtered)
     effects = {key: value for key, value in subtracted.items() if known[key].effect is not None}
     _, misread = total_contribution(len(made.context.track), known, effects)
     kept = point.loud, point.exact, misread, point.directed

@@ -102,9 +102,7 @@ def _interpolate_held(problem: Problem, name: str) -> Problem | None:
     held = tuple(one for one in find_held_columns(problem.recorded) if one.name == name)
     if not held:
         return None
-    note = (
-        f"column {label(name)} comes {held[0].interval_words}: drawn straight between its values"
-    )
+    note = f"column {label(name)} comes {held[0].interval_words}: drawn straight between its values"
     return _replace_recorded(problem, interpolate_held_columns(problem.recorded, held), note)
 
 
