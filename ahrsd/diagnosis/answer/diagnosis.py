@@ -60,7 +60,7 @@ class Value:
 class Heldout:
     """Predictive gain of the model on blocks that it was not fitted to.
 
-    placebo_gain: that of the same effect shifted in time (99th percentile), nats per sample
+    placebo_gain: that of the best of the time-shifted copies of the effect, nats per sample
     """
 
     rms_before_gauss: float

@@ -14,8 +14,8 @@ and the fitted noise.  First the calibration is fitted to each copy as it was to
 the residuals of the recording are like those of the copies, recording and calibration agree,
 whatever else was found.  If not, the first copies are diagnosed as well, and a finding must be far
 beyond what is found in these.  Calibration and noise are those of the fit without any effect or of
-the fit with the effects, whichever has the lower magnetometer noise: the residual of a missing
-effect is not noise, and noisier copies show more by chance.
+the fit with the effects, whichever has the noisier gyro relative to its magnetometer: the residual
+of a missing effect is not magnetometer noise.
 
 The motion is the expected value of the gyro's readings without their noise
 (`time_series.wiener_filter`), aligned by field and accelerometer.  A copy has no mismatch, so

@@ -8,6 +8,7 @@ Whatever a file calls its columns, a person sees one short line (`label`).
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -237,16 +238,17 @@ def _fill_gaps(name: str, values: Array, time_s: Array) -> tuple[Array, str]:
     if share > priors.COLUMN_MISSING:
         return values, f"column {label(name)} was left out: {share:.0%} of its values are missing"
     known_s = np.concatenate([time_s[:1], time_s[good], time_s[-1:]])
-    widest = int(np.argmax(np.diff(known_s)))
-    hole_s = float(known_s[widest + 1] - known_s[widest])
     usual_s = float(np.median(np.diff(time_s)))
-    if hole_s > priors.COLUMN_GAP_S + usual_s and not _samples_pause(
-        time_s, known_s[widest], hole_s
-    ):
+    gaps = [
+        (begin, end)
+        for begin, end in itertools.pairwise(known_s)
+        if end - begin > priors.COLUMN_GAP_S + usual_s and _has_samples(time_s, begin, end)
+    ]
+    if gaps:
+        begin, end = max(gaps, key=lambda one: one[1] - one[0])
         return values, (
-            f"column {label(name)} was left out: no values from {known_s[widest]:.1f} to "
-            f"{known_s[widest + 1]:.1f} s; holes of more than {priors.COLUMN_GAP_S:g} s are not "
-            "guessed"
+            f"column {label(name)} was left out: no values from {begin:.1f} to {end:.1f} s; "
+            f"holes of more than {priors.COLUMN_GAP_S:g} s are not guessed"
         )
     nearest = _longest_nonzero_interval(values[good]) and np.isin(values[good], (0.0, 1.0)).all()
     if nearest:  # a switch is on or off, never half
@@ -255,10 +257,9 @@ def _fill_gaps(name: str, values: Array, time_s: Array) -> tuple[Array, str]:
     return np.interp(time_s, time_s[good], values[good]), ""
 
 
-def _samples_pause(time_s: Array, from_s: float, hole_s: float) -> bool:
-    """Whether there are no samples in the gap, so that no value is missing."""
-    inside = (time_s > from_s) & (time_s < from_s + hole_s)
-    return not bool(inside.any())
+def _has_samples(time_s: Array, begin_s: float, end_s: float) -> bool:
+    """Whether there are samples between two times: where they pause no value is missing."""
+    return bool(np.any((time_s > begin_s) & (time_s < end_s)))
 
 
 def _longest_nonzero_interval(values: Array) -> int:

@@ -129,7 +129,7 @@ def single_source_direction(series: Array, deviation: Array) -> tuple[Array, flo
     return np.asarray(direction), float(power[0] / max(power.sum(), 1e-300))
 
 
-def segment_means(track: Track, covariate: Array, cut: Segments) -> Array:
+def segment_means(covariate: Array, cut: Segments) -> Array:
     """(J,) mean of a logged column over each segment; nan where it has no value."""
     out = np.full(len(cut), np.nan)
     for j in range(len(cut)):
@@ -155,7 +155,7 @@ def matching_channels(track: Track, located: Located) -> tuple[Match, ...]:
     """
     found = []
     for channel, values in track.covariates.items():
-        logged = segment_means(track, values, located.cut)
+        logged = segment_means(values, located.cut)
         known = np.isfinite(logged)
         if known.sum() < 6 or np.ptp(logged[known]) == 0:
             continue

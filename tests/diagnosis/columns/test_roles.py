@@ -117,6 +117,17 @@ def test_a_hole_of_the_samples_themselves_is_none_of_the_column():
     assert found.covariates["x_a"] == pytest.approx(RAMP)
 
 
+def test_a_gap_of_a_column_counts_beside_a_longer_pause_of_the_samples():
+    base = track(motor_current_a=RAMP)
+    time_s = base.time_s + np.where(np.arange(200) >= 100, 30.0, 0.0)
+    values = RAMP.copy()
+    values[20:75] = np.nan
+    moved = Track(time_s, base.dt_s, base.mag_b_gauss, base.gyro_b_rad_s, None, {"x_a": values})
+    found, (note,) = roles.prepare_columns(moved)
+    assert "no values from 1.9 to 7.5 s" in note
+    assert found.covariates == {}
+
+
 def test_columns_without_a_role_are_kept():
     found, notes = roles.prepare_columns(track(hdop=RAMP))
     assert list(found.covariates) == ["hdop"]

@@ -273,7 +273,9 @@ def _drop_parts_of_unknown_source(
     odds = {key: best.score - rival.score for key, rival in rivals.items()}
     members = [key for key in odds if key != LAG and all_sets.component(key).columns.on_mag]
     effects = [key for key in members if all_sets.component(key).row is not None]
-    unknown = [key for key in set(members) - set(effects) if not is_ordinary(all_sets, best, key)]
+    unknown = [
+        key for key in members if key not in effects and not is_ordinary(all_sets, best, key)
+    ]
     contributions = {key: contribution_of(all_sets, best, key)[0] for key in (*effects, *unknown)}
     for key in sorted(unknown, key=lambda one: -odds[one]):
         direction, share = single_source_direction(

@@ -194,7 +194,7 @@ class Linearised:
 
         It is multiplied with all others; its neighbours in the old batch need not be.
         """
-        for key in set(keys) - self.apart:
+        for key in sorted(set(keys) - self.apart):
             one = self.seen[key]
             self.batches.append(self.batches[one.batch][:, one.columns].copy())
             own = slice(0, one.component.width)

@@ -53,7 +53,7 @@ def search_at_point(
     starts: list[Names] = [frozenset(), lag, real | lag, real | lag | {FREE_PROCESSES[0]}]
     if known:
         start = known | real if was_real else known
-        starts = [start, known, start | {FREE_PROCESSES[0]}, start | set(FREE_PROCESSES[:2]) - real]
+        starts = [start, known, start | {FREE_PROCESSES[0]}, start | set(FREE_PROCESSES[:2])]
     if not (known and was_real):
         _add_switching_sources(all_sets, space, all_sets.judge(()))
     hypotheses = beam_search(all_sets, space, starts)
