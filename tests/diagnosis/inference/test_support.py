@@ -15,7 +15,14 @@ from ahrsd.diagnosis.answer.added_field import (
     project_out_calibration,
     rms_about_mean,
 )
-from ahrsd.diagnosis.answer.diagnosis import Assumed, Finding, Heldout, OnPriors, Where
+from ahrsd.diagnosis.answer.diagnosis import (
+    Assumed,
+    Finding,
+    Heldout,
+    OnPriors,
+    Unexplained,
+    Where,
+)
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import build_problem
 from ahrsd.diagnosis.effects.library import EFFECTS
@@ -33,9 +40,11 @@ from ahrsd.diagnosis.inference.answer.support import (
     NOISE,
     ORDINARY,
     doubts,
+    nearest,
     on_priors,
 )
 from ahrsd.diagnosis.inference.answer.visibility import limits, seen_alone
+from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Space
 from ahrsd.diagnosis.inference.search.search_space import build_search_space
@@ -90,6 +99,20 @@ def gains(found: tuple[Hypotheses, Space], name: str) -> tuple[float, float]:
     held = HeldOut(all_sets, all_sets.judge({key}))
     told = held.told((key,))
     return told.nll_gain_per_sample * held.samples, told.placebo_gain * held.samples
+
+
+def test_what_is_not_reported_is_compared_with_an_unknown_cause_in_its_place(track):
+    """As the decision does: over nothing it may be beyond what is required."""
+    all_sets, space = sets_of(with_current(track, field=True))
+    bare, key = all_sets.judge(()), key_of(space, "motor_current_field")
+    answer = Answer(bare, (), (), {}, (), (), Unexplained(False), 0.0)
+    named = all_sets.judge({key})
+    (alone,) = nearest(answer, all_sets)
+    assert f"motor_current_field: {named.score - bare.score:+.1f} nats over no effect" in alone
+    free = all_sets.judge({space.courses[0]})
+    assert free.score > bare.score
+    (beside,) = nearest(answer, all_sets)
+    assert f"motor_current_field: {named.score - free.score:+.1f} nats over an unknown" in beside
 
 
 def test_a_set_with_too_many_coefficients_is_no_candidate_and_its_neighbours_are(idle, monkeypatch):

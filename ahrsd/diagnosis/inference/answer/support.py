@@ -115,8 +115,19 @@ def doubts(told: Sequence[Finding]) -> tuple[str, ...]:
 
 
 def nearest(answer: Answer, all_sets: Hypotheses) -> tuple[str, ...]:
-    """A sentence on the likeliest name that is not told: how far from one it is."""
+    """A sentence on the most probable effect that is not reported: how far from a finding it is.
+
+    As the decision does, it is compared with the best set without it: with nothing more, or with a
+    free process in its place.
+    """
     best = answer.best
+    in_its_place = [
+        one
+        for names, one in all_sets.judged.items()
+        if best.names < names
+        and all(all_sets.component(key).effect is None for key in names - best.names)
+    ]
+    rival = max([best, *in_its_place], key=lambda one: one.score)
     more = {
         key: one
         for names, one in all_sets.judged.items()
@@ -128,12 +139,13 @@ def nearest(answer: Answer, all_sets: Hypotheses) -> tuple[str, ...]:
         return ()
     key = max(more, key=lambda one: more[one].score)
     asked = required_odds(all_sets, more[key], key)
-    found = on_priors(all_sets, more[key], best, asked)
+    found = on_priors(all_sets, more[key], rival, asked)
     most = max(nats for one in found.assumed for nats in (one.half_nats, one.double_nats))
     name = all_sets.component(key).effect
+    other = "no effect" if rival is best else "an unknown cause"
     return (
-        f"nearest to being found is {name}: {found.log_odds:+.1f} nats where {asked:.0f} are "
-        f"required; at most {most:+.1f} with each prior halved or doubled",
+        f"nearest to being found is {name}: {found.log_odds:+.1f} nats over {other} where "
+        f"{asked:.0f} are required; at most {most:+.1f} with each prior halved or doubled",
     )
 
 
