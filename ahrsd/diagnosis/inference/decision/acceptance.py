@@ -80,7 +80,7 @@ def _drop_unsupported(
             key for key in odds if odds[key] < required[key] or _is_mostly_form(all_sets, best, key)
         ]
         if not unsupported:
-            without_pair = _drop_cancelling_pair(all_sets, best, required)
+            without_pair = _drop_unsupported_pair(all_sets, space, best, required)
             if without_pair is best:
                 return best, rivals
             best = without_pair
@@ -150,23 +150,24 @@ def _is_mostly_form(all_sets: Hypotheses, best: Hypothesis, key: str) -> bool:
     return bool(projection @ projection < priors.OWN_PART * (total @ total))
 
 
-def _drop_cancelling_pair(
-    all_sets: Hypotheses, best: Hypothesis, required: Mapping[str, float]
+def _drop_unsupported_pair(
+    all_sets: Hypotheses, space: Space, best: Hypothesis, required: Mapping[str, float]
 ) -> Hypothesis:
-    """Remove two effects that change at one time and are not worth what both require together.
+    """Remove two effects that are not worth what both require together.
 
-    Steps of the field and of the iron at one time cancel: without one of them the other's
-    contribution is no longer compensated, so each of them looks certain.
+    Each may be certain given the other: steps of the field and of the iron at one time cancel, and
+    two effects that share an unknown source fit it together.  So both are left out at once, with
+    nothing or one free process in time in their place.
     """
-    times_s = {key: all_sets.component(key).moments_s for key in required}
-    for first, last in itertools.combinations(sorted(key for key in required if times_s[key]), 2):
-        separation_s = np.abs(np.subtract.outer(times_s[first], times_s[last]))
-        if np.min(separation_s) > priors.APPROACH_S:
-            continue
+    effects = [key for key in sorted(required) if all_sets.component(key).effect is not None]
+    for first, last in itertools.combinations(effects, 2):
         least = best.score - required[first] - required[last]
-        reduced = all_sets.judge_above(best.names - {first, last}, best, least)
-        if reduced is not None and reduced.score > least:
-            return reduced
+        reduced = all_sets.without_member(all_sets.without_member(best.names, first), last)
+        processes = [one for one in space.courses if one not in reduced]
+        for members in (reduced, *(reduced | {one} for one in processes)):
+            found = all_sets.judge_above(members, best, least)
+            if found is not None and found.score > least:
+                return found
     return best
 
 
