@@ -31,6 +31,7 @@ from ahrsd.diagnosis.inference.search.model_search import (
 )
 from ahrsd.diagnosis.inference.search.remembered import memory_settings
 from ahrsd.diagnosis.inference.search.switching_sources import find_switching_sources
+from ahrsd.diagnosis.model import Context
 
 FREE_PROCESSES = ("free sensor", "free world", "free gyro")
 #: columns that are computed before they pass the filter as a batch
@@ -136,6 +137,13 @@ def build_search_space(
     projected = {one.key: projected_key(one.key) for one in containing_delay}
     all_sets = Hypotheses(made, base.remainder, fitted.at.log_noise, psi, forms, projected)
     all_sets.unknown_nats = 0.0 if made.point.directed is None else made.point.directed.nats
+    return all_sets, _space_of(effects, context, library)
+
+
+def _space_of(
+    effects: dict[str, list[str]], context: Context, library: Mapping[str, Effect]
+) -> Space:
+    """What a search may put into a set; effects: keys of the library's components by effect."""
     length_s = context.track.duration_s
 
     def refined(one: Component, settings: Iterable[Setting]) -> list[Component]:
@@ -169,7 +177,7 @@ def build_search_space(
     def components_between(begins: Component, ends: Component) -> list[Component]:
         return interval_components(begins, ends, context, library, priors.SOUGHT_SETTINGS**2)
 
-    space = Space(
+    return Space(
         effects,
         FREE_PROCESSES,
         refine_setting,
@@ -178,4 +186,3 @@ def build_search_space(
         steps_at,
         components_between,
     )
-    return all_sets, space
