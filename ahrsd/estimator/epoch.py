@@ -24,11 +24,11 @@ from ahrsd.estimator.graph import (
     Node,
     Stack,
     Step,
-    at_borders,
+    border_step,
     gap_factor,
 )
 from ahrsd.estimator.noise import DirectionCells
-from ahrsd.estimator.parameters import Kinds, instruments
+from ahrsd.estimator.parameters import Kinds, possible_instruments
 from ahrsd.samples import Array
 
 _SHORTEST_GAP_S = 0.1
@@ -44,7 +44,7 @@ class EpochContent:
     data: chain.EpochData
     a: int
     walk: float
-    turned: bool
+    has_motion: bool
     typical: noise.Typical
 
 
@@ -72,7 +72,7 @@ class LockedInformation:
     epoch tells; noise: that it was linearised with
     """
 
-    told: InstrumentInformation
+    information: InstrumentInformation
     roots: dict[str, Array]
     freedom: dict[str, int]
     noise: chain.Noise
@@ -119,9 +119,9 @@ class WindowEpoch:
         return self.piece.a
 
     @property
-    def turned(self) -> bool:
+    def has_motion(self) -> bool:
         """Whether it calibrates."""
-        return self.piece.turned
+        return self.piece.has_motion
 
     @property
     def weights(self) -> Array:
@@ -150,7 +150,7 @@ class WindowEpoch:
         return self.quadratic.cost
 
 
-def scores_of(epochs: Sequence[WindowEpoch]) -> list[MisfitScore]:
+def epoch_scores(epochs: Sequence[WindowEpoch]) -> list[MisfitScore]:
     """What epochs ask for, found once where each was linearised."""
     new = [e for e in epochs if e.score is None]
     for epoch, score in zip(
@@ -160,8 +160,8 @@ def scores_of(epochs: Sequence[WindowEpoch]) -> list[MisfitScore]:
     return [e.score for e in epochs if e.score is not None]
 
 
-def grown(
-    graph: Graph, data: chain.EpochData, walk: float, *, moving: bool
+def begin_epoch(
+    graph: Graph, data: chain.EpochData, walk: float, *, has_motion: bool
 ) -> tuple[EpochContent, Array]:
     """A new epoch, with the nodes that it needs in the graph, and directions to start from.
 
@@ -179,22 +179,22 @@ def grown(
     graph.nodes[a + 1] = Node.at(graph.nodes[a].bias, u[-1])
     graph.until_s = float(data.time_s[-1])
     information = 1.0 / (walk**2 * float(np.sum(data.dt_s[1:])))
-    return EpochContent(data, a, information, moving, noise.Typical.of(data)), u
+    return EpochContent(data, a, information, has_motion, noise.Typical.of(data)), u
 
 
-def place_borders(graph: Graph, begun: Sequence[WindowEpoch]) -> None:
+def place_borders(graph: Graph, new_epochs: Sequence[WindowEpoch]) -> None:
     """Put borders that are at directions of single fields to where their epochs alone want them.
 
     Until then a chain is bent towards the noise of one field and seems that noisy itself; for an
     epoch at rest, whose borders only a token moves, for long.
     """
-    for epoch in begun:
-        step = at_borders(epoch.quadratic)
+    for epoch in new_epochs:
+        step = border_step(epoch.quadratic)
         own = [(epoch.a + 1, step[2:])]
         if epoch.data.measures_first:
             own.append((epoch.a, step[:2]))
         for j, tangent in own:
-            graph.nodes[j] = graph.nodes[j].retracted(np.r_[np.zeros(3), tangent])
+            graph.nodes[j] = graph.nodes[j].moved_by(np.r_[np.zeros(3), tangent])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -220,8 +220,8 @@ class Snapshot:
 # noise, a wandering field or a lag make it larger, and the covariance of the estimate is multiplied
 # by it.
 
-_KEEP = np.r_[0:12]
-_USED = 12.0  # parameters that the fit took from the misfit_scores
+_CALIBRATION_AND_BIAS = np.r_[0:12]
+_FITTED_PARAMETERS = 12.0  # parameters that the fit took from the misfit_scores
 _MEMORY = 0.98  # per epoch that left the window
 
 
@@ -234,27 +234,29 @@ class MisfitScore:
     freedom: degrees of freedom; directions of which the epoch says nothing ask for nothing.
     """
 
-    asked: Array
-    turning: Array
+    whitened_gradient: Array
+    root: Array
     freedom: float
 
     @property
     def information(self) -> Array:
         """On z (12, 12)."""
-        return np.asarray(self.turning.T @ self.turning)
+        return np.asarray(self.root.T @ self.root)
 
 
 def misfit_scores(factors: Sequence[Factor]) -> list[MisfitScore]:
     """Of several epochs' factors."""
     H, g = np.array([f.H for f in factors]), np.array([f.g for f in factors])
-    cross = H[:, _KEEP[:, None], BORDERS]
+    cross = H[:, _CALIBRATION_AND_BIAS[:, None], BORDERS]
     gain = cross @ np.linalg.pinv(H[:, BORDERS[:, None], BORDERS], rcond=1e-12, hermitian=True)
-    S = H[:, _KEEP[:, None], _KEEP] - gain @ np.swapaxes(cross, 1, 2)
-    r = g[:, _KEEP] - (gain @ g[:, BORDERS, None])[:, :, 0]
+    S = H[:, _CALIBRATION_AND_BIAS[:, None], _CALIBRATION_AND_BIAS] - gain @ np.swapaxes(
+        cross, 1, 2
+    )
+    r = g[:, _CALIBRATION_AND_BIAS] - (gain @ g[:, BORDERS, None])[:, :, 0]
     whiten, count = _whitening(S)
-    asked = (whiten @ r[:, :, None])[:, :, 0]
+    whitened = (whiten @ r[:, :, None])[:, :, 0]
     freedom = count.astype(float)
-    return [MisfitScore(*each) for each in zip(asked, whiten @ S, freedom, strict=True)]
+    return [MisfitScore(*each) for each in zip(whitened, whiten @ S, freedom, strict=True)]
 
 
 class Misfit:
@@ -267,12 +269,12 @@ class Misfit:
     @property
     def epochs(self) -> float:
         """How many whole epochs are remembered."""
-        return self._count / _USED
+        return self._count / _FITTED_PARAMETERS
 
     def remember(self, factor: Factor, score: MisfitScore, graph: Graph) -> None:
         """An epoch leaves the window: keep its score."""
         bias = graph.nodes[factor.a].bias
-        s, n = _squares([factor], [score], graph.c, bias[None])
+        s, n = _sum_of_squares([factor], [score], graph.c, bias[None])
         self._sum, self._count = _MEMORY * self._sum + s, _MEMORY * self._count + n
 
     def value(
@@ -290,22 +292,22 @@ class Misfit:
         """
         dc, dy = step
         biases = np.array([graph.nodes[f.a].bias + dy[f.a][:3] for f in factors])
-        s, n = _squares(factors, scores, graph.c + dc, biases)
+        s, n = _sum_of_squares(factors, scores, graph.c + dc, biases)
         total, count = self._sum + s, self._count + n
-        freedom = max(count - _USED, 0.2 * count, 1.0)
+        freedom = max(count - _FITTED_PARAMETERS, 0.2 * count, 1.0)
         return total / freedom, float(np.sqrt(2.0 / freedom))
 
 
-def _squares(
+def _sum_of_squares(
     factors: Sequence[Factor], scores: Sequence[MisfitScore], c: Array, biases: Array
 ) -> tuple[float, float]:
     """Sum of squares of what is asked for at c and the biases (N, 3), and degrees of freedom."""
     z = np.empty((len(factors), 12))
     z[:, :9] = c - np.array([f.point.c for f in factors])
     z[:, 9:] = biases - np.array([f.point.a.bias for f in factors])
-    turning = np.array([s.turning for s in scores])
-    asked = np.array([s.asked for s in scores]) + (turning @ z[:, :, None])[:, :, 0]
-    return float(np.sum(asked * asked)), sum(s.freedom for s in scores)
+    roots = np.array([s.root for s in scores])
+    whitened = np.array([s.whitened_gradient for s in scores]) + (roots @ z[:, :, None])[:, :, 0]
+    return float(np.sum(whitened * whitened)), sum(s.freedom for s in scores)
 
 
 # -- Instrument ------------------------------------------------------------------------------------
@@ -343,29 +345,35 @@ def _squares(
 # angles are multiplied by a matrix. The step is then one more from there.
 
 TURN, LAG, SCALE = slice(12, 15), 15, 16
-_ASKED = 17  # what an instrument is asked for; its shape (5) is only considered
+_ESTIMATED = 17  # what an instrument is asked for; its shape (5) is only considered
 PLACE = slice(22, 28)  # of how the field differs with where the sensor heads
 _SIZE = 28
-_X, _BIAS, _REST = slice(0, 12), slice(9, 12), slice(12, _SIZE + 3)
-_OF_ANGLE = np.r_[12:15, 16:22]
+_CALIBRATION, _BIAS, _IMPERFECT = slice(0, 12), slice(9, 12), slice(12, _SIZE + 3)
+_ANGLE_COLUMNS = np.r_[12:15, 16:22]
 _SCALES = np.r_[SCALE:22]
-_OF_FIELD, _OF_MOTION = np.r_[0:9, LAG, PLACE], np.r_[9:15, SCALE:22]
+_FIELD_COLUMNS, _MOTION_COLUMNS = np.r_[0:9, LAG, PLACE], np.r_[9:15, SCALE:22]
 _PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
 IMPERFECTIONS = ("axes", "lag", "scales", "place", "bias")
 _PLACE = np.r_[10:16]
-_EACH = (np.r_[0:3], np.r_[3:4], np.r_[4:10], _PLACE, np.r_[16:19])  # of what is considered
+_IMPERFECTION_ROWS = (
+    np.r_[0:3],
+    np.r_[3:4],
+    np.r_[4:10],
+    _PLACE,
+    np.r_[16:19],
+)  # of what is considered
 _MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
 _GYRO = np.r_[TURN, SCALE:22]  # what turns or scales the gyro's angles
-GYRO_OF_ALL = _GYRO - 12  # the same among what is considered
-TOLD = 5.0  # nats by which an instrument with imperfections must be likelier
+GYRO_AMONG_IMPERFECTIONS = _GYRO - 12  # the same among what is considered
+REQUIRED_NATS = 5.0  # nats by which an instrument with imperfections must be likelier
 _WORTH_SIGMAS = 0.3  # of what is known of them: less is not worth another step
-_LASTING = np.r_[0:9, 12:_SIZE]  # all but the gyro's bias
-_STEEP = 0.05  # sine of an angle: less tells no heading
+_CONSTANT = np.r_[0:9, 12:_SIZE]  # all but the gyro's bias
+_LEAST_HORIZONTAL = 0.05  # sine of an angle: less tells no heading
 _WEAKEST = 1e-4  # scaled information of a direction of which an epoch says something
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TakenOut:
+class InstrumentCorrection:
     """What of an instrument is taken out of the epochs' data already.
 
     lag_s: by which the field is late; gyro: (3, 3) by which the gyro's angles are multiplied
@@ -377,17 +385,17 @@ class TakenOut:
     walk: float = 0.0
 
     @staticmethod
-    def nothing() -> TakenOut:
+    def identity() -> InstrumentCorrection:
         """Of a perfect instrument."""
-        return TakenOut(0.0, np.eye(3))
+        return InstrumentCorrection(0.0, np.eye(3))
 
     @property
-    def anything(self) -> bool:
+    def is_nonzero(self) -> bool:
         """Whether there is any."""
         return self.lag_s != 0.0 or self.walk > 0.0 or not np.array_equal(self.gyro, np.eye(3))
 
     @property
-    def numbers(self) -> Array:
+    def gyro_parameters(self) -> Array:
         """Turn (3), scale and shape (5) of the matrix."""
         E = self.gyro - np.eye(3)
         scale = float(np.trace(E)) / 3
@@ -396,9 +404,13 @@ class TakenOut:
         apart = [(S[0, 0] - S[1, 1]) / 2, -S[2, 2] * np.sqrt(3.0) / 2]
         return np.array([*turn, scale, *apart, S[1, 2], S[0, 2], S[0, 1]])
 
-    def with_gyro(self, numbers: Array) -> TakenOut:
+    def with_gyro(self, parameters: Array) -> InstrumentCorrection:
         """With this much more of turn (3), scale and shape (5)."""
-        (x, y, z), scale, (apart, against, yz, xz, xy) = numbers[:3], numbers[3], numbers[4:]
+        (x, y, z), scale, (apart, against, yz, xz, xy) = (
+            parameters[:3],
+            parameters[3],
+            parameters[4:],
+        )
         third = against / np.sqrt(3.0)
         diagonal = np.array([apart + third, third - apart, -2 * third]) + scale
         sides = np.array([[0.0, xy - z, xz + y], [xy + z, 0.0, yz - x], [xz - y, yz + x, 0.0]])
@@ -407,7 +419,9 @@ class TakenOut:
 
 
 #: (9, 3, 3) matrices of one of each of turn, scale and shape, on the gyro's angles
-GYRO_WAYS = np.array([TakenOut.nothing().with_gyro(one).gyro - np.eye(3) for one in np.eye(9)])
+GYRO_BASIS = np.array(
+    [InstrumentCorrection.identity().with_gyro(one).gyro - np.eye(3) for one in np.eye(9)]
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -443,33 +457,33 @@ InformationStack = tuple[Array, Array]
 """H (N, 17, 17) and gradient (N, 17) of epochs, all directions eliminated."""
 
 
-def informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+def instrument_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
     """Quadratics of the epochs with motion around the present estimate.
 
     LinAlgError where none has motion, or its directions are not determined.
     """
-    H, g = whole_informations(epochs, graph)
-    return H[:, :_ASKED, :_ASKED], g[:, :_ASKED]
+    H, g = full_instrument_quadratics(epochs, graph)
+    return H[:, :_ESTIMATED, :_ESTIMATED], g[:, :_ESTIMATED]
 
 
-def whole_informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+def full_instrument_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
     """The same with the gyro's shape and the place: H (N, 28, 28) and gradient (N, 28).
 
     Each as it was where the epoch was linearised, so that it is computed once for each.
     """
     linearise_instrument(epochs)
-    told = [(e.instrument, graph.nodes[e.a].bias) for e in epochs if e.turned]
-    if not told:
+    moving = [(e.instrument, graph.nodes[e.a].bias) for e in epochs if e.has_motion]
+    if not moving:
         raise np.linalg.LinAlgError("no epoch with motion")
-    known = [(one, bias) for one, bias in told if one is not None]
+    known = [(one, bias) for one, bias in moving if one is not None]
     H = np.array([one.H for one, _ in known])
     return H, np.array([one.at(graph.c, bias) for one, bias in known])
 
 
-def of_rests(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+def rest_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
     """Quadratics (R, 28, 28) and gradients (R, 28) of the epochs without motion: of the gyro's bias
     alone, around that of their nodes."""
-    resting = [e for e in epochs if not e.turned]
+    resting = [e for e in epochs if not e.has_motion]
     H, g = np.zeros((len(resting), _SIZE, _SIZE)), np.zeros((len(resting), _SIZE))
     for k, epoch in enumerate(resting):
         factor = epoch.factor
@@ -490,14 +504,14 @@ class FoldedInformation:
         self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x as `_place`
 
     @staticmethod
-    def of_iron(graph: Graph, taken: TakenOut) -> FoldedInformation:
+    def of_iron(graph: Graph, correction: InstrumentCorrection) -> FoldedInformation:
         """Information on the iron from the epochs folded into the graph; none on a lag."""
-        H, g = (each[0] for each in Stack([graph.prior], graph.c, graph.nodes).here())
+        H, g = (each[0] for each in Stack([graph.prior], graph.c, graph.nodes).quadratics())
         gain = H[C, Y_A] @ np.linalg.pinv(H[Y_A, Y_A], rcond=1e-12, hermitian=True)
         own_H, own_g = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE)
         own_H[C, C], own_g[C] = H[C, C] - gain @ H[Y_A, C], g[C] - gain @ g[Y_A]
         past = FoldedInformation()
-        past._add(own_H, own_g, graph.c, taken)
+        past._add(own_H, own_g, graph.c, correction)
         return past
 
     @staticmethod
@@ -509,44 +523,52 @@ class FoldedInformation:
         return past
 
     def with_epoch(
-        self, told: InstrumentInformation, taken: TakenOut, sigma_bias: float
+        self,
+        information: InstrumentInformation,
+        correction: InstrumentCorrection,
+        sigma_bias: float,
     ) -> FoldedInformation:
         """With one epoch more, which was linearised with this taken out; sigma_bias in rad/s."""
         bias = slice(9, 12)
-        own = told.H[bias, bias] + np.eye(3) / sigma_bias**2
-        gain = np.linalg.solve(own, told.H[bias]).T
-        H, g = told.H - gain @ told.H[bias], told.g - gain @ told.g[bias]
+        own = information.H[bias, bias] + np.eye(3) / sigma_bias**2
+        gain = np.linalg.solve(own, information.H[bias]).T
+        H, g = (
+            information.H - gain @ information.H[bias],
+            information.g - gain @ information.g[bias],
+        )
         keep = np.zeros(_SIZE)
-        keep[_LASTING] = 1.0
+        keep[_CONSTANT] = 1.0
         past = FoldedInformation()
         past._H, past._eta = self._H.copy(), self._eta.copy()
-        past._add(H * np.outer(keep, keep), g * keep, told.c, taken)
+        past._add(H * np.outer(keep, keep), g * keep, information.c, correction)
         return past
 
-    def _add(self, H: Array, g: Array, c: Array, taken: TakenOut) -> None:
+    def _add(self, H: Array, g: Array, c: Array, correction: InstrumentCorrection) -> None:
         self._H = self._H + H
-        self._eta = self._eta + H @ _place(c, taken) - g
+        self._eta = self._eta + H @ _instrument_point(c, correction) - g
 
-    def at(self, c: Array, taken: TakenOut) -> tuple[Array, Array]:
+    def at(self, c: Array, correction: InstrumentCorrection) -> tuple[Array, Array]:
         """H (28, 28) and gradient (28,) there."""
-        return self._H, self._H @ _place(c, taken) - self._eta
+        return self._H, self._H @ _instrument_point(c, correction) - self._eta
 
 
-def _place(c: Array, taken: TakenOut) -> Array:
+def _instrument_point(c: Array, correction: InstrumentCorrection) -> Array:
     x = np.zeros(_SIZE)
-    x[:9], x[LAG], x[_GYRO] = c, taken.lag_s, taken.numbers
+    x[:9], x[LAG], x[_GYRO] = c, correction.lag_s, correction.gyro_parameters
     return x
 
 
 def linearise_instrument(epochs: Sequence[WindowEpoch]) -> None:
     """Compute `WindowEpoch.instrument` of the epochs with motion that do not have it yet, together
     those that were linearised at one calibration."""
-    silent = [epoch for epoch in epochs if epoch.turned and epoch.instrument is None]
-    for place in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in silent}.values():
-        _informations([epoch for epoch in silent if epoch.factor.point.c is place], place)
+    missing = [epoch for epoch in epochs if epoch.has_motion and epoch.instrument is None]
+    for point in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in missing}.values():
+        _set_instrument_information(
+            [epoch for epoch in missing if epoch.factor.point.c is point], point
+        )
 
 
-def lag_known(
+def lag_uncertainty(
     epochs: Sequence[WindowEpoch], graph: Graph, past: FoldedInformation, sigma_bias: float
 ) -> Lag:
     """Sigma of the lag that is taken out of the field, from all data.  LinAlgError: unobservable.
@@ -555,9 +577,9 @@ def lag_known(
     the lag, so what both make adds up.
     """
     linearise_instrument(epochs)
-    H = past.at(graph.c, TakenOut.nothing())[0]
+    H = past.at(graph.c, InstrumentCorrection.identity())[0]
     H = H + sum(epoch.instrument.H for epoch in epochs if epoch.instrument is not None)
-    H = believed(graph, sigma_bias)[0] + H[:_ASKED, :_ASKED]
+    H = prior_quadratic(graph, sigma_bias)[0] + H[:_ESTIMATED, :_ESTIMATED]
     sigma = float(np.sqrt(graph.temper * _inverse(H)[LAG, LAG]))
     return Lag(sigma, -sigma * (_inverse(H[:12, :12]) @ H[:12, LAG]))
 
@@ -582,7 +604,7 @@ def _inverse(H: Array) -> Array:
     return np.asarray(np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale))
 
 
-def instrument(
+def estimate_instrument(
     epochs: InformationStack,
     graph: Graph,
     sigma_bias: float,
@@ -593,9 +615,9 @@ def instrument(
 
     LinAlgError where the motion does not tell.
     """
-    H, g = believed(graph, sigma_bias)
+    H, g = prior_quadratic(graph, sigma_bias)
     if before is not None:
-        H, g = H + before[0][:_ASKED, :_ASKED], g + before[1][:_ASKED]
+        H, g = H + before[0][:_ESTIMATED, :_ESTIMATED], g + before[1][:_ESTIMATED]
     H, g = H + epochs[0].sum(axis=0), g + epochs[1].sum(axis=0)
     covariance = _inverse(H)
     step = -covariance @ g
@@ -604,7 +626,7 @@ def instrument(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Considered:
+class ImperfectionLikelihood:
     """What is known of an instrument's imperfections (`_REST`, 19), and what they do to the answer.
 
     alone (12, 12) covariance of [M, b, w_b] were it perfect; by_rest (12, 19): what one of each
@@ -614,13 +636,13 @@ class Considered:
     disagree: how much the epochs disagree after a step (31,) of all
     """
 
-    alone: Array
-    by_rest: Array
-    own: Array
-    known: Array
-    asked: Array
-    already: Array
-    disagree: Callable[[Array], float]
+    covariance: Array
+    response: Array
+    gradient: Array
+    information: Array
+    imperfection_gradient: Array
+    corrected: Array
+    misfit_after: Callable[[Array], float]
 
     @staticmethod
     def of(
@@ -629,51 +651,67 @@ class Considered:
         graph: Graph,
         sigma_bias: float,
         before: tuple[Array, Array],
-        taken: TakenOut,
-    ) -> Considered:
+        correction: InstrumentCorrection,
+    ) -> ImperfectionLikelihood:
         """Of epochs (of these times, (N,)) and those before.  LinAlgError: the motion tells not."""
-        epochs = with_drift(epochs, times_s)
+        epochs = add_bias_drift(epochs, times_s)
         H, g = epochs[0].sum(axis=0), epochs[1].sum(axis=0)
         H[:_SIZE, :_SIZE] += before[0]
         g[:_SIZE] += before[1]
-        own_H, own_g = believed(graph, sigma_bias)
-        alone = _inverse(H[_X, _X] + own_H[_X, _X])
-        by_rest, own = -alone @ H[_X, _REST], g[_X] + own_g[_X]
-        known = H[_REST, _REST] + H[_REST, _X] @ by_rest
-        already = np.zeros(len(known))
-        already[GYRO_OF_ALL] = taken.numbers
-        asked = g[_REST] + by_rest.T @ own
-        return Considered(
-            alone, by_rest, own, known, asked, already, partial(disagreement, *epochs)
+        own_H, own_g = prior_quadratic(graph, sigma_bias)
+        covariance = _inverse(H[_CALIBRATION, _CALIBRATION] + own_H[_CALIBRATION, _CALIBRATION])
+        response, gradient = (
+            -covariance @ H[_CALIBRATION, _IMPERFECT],
+            g[_CALIBRATION] + own_g[_CALIBRATION],
+        )
+        information = H[_IMPERFECT, _IMPERFECT] + H[_IMPERFECT, _CALIBRATION] @ response
+        corrected = np.zeros(len(information))
+        corrected[GYRO_AMONG_IMPERFECTIONS] = correction.gyro_parameters
+        imperfection_gradient = g[_IMPERFECT] + response.T @ gradient
+        return ImperfectionLikelihood(
+            covariance,
+            response,
+            gradient,
+            information,
+            imperfection_gradient,
+            corrected,
+            partial(disagreement, *epochs),
         )
 
-    def found(self, sigmas: Array, temper: float) -> tuple[Array, Array]:
+    def posterior(self, sigmas: Array, temper: float) -> tuple[Array, Array]:
         """Spread (..., 19, 19) over the temper, and what they are beyond what is taken out
         (..., 19), of instruments like that (..., 19)."""
         pull = temper / sigmas**2
-        spread = _inverses(self.known + pull[..., None] * np.eye(pull.shape[-1]))
-        return spread, -(spread @ (self.asked + pull * self.already)[..., None])[..., 0]
+        spread = _inverses(self.information + pull[..., None] * np.eye(pull.shape[-1]))
+        return spread, -(spread @ (self.imperfection_gradient + pull * self.corrected)[..., None])[
+            ..., 0
+        ]
 
     def temper(self, sigmas: Array, most: float) -> float:
         """By how much the epochs disagree once what they say of the imperfections is in."""
-        rest = self.found(sigmas, most)[1]
-        step = np.r_[-self.alone @ self.own + self.by_rest @ rest, rest]
-        return min(most, max(1.0, self.disagree(step)))
+        mean = self.posterior(sigmas, most)[1]
+        step = np.r_[-self.covariance @ self.gradient + self.response @ mean, mean]
+        return min(most, max(1.0, self.misfit_after(step)))
 
-    def evidence(self, sigmas: Array, rest: Array, temper: float) -> Array:
+    def log_evidence(self, sigmas: Array, mean: Array, temper: float) -> Array:
         """Log of how likely the data are of instruments like that (..., 19), up to a constant.
 
         rest: what they were found to be
         """
-        sizes = sigmas[..., :, None] * sigmas[..., None, :]
-        told = np.linalg.slogdet(np.eye(sigmas.shape[-1]) + self.known / temper * sizes)[1]
-        left = np.sum((rest @ self.known + 2.0 * self.asked) * rest, axis=-1) / temper
-        left = left + np.sum(np.square((self.already + rest) / sigmas), axis=-1)
-        return np.asarray(-0.5 * (left + told))
+        outer = sigmas[..., :, None] * sigmas[..., None, :]
+        log_determinant = np.linalg.slogdet(
+            np.eye(sigmas.shape[-1]) + self.information / temper * outer
+        )[1]
+        penalty = (
+            np.sum((mean @ self.information + 2.0 * self.imperfection_gradient) * mean, axis=-1)
+            / temper
+        )
+        penalty = penalty + np.sum(np.square((self.corrected + mean) / sigmas), axis=-1)
+        return np.asarray(-0.5 * (penalty + log_determinant))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Weighed:
+class InstrumentPosterior:
     """All instruments that may be, at all places, against what the data say of them.
 
     every (K, 19) their sigmas; prior (K,) log of how likely they are without the data; evidence
@@ -681,48 +719,52 @@ class Weighed:
     beyond what is taken out already
     """
 
-    said: Considered
-    every: Array
-    prior: Array
-    evidence: Array
+    likelihood: ImperfectionLikelihood
+    sigmas: Array
+    log_prior: Array
+    log_evidence: Array
     spread: Array
-    rest: Array
+    means: Array
 
     @staticmethod
-    def of(said: Considered, graph: Graph, kinds: Kinds) -> Weighed:
+    def of(likelihood: ImperfectionLikelihood, graph: Graph, kinds: Kinds) -> InstrumentPosterior:
         """What an imperfection makes the epochs disagree is no noise."""
-        may_be = instruments(*kinds)
-        every = may_be.sigmas
-        temper = said.temper(every.max(axis=0), graph.temper)
-        spread, rest = said.found(every, temper)
-        evidence = said.evidence(every, rest, temper)
-        return Weighed(said, every, may_be.log_prior, evidence, temper * spread, rest)
+        may_be = possible_instruments(*kinds)
+        sigmas = may_be.sigmas
+        temper = likelihood.temper(sigmas.max(axis=0), graph.temper)
+        spread, means = likelihood.posterior(sigmas, temper)
+        log_evidence = likelihood.log_evidence(sigmas, means, temper)
+        return InstrumentPosterior(
+            likelihood, sigmas, may_be.log_prior, log_evidence, temper * spread, means
+        )
 
-    def likely(self) -> Array:
+    def probabilities(self) -> Array:
         """How likely each is (K,), the data and all else taken together."""
-        told = self.evidence + self.prior
-        shares = np.exp(told - told.max())
+        log_weights = self.log_evidence + self.log_prior
+        shares = np.exp(log_weights - log_weights.max())
         return np.asarray(shares / shares.sum())
 
-    def likelier(self, which: Array | slice, told: float = TOLD) -> int | None:
+    def most_probable(
+        self, which: Array | slice, required_nats: float = REQUIRED_NATS
+    ) -> int | None:
         """The likeliest of those in which some of `which` are larger than need be; None where it is
         not likelier than the others by `told` nats."""
-        found, gain = self.against_plain(which)
-        return None if gain < told else found
+        found, gain = self.log_odds_against_smallest(which)
+        return None if gain < required_nats else found
 
-    def against_plain(self, which: Array | slice) -> tuple[int, float]:
+    def log_odds_against_smallest(self, which: Array | slice) -> tuple[int, float]:
         """The likeliest of those in which some of `which` are larger than need be, and by how many
         nats it is likelier than the likeliest of those in which all are as small as may be.
 
         Whatever else is wrong with either is free: a field that differs by place may be what looks
         like a gyro.
         """
-        sized = self.every[:, which]
-        plain = np.all(sized == sized.min(axis=0), axis=1)
-        if plain.all():
+        sizes = self.sigmas[:, which]
+        smallest = np.all(sizes == sizes.min(axis=0), axis=1)
+        if smallest.all():
             return 0, -np.inf
-        others = np.where(plain, -np.inf, self.evidence)
-        return int(np.argmax(others)), float(others.max() - self.evidence[plain].max())
+        others = np.where(smallest, -np.inf, self.log_evidence)
+        return int(np.argmax(others)), float(others.max() - self.log_evidence[smallest].max())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -743,16 +785,16 @@ class Widening:
 
     def joint(self, covariance: Array, K: Array) -> Array:
         """(21, 21) of K (12, 12) times [M, b, w_b], whose covariance is given, and the gyro's."""
-        beside = K @ self.with_gyro
-        return np.block([[covariance, beside], [beside.T, self.gyro]])
+        cross = K @ self.with_gyro
+        return np.block([[covariance, cross], [cross.T, self.gyro]])
 
     @staticmethod
-    def nothing() -> Widening:
+    def zero() -> Widening:
         """Of a perfect instrument, or where nobody can tell."""
         return Widening(np.zeros((12, 12)), {}, float("nan"), np.zeros((9, 9)), np.zeros((12, 9)))
 
 
-def considered(weighed: Weighed) -> Widening:
+def widening_by_imperfections(posterior: InstrumentPosterior) -> Widening:
     """What imperfections of the instrument do to the answer.
 
     The answer takes the instrument to be perfect. It is one of `instruments`, each as likely as
@@ -760,45 +802,51 @@ def considered(weighed: Weighed) -> Widening:
     what they say that they are is an error of it. So their sizes, which a few numbers tell badly,
     count as far as they are not known: the mean of the variances, not that of the likeliest.
     """
-    by_rest, rest, likely = weighed.said.by_rest, weighed.rest, weighed.likely()
-    mean = np.tensordot(likely, weighed.spread, 1) + (likely * rest.T) @ rest
-    added = by_rest @ mean @ by_rest.T
-    each = [by_rest[:, i] @ mean[np.ix_(i, i)] @ by_rest[:, i].T for i in _EACH]
+    response, means, probabilities = (
+        posterior.likelihood.response,
+        posterior.means,
+        posterior.probabilities(),
+    )
+    mean = np.tensordot(probabilities, posterior.spread, 1) + (probabilities * means.T) @ means
+    added = response @ mean @ response.T
+    each = [response[:, i] @ mean[np.ix_(i, i)] @ response[:, i].T for i in _IMPERFECTION_ROWS]
     return Widening(
         (added + added.T) / 2,
         dict(zip(IMPERFECTIONS, each, strict=True)),
         float(np.sqrt(np.mean(np.diag(mean)[_PLACE]))),
-        mean[np.ix_(GYRO_OF_ALL, GYRO_OF_ALL)],
-        by_rest @ mean[:, GYRO_OF_ALL],
+        mean[np.ix_(GYRO_AMONG_IMPERFECTIONS, GYRO_AMONG_IMPERFECTIONS)],
+        response @ mean[:, GYRO_AMONG_IMPERFECTIONS],
     )
 
 
-def walk_asked(weighed: Weighed, span_s: float) -> float:
+def required_bias_walk(posterior: InstrumentPosterior, span_s: float) -> float:
     """Walk of the gyro's bias (rad/s/sqrt(s)) by which it would drift as far as it did in span_s.
 
     0 where an instrument that does not drift is as likely.
     """
-    found = weighed.likelier(slice(-3, None))
-    drift = np.zeros(3) if found is None else weighed.rest[found][-3:]
+    found = posterior.most_probable(slice(-3, None))
+    drift = np.zeros(3) if found is None else posterior.means[found][-3:]
     return float(np.sqrt(np.mean(np.square(drift)) / max(span_s, 1.0)))
 
 
-def gyro_asked(weighed: Weighed, told: float) -> Array | None:
+def required_gyro_correction(posterior: InstrumentPosterior, required_nats: float) -> Array | None:
     """Turn (3), scale and shape (5) that the gyro's angles are to be corrected by, once more.
 
     None where an instrument like that is not likelier than its maker's by `told` nats, unless some
     of it is taken out already, or where the step is not worth it.
     """
-    found = weighed.likelier(GYRO_OF_ALL, -np.inf if weighed.said.already.any() else told)
+    found = posterior.most_probable(
+        GYRO_AMONG_IMPERFECTIONS, -np.inf if posterior.likelihood.corrected.any() else required_nats
+    )
     if found is None:
         return None
-    step = weighed.rest[found][GYRO_OF_ALL]
-    known = weighed.spread[found][np.ix_(GYRO_OF_ALL, GYRO_OF_ALL)]
+    step = posterior.means[found][GYRO_AMONG_IMPERFECTIONS]
+    known = posterior.spread[found][np.ix_(GYRO_AMONG_IMPERFECTIONS, GYRO_AMONG_IMPERFECTIONS)]
     worth = float(np.sqrt(step @ np.linalg.solve(known, step) / len(step)))
     return step if worth > _WORTH_SIGMAS else None
 
 
-def with_drift(epochs: InformationStack, times_s: Array) -> InformationStack:
+def add_bias_drift(epochs: InformationStack, times_s: Array) -> InformationStack:
     """H (N, 31, 31) and g (N, 31): and by how much the gyro's bias came to be in all the epochs.
 
     It moved at one rate; w_b is that of the newest epoch.
@@ -811,9 +859,9 @@ def with_drift(epochs: InformationStack, times_s: Array) -> InformationStack:
     return both, np.concatenate([g, until * g[:, _BIAS]], axis=1)
 
 
-def believed(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:
+def prior_quadratic(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:
     """H (17, 17) and gradient (17,) of what is known without the epochs."""
-    H, g = np.zeros((_ASKED, _ASKED)), np.zeros(_ASKED)
+    H, g = np.zeros((_ESTIMATED, _ESTIMATED)), np.zeros(_ESTIMATED)
     pull = graph.temper * graph.anchor[1] + graph.hold
     H[:9, :9], g[:9] = pull, pull @ (graph.c - graph.anchor[0])
     prior = [*[sigma_bias] * 3, *[_PRIOR_TURN_RAD] * 3, _PRIOR_LAG_S, _PRIOR_SCALE]
@@ -829,13 +877,13 @@ def disagreement(H: Array, g: Array, steps: Array) -> float:
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-30))
     values, vectors = np.linalg.eigh(H * scale[:, :, None] * scale[:, None, :])
     good = values > _WEAKEST
-    left = scale * (g + (H @ np.broadcast_to(steps, g.shape)[:, :, None])[:, :, 0])
-    asked = (np.swapaxes(vectors, 1, 2) @ left[:, :, None])[:, :, 0]
+    gradients = scale * (g + (H @ np.broadcast_to(steps, g.shape)[:, :, None])[:, :, 0])
+    projected = (np.swapaxes(vectors, 1, 2) @ gradients[:, :, None])[:, :, 0]
     count = int(np.count_nonzero(good))
-    return float(np.sum(asked[good] ** 2 / values[good]) / max(count - H.shape[1], 0.2 * count))
+    return float(np.sum(projected[good] ** 2 / values[good]) / max(count - H.shape[1], 0.2 * count))
 
 
-def _informations(epochs: Sequence[WindowEpoch], c: Array) -> None:
+def _set_instrument_information(epochs: Sequence[WindowEpoch], c: Array) -> None:
     """`WindowEpoch.instrument` of epochs that were linearised at c."""
     for epoch, own in zip(epochs, _quadratics(epochs, c), strict=True):
         at = c, epoch.factor.point.a.bias
@@ -855,12 +903,12 @@ def _quadratics(
     )
     field, motion = chain.parts(rows, c)
     turned = rows.angle_b_rad - rows.bias * rows.dt_s
-    turn = _of_angle(motion.by_bias / rows.dt_s, turned)
+    turn = _gyro_matrix_columns(motion.by_bias / rows.dt_s, turned)
     seen = np.concatenate([e.data.seen(e.u) for e in epochs])
     rate = np.concatenate([rates(e.data) for e in epochs])
     swept = chain.symmetric(c[:6]) @ np.cross(rate, seen).T
     late = field.by_x[0, 6] * swept  # by_x holds - sqrt(weight) / s_m in that place
-    place = _by_place(field, seen, np.concatenate([e.data.down_b for e in epochs]), c)
+    place = _place_columns(field, seen, np.concatenate([e.data.down_b for e in epochs]), c)
     of_field, of_motion = np.zeros((3, 0, len(rate))), np.zeros((2, 0, len(rate)))
     if further is not None:
         of_field, of_motion = further(field, motion, seen, rate - rows.bias.T, turned / rows.dt_s)
@@ -871,7 +919,7 @@ def _quadratics(
     diag, upper, border = chain.interior(field, motion)
     columns = np.zeros((2, size + 1, len(rate)))
     columns[:, :12], columns[:, size] = border[:, :12], border[:, 12]
-    angles = np.r_[_OF_ANGLE, split:size]
+    angles = np.r_[_ANGLE_COLUMNS, split:size]
     by_angle = K[:, 3:-1]
     columns[:, angles] = -motion.scale * by_angle
     columns[:, angles, :-1] += np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], by_angle[:, :, 1:])
@@ -879,8 +927,8 @@ def _quadratics(
     columns[:, PLACE] = np.einsum("rjn,rin->ijn", place, field.own)
     columns[:, _SIZE:split] = np.einsum("rjn,rin->ijn", of_field, field.own)
     _, half = halfway(diag, upper, np.ascontiguousarray(columns.transpose(1, 2, 0)))
-    fields = np.r_[_OF_FIELD, _SIZE:split, size]
-    motions = np.r_[_OF_MOTION, split:size, size]
+    fields = np.r_[_FIELD_COLUMNS, _SIZE:split, size]
+    motions = np.r_[_MOTION_COLUMNS, split:size, size]
     H = np.zeros((len(epochs), size + 1, size + 1))
     for k, (a, b) in enumerate(zip(rows.first.tolist(), (rows.last + 1).tolist(), strict=True)):
         Y = half[2 * a : 2 * b]
@@ -888,7 +936,7 @@ def _quadratics(
         H[k][np.ix_(fields, fields)] += chain.squares(J[:, :, a:b])
         H[k][np.ix_(motions, motions)] += chain.squares(K[:, :, a:b])
     for epoch, own in zip(epochs, H, strict=True):
-        own[_SCALES, size] -= _by_noise(epoch)
+        own[_SCALES, size] -= _gyro_noise_gradient(epoch)
     return H
 
 
@@ -896,7 +944,7 @@ _Columns = tuple[Array, Array]
 """Of the field's residuals (3, n, N) and of the motion's (2, m, N)."""
 
 
-def _by_place(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Array:
+def _place_columns(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Array:
     """Residuals (3, 6, N) by a field that differs with the heading, gauss: north, east and down of
     it, each with the heading's cosine and sine.
 
@@ -905,18 +953,23 @@ def _by_place(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Arr
     down = np.nan_to_num(down)
     east = np.cross(down, seen)
     flat = np.linalg.norm(east, axis=1)[:, None]
-    told = flat > _STEEP
-    east, down = np.where(told, east / np.maximum(flat, _STEEP), 0.0), np.where(told, down, 0.0)
+    determined = flat > _LEAST_HORIZONTAL
+    east, down = (
+        np.where(determined, east / np.maximum(flat, _LEAST_HORIZONTAL), 0.0),
+        np.where(determined, down, 0.0),
+    )
     north = np.cross(east, down)
-    ahead = np.column_stack([north[:, 0], east[:, 0]])
-    ahead /= np.maximum(np.linalg.norm(ahead, axis=1), _STEEP)[:, None]
+    heading = np.column_stack([north[:, 0], east[:, 0]])
+    heading /= np.maximum(np.linalg.norm(heading, axis=1), _LEAST_HORIZONTAL)[:, None]
     M = chain.symmetric(c[:6]) / np.cbrt(np.linalg.det(chain.symmetric(c[:6])))
-    ahead = (field.by_x[0, 6] * ahead.T)[None]  # by_x holds - sqrt(weight) / s_m in that place
-    moved = np.stack([M @ axis.T for axis in (north, east, down)], axis=1)
-    return np.asarray((moved[:, :, None] * ahead[:, None]).reshape(3, 6, -1), dtype=np.float64)
+    heading = (field.by_x[0, 6] * heading.T)[None]  # by_x holds - sqrt(weight) / s_m in that place
+    in_sensor = np.stack([M @ axis.T for axis in (north, east, down)], axis=1)
+    return np.asarray(
+        (in_sensor[:, :, None] * heading[:, None]).reshape(3, 6, -1), dtype=np.float64
+    )
 
 
-def _by_noise(epoch: WindowEpoch) -> Array:
+def _gyro_noise_gradient(epoch: WindowEpoch) -> Array:
     """What the gyro's own noise seems to ask of scale (1) and shape (5): the gradient that it has.
 
     Angles that are made smaller have less noise. A step's noise (1 + E) n is seen across the field,
@@ -930,7 +983,7 @@ def _by_noise(epoch: WindowEpoch) -> Array:
     return np.asarray(squares * np.array([1.0, *(-0.5 * x for x in along)]))
 
 
-def _of_angle(by_angle: Array, angle: Array) -> Array:
+def _gyro_matrix_columns(by_angle: Array, angle: Array) -> Array:
     """dq/dtheta, dq/ds and dq/dE, (2, 9, N), of dq/dphi (2, 3, N) and phi (3, N).
 
     E: x and y apart, z against both, then the three shears.
@@ -949,12 +1002,14 @@ def _of_angle(by_angle: Array, angle: Array) -> Array:
 # different times; products of the gyro's rates. They are not asked for, only watched
 # (`model_checks`). What follows time is a hard iron of each epoch's own, and needs no columns.
 
-_FROM = _SIZE
-_NEARBY = 1e-2  # of the field: a calibration that moved by less leaves 1e-4 of it to second order
-_ALIKE = 0.1  # of a noise level, by which another makes another epoch
+_FIRST_LOCKED = _SIZE
+_SAME_CALIBRATION = (
+    1e-2  # of the field: a calibration that moved by less leaves 1e-4 of it to second order
+)
+_SAME_NOISE = 0.1  # of a noise level, by which another makes another epoch
 LOCKED = {
-    "attitude": np.arange(_FROM, _FROM + 36),
-    "rate": np.arange(_FROM + 36, _FROM + 36 + 9 + 8 + 18),
+    "attitude": np.arange(_FIRST_LOCKED, _FIRST_LOCKED + 36),
+    "rate": np.arange(_FIRST_LOCKED + 36, _FIRST_LOCKED + 36 + 9 + 8 + 18),
     "time": np.arange(6, 9),
 }
 
@@ -962,33 +1017,33 @@ LOCKED = {
 def linearise_locked(epochs: Sequence[WindowEpoch]) -> None:
     """Compute `WindowEpoch.locked` of the epochs with motion that do not have it yet, as
     `linearise_instrument`."""
-    silent = [epoch for epoch in epochs if epoch.turned and epoch.locked is None]
-    for place in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in silent}.values():
-        here = [epoch for epoch in silent if epoch.factor.point.c is place]
-        found = _quadratics(here, place, partial(_locked_columns, c=place))
+    missing = [epoch for epoch in epochs if epoch.has_motion and epoch.locked is None]
+    for point in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in missing}.values():
+        here = [epoch for epoch in missing if epoch.factor.point.c is point]
+        found = _quadratics(here, point, partial(_locked_columns, c=point))
         H, g = found[:, :-1, :-1], found[:, :-1, -1]
         roots = {key: _whitening(H[:, at[:, None], at]) for key, at in LOCKED.items()}
         for k, epoch in enumerate(here):
-            told = InstrumentInformation(H[k], g[k], place, epoch.factor.point.a.bias)
+            information = InstrumentInformation(H[k], g[k], point, epoch.factor.point.a.bias)
             own = {key: root[k] for key, (root, _) in roots.items()}
             freedom = {key: int(count[k]) for key, (_, count) in roots.items()}
-            epoch.locked = LockedInformation(told, own, freedom, epoch.used)
+            epoch.locked = LockedInformation(information, own, freedom, epoch.used)
 
 
-def still_locked(old: WindowEpoch, new: WindowEpoch) -> LockedInformation | None:
+def reusable_locked(old: WindowEpoch, new: WindowEpoch) -> LockedInformation | None:
     """What is locked in an epoch that was linearised again, where that is as good as before."""
     known = old.locked
     if known is None or old.data is not new.data:
         return None
-    c, moved = new.factor.point.c, new.factor.point.c - known.told.c
-    far = float(np.linalg.norm(moved)) > _NEARBY * float(
+    c, moved = new.factor.point.c, new.factor.point.c - known.information.c
+    far = float(np.linalg.norm(moved)) > _SAME_CALIBRATION * float(
         np.cbrt(np.linalg.det(chain.symmetric(c[:6])))
     )
     other = max(
         abs(new.used.mag_gauss / known.noise.mag_gauss - 1.0),
         abs(new.used.gyro_rad_s / known.noise.gyro_rad_s - 1.0),
     )
-    return None if far or other > _ALIKE else known
+    return None if far or other > _SAME_NOISE else known
 
 
 def _locked_columns(
@@ -1033,9 +1088,11 @@ def _whitening(H: Array) -> tuple[Array, Array]:
 # another hard iron explains what it does (`model_checks.py`).
 
 _MOST_ROWS = 0.6
-_ATTITUDES = 0.1  # rad, spread of the field's direction over the rows that contradict
+_LEAST_SPREAD_RAD = 0.1  # rad, spread of the field's direction over the rows that contradict
 _EXPLAINED = 0.9  # share of the epoch's cost that another hard iron alone must take away
-_FREE = np.r_[6:9, 12:16]  # hard iron and borders among the numbers of `chain.Quadratic`
+_IRON_AND_BORDERS = np.r_[
+    6:9, 12:16
+]  # hard iron and borders among the numbers of `chain.Quadratic`
 
 
 def contradicts(
@@ -1048,16 +1105,16 @@ def contradicts(
     Its directions must still be where the epoch was linearised, at c.
     """
     u = chain.move(epoch.u, epoch.quadratic, np.zeros(chain.WIDTH))
-    J = chain.symmetric_columns(epoch.data.seen(u))
-    J = np.concatenate([J, np.broadcast_to(np.eye(3), (len(u), 3, 3))], axis=2)
-    known = np.sum((J @ covariance) * J, axis=(1, 2))
+    jacobian = chain.symmetric_columns(epoch.data.seen(u))
+    jacobian = np.concatenate([jacobian, np.broadcast_to(np.eye(3), (len(u), 3, 3))], axis=2)
+    known = np.sum((jacobian @ covariance) * jacobian, axis=(1, 2))
     error = np.sum(epoch.data.field_error(u, c) ** 2, axis=1)
     beyond = error > limit_sigma**2 * (usual.mag_gauss**2 / epoch.data.count + known)
-    if not epoch.turned or float(np.mean(beyond)) <= _MOST_ROWS:
+    if not epoch.has_motion or float(np.mean(beyond)) <= _MOST_ROWS:
         return False
-    if spread(u[beyond]) < _ATTITUDES:
+    if spread(u[beyond]) < _LEAST_SPREAD_RAD:
         return False
     q = epoch.quadratic
-    H, g = q.H[np.ix_(_FREE, _FREE)], q.g[_FREE]
+    H, g = q.H[np.ix_(_IRON_AND_BORDERS, _IRON_AND_BORDERS)], q.g[_IRON_AND_BORDERS]
     explained = 0.5 * g @ np.linalg.lstsq(H, g, rcond=1e-12)[0]
     return bool(explained > _EXPLAINED * q.cost)

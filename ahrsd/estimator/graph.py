@@ -47,7 +47,7 @@ _CHAIN_BORDERS = np.r_[chain.FIRST, chain.LAST]
 _TOKEN = 1.0  # information on a direction, 1/rad^2
 # where chain.Quadratic's 16 numbers go among the factor's 19
 _FROM_CHAIN = np.r_[0:9, 9:12, 12:14, 17:19]
-_AMONG = np.ix_(_FROM_CHAIN, _FROM_CHAIN)
+_CHAIN_BLOCK = np.ix_(_FROM_CHAIN, _FROM_CHAIN)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,11 +66,11 @@ class Node:
         """A node with a tangent basis of its direction."""
         return Node(bias.copy(), direction.copy(), so3.tangent_basis(direction[None])[0])
 
-    def retracted(self, step: Array) -> Node:
+    def moved_by(self, step: Array) -> Node:
         """The node after a step (5,), on the sphere."""
         return retract_nodes([self], step[None])[0]
 
-    def turned(self, R: Array) -> Node:
+    def rotated(self, R: Array) -> Node:
         """The node with its direction and tangents turned by R (3, 3)."""
         return Node(self.bias, R @ self.direction, R @ self.tangent)
 
@@ -132,15 +132,15 @@ class Stack:
             self.z[:, at : at + 3] = np.array([n.bias for n in now]) - [n.bias for n in old]
             self.z[:, at + 3 : at + 5] = (back @ moved[:, :, None])[:, :, 0]
             self._tilt[k] = back @ np.array([n.tangent for n in now])
-        self._walked = np.array([nodes[f.b].bias - nodes[f.a].bias for f in factors])
+        self._bias_change = np.array([nodes[f.b].bias - nodes[f.a].bias for f in factors])
 
-    def rises(self) -> Array:
+    def cost_increases(self) -> Array:
         """Costs (F,) above those at each factor's `point`, the walk of the bias included."""
         pulled = (self._H @ self.z[:, :, None])[:, :, 0]
-        walks = 0.5 * self._walk * np.sum(self._walked**2, axis=1)
+        walks = 0.5 * self._walk * np.sum(self._bias_change**2, axis=1)
         return np.asarray(np.sum((self._g + 0.5 * pulled) * self.z, axis=1) + walks)
 
-    def here(self) -> tuple[Array, Array]:
+    def quadratics(self) -> tuple[Array, Array]:
         """H (F, 19, 19) and gradients (F, 19) around the present values."""
         J = np.tile(np.eye(SIZE), (len(self.z), 1, 1))
         J[:, 12:14, 12:14], J[:, 17:19, 17:19] = self._tilt
@@ -152,8 +152,8 @@ class Stack:
         H[:, j, j] += self._walk[:, None]
         H[:, i, j] -= self._walk[:, None]
         H[:, j, i] -= self._walk[:, None]
-        g[:, i] -= self._walk[:, None] * self._walked
-        g[:, j] += self._walk[:, None] * self._walked
+        g[:, i] -= self._walk[:, None] * self._bias_change
+        g[:, j] += self._walk[:, None] * self._bias_change
         return H, g
 
 
@@ -175,12 +175,12 @@ def epoch_factor(
     where the epoch wants them; one that an epoch with motion shares is not.
     """
     H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
-    H[_AMONG] = q.H
+    H[_CHAIN_BLOCK] = q.H
     g[_FROM_CHAIN] = q.g
     if rest is not None:
         gain = np.linalg.solve(H[BORDERS][:, BORDERS], np.c_[H[BORDERS][:, _BIAS], g[BORDERS]])
         cross = H[_BIAS][:, BORDERS]
-        wanted = at_borders(q) * np.repeat(drawn, 2)
+        wanted = border_step(q) * np.repeat(drawn, 2)
         H_bias, g_bias = H[_BIAS, _BIAS] - cross @ gain[:, :3], g[_BIAS] - cross @ gain[:, 3]
         across = np.eye(3) - np.outer(rest, rest)
         H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
@@ -189,7 +189,7 @@ def epoch_factor(
     return Factor(a, a + 1, H, g, point, walk)
 
 
-def at_borders(q: chain.Quadratic) -> Array:
+def border_step(q: chain.Quadratic) -> Array:
     """Where an epoch alone wants its borders (4,), first and last, from where they are.
 
     A direction that it does not tell stays: against that a rad of doubt is nothing.
@@ -239,7 +239,7 @@ class Moments:
         self._sum: Array = np.zeros(3)
         self._squares: Array = np.zeros((3, 3))
 
-    def take(self, field: Array) -> None:
+    def add(self, field: Array) -> None:
         """Add rows (n, 3) in gauss."""
         self._count += len(field)
         self._sum = self._sum + field.sum(axis=0)
@@ -255,11 +255,11 @@ class Moments:
 
 def retract(c: Array, dc: Array, moments: Moments) -> Array:
     """c = [M (6), b (3)] after a step dc; plainly c + dc where C would not stay positive."""
-    found = along_valley(c, dc, moments)
+    found = retract_in_valley(c, dc, moments)
     return np.asarray(c + dc) if found is None else found
 
 
-def along_valley(c: Array, dc: Array, moments: Moments) -> Array | None:
+def retract_in_valley(c: Array, dc: Array, moments: Moments) -> Array | None:
     """c after a step dc; None where the valley does not reach that far: C would not be positive."""
     M, dM = chain.symmetric(c[:6]), chain.symmetric(dc[:6])
     C = np.linalg.inv(M)
@@ -272,7 +272,7 @@ def along_valley(c: Array, dc: Array, moments: Moments) -> Array | None:
     return np.concatenate([chain.upper_triangle(new), new @ (d + dd) / scale])
 
 
-def way(c: Array, to: Array, moments: Moments) -> Array:
+def valley_step(c: Array, to: Array, moments: Moments) -> Array:
     """The step dc (9,) after which `retract` is at another calibration; to - c where there is none.
 
     With v = C m - d of each and s the scale that is restored, s^2 = 1 + mean |s v' - v|^2.
@@ -291,7 +291,7 @@ def way(c: Array, to: Array, moments: Moments) -> Array:
     return np.concatenate([chain.upper_triangle(-M @ dC @ M), M @ (dd - dC @ c[6:])])
 
 
-def curvature(c: Array, covariance: Array, moments: Moments) -> Array:
+def curvature_covariance(c: Array, covariance: Array, moments: Moments) -> Array:
     """What the valley's curvature adds to the covariance (9, 9) of c.
 
     One sigma along a principal direction ends q beside the straight line, t sigmas t^2 q: of a
@@ -317,28 +317,30 @@ class SingularError(ValueError):
 _C = gtsam.symbol("c", 0)
 # Unit of the gyro bias inside GTSAM: (rad/s) / 100, which brings its pivots near the directions'.
 _UNITS = np.r_[np.ones(9), np.full(3, 1e-2), 1.0, 1.0, np.full(3, 1e-2), 1.0, 1.0]
-_BADLY = 0.1
-BLIND = 0.5  # posterior over prior sigma above which a direction counts as not determined
+_BADLY_KNOWN = 0.1
+UNDETERMINED_RATIO = (
+    0.5  # posterior over prior sigma above which a direction counts as not determined
+)
 _HOLD = 1e4  # a held direction is this much stiffer than the prior
 
 
 _FIRST_Y = gtsam.symbol("y", 0)
 
 
-def _y(j: int) -> int:
+def _node_key(j: int) -> int:
     return int(_FIRST_Y + j)
 
 
-def _hessian(factor: Factor, G: Array, linear: Array) -> gtsam.HessianFactor:
+def _hessian_factor(factor: Factor, G: Array, linear: Array) -> gtsam.HessianFactor:
     c, a, b = C, Y_A, Y_B
     if factor.a == factor.b:
         return gtsam.HessianFactor(
-            _C, _y(factor.a), G[c, c], G[c, a], linear[c], G[a, a], linear[a], 0.0
+            _C, _node_key(factor.a), G[c, c], G[c, a], linear[c], G[a, a], linear[a], 0.0
         )
     return gtsam.HessianFactor(
         _C,
-        _y(factor.a),
-        _y(factor.b),
+        _node_key(factor.a),
+        _node_key(factor.b),
         G[c, c],
         G[c, a],
         G[c, b],
@@ -352,7 +354,7 @@ def _hessian(factor: Factor, G: Array, linear: Array) -> gtsam.HessianFactor:
     )
 
 
-def _singular(error: RuntimeError) -> SingularError:
+def _singular_error(error: RuntimeError) -> SingularError:
     return SingularError(str(error).strip().split("\n", maxsplit=1)[0])
 
 
@@ -374,7 +376,7 @@ class Graph:
         self.c = c.copy()
         self.anchor = (c.copy(), np.asarray(np.linalg.inv(belief), dtype=np.float64))
         self._whitening = whitening(belief)
-        self._blind: Array = np.zeros((9, 0))
+        self._held_directions: Array = np.zeros((9, 0))
         self.temper = 1.0
         self.hold: Array = np.zeros((9, 9))
         self.moments = Moments()
@@ -382,7 +384,7 @@ class Graph:
         self.prior = prior
         self.until_s: float | None = None  # when the newest node is
         self.factors: list[Factor] = []
-        self._kept: tuple[list[object], tuple[gtsam.GaussianBayesNet, Array, Array]] | None = None
+        self._cached: tuple[list[object], tuple[gtsam.GaussianBayesNet, Array, Array]] | None = None
 
     def copy(self) -> Graph:
         """A copy that goes its own way; nodes and factors are shared, they never change."""
@@ -401,13 +403,13 @@ class Graph:
         """Index of the newest node."""
         return max(self.nodes)
 
-    def _belief(self) -> Array:
+    def _anchor_information(self) -> Array:
         return np.asarray(self.temper * self.anchor[1])
 
     def anchor_cost(self) -> float:
         """What departing from the anchor costs, as a negative log likelihood."""
         d = self.c - self.anchor[0]
-        return float(0.5 * d @ (self._belief() + self.hold) @ d)
+        return float(0.5 * d @ (self._anchor_information() + self.hold) @ d)
 
     def distance_from_prior(self, covariance: Array) -> float:
         """Mean square in sigmas of the prior of where c is in the directions that are badly known.
@@ -416,30 +418,30 @@ class Graph:
         1 belief and data disagree by more than either allows. In planar motion directions that fit
         the noise lead up a valley to any size; this holds them back.
         """
-        values, vectors = self._against_belief(covariance)
-        badly = vectors[:, values > _BADLY**2]
-        away = badly.T @ self._whitening @ (self.c - self.anchor[0])
+        values, vectors = self._variance_over_prior(covariance)
+        badly_known = vectors[:, values > _BADLY_KNOWN**2]
+        away = badly_known.T @ self._whitening @ (self.c - self.anchor[0])
         return float(np.mean(away * away)) if len(away) else 0.0
 
-    def hold_blind(self, limit: float, covariance: Array) -> None:
+    def hold_undetermined(self, limit: float, covariance: Array) -> None:
         """Hold the directions whose sigma stays above `limit` of the prior's at the prior's mean.
 
         covariance (9, 9) of c, tempered. In the eigenbasis of the posterior, whitened by
         the prior, both are diagonal: holding one direction moves no other.
         """
-        values, vectors = self._against_belief(covariance)
-        self._blind = vectors[:, values > limit**2]
-        blind = self._whitening.T @ self._blind
+        values, vectors = self._variance_over_prior(covariance)
+        self._held_directions = vectors[:, values > limit**2]
+        blind = self._whitening.T @ self._held_directions
         self.hold = np.asarray(_HOLD * self.temper * blind @ blind.T)
 
-    def _against_belief(self, covariance: Array) -> tuple[Array, Array]:
+    def _variance_over_prior(self, covariance: Array) -> tuple[Array, Array]:
         """Variances (9,) over the prior's and their directions, columns, whitened by the prior."""
         W = self._whitening
         scaled = W @ covariance @ W.T
         values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
         return values, vectors
 
-    def _all(self) -> list[Factor]:
+    def _all_factors(self) -> list[Factor]:
         return [self.prior, *self.factors]
 
     def step(self, damping: float = 0.0) -> Step:
@@ -449,9 +451,9 @@ class Graph:
 
         Raises SingularError where the graph does not determine all of it.
         """
-        net, H, g = self._reduced()
+        net, H, g = self._reduced_system()
         H, g = H[:14, :14].copy(), g[:14].copy()
-        pull = self._belief() + self.hold
+        pull = self._anchor_information() + self.hold
         H[C, C] += pull + damping * self.anchor[1]
         g[C] += pull @ (self.c - self.anchor[0])
         if not np.isfinite(g).all():
@@ -459,19 +461,19 @@ class Graph:
         solved = -_inverse(H) @ g
         given = gtsam.VectorValues()
         given.insert(_C, solved[C])
-        given.insert(_y(self.last), solved[Y_A] / _UNITS[Y_A])
+        given.insert(_node_key(self.last), solved[Y_A] / _UNITS[Y_A])
         delta = net.optimize(given)
-        dy = {j: np.array(delta.at(_y(j))) * _UNITS[Y_A] for j in self.nodes}
+        dy = {j: np.array(delta.at(_node_key(j))) * _UNITS[Y_A] for j in self.nodes}
         return np.asarray(solved[C], dtype=np.float64), dy
 
-    def ahead(self) -> tuple[Array, Array]:
+    def predict_step(self) -> tuple[Array, Array]:
         """Where an undamped step would take c, dc (9,), and the information (9, 9) of c.
 
         Raises SingularError as `step` does.
         """
-        _, H, g = self._reduced()
+        _, H, g = self._reduced_system()
         H, g = H[:14, :14].copy(), g[:14].copy()
-        pull = self._belief() + self.hold
+        pull = self._anchor_information() + self.hold
         H[C, C] += pull
         g[C] += pull @ (self.c - self.anchor[0])
         covariance = _inverse(H)
@@ -486,56 +488,56 @@ class Graph:
             zip(self.nodes, retract_nodes(list(self.nodes.values()), steps), strict=True)
         )
 
-    def turn_first(self, R: Array) -> None:
+    def rotate_first(self, R: Array) -> None:
         """Turn the oldest node's direction by R (3, 3), and with it what was folded about it."""
         prior = self.prior
-        point = replace(prior.point, a=prior.point.a.turned(R), b=prior.point.b.turned(R))
+        point = replace(prior.point, a=prior.point.a.rotated(R), b=prior.point.b.rotated(R))
         self.prior = replace(prior, point=point)
-        self.nodes[self.first] = self.nodes[self.first].turned(R)
+        self.nodes[self.first] = self.nodes[self.first].rotated(R)
 
     def covariance(self) -> Array:
         """Joint covariance (12, 12) of c and the newest node's gyro bias, noise as assumed.
 
         As if nothing were held: what is not determined has the sigma of the prior.
         """
-        H = self._reduced()[1][:14, :14].copy()
-        H[C, C] += self._belief()
+        H = self._reduced_system()[1][:14, :14].copy()
+        H[C, C] += self._anchor_information()
         return _inverse(H)[:12, :12]
 
-    def with_held(self, c: Array) -> Array:
+    def project_held(self, c: Array) -> Array:
         """c with the directions that are held put where they are held."""
         W = self._whitening
-        beside = self._blind @ self._blind.T @ W @ (c - self.anchor[0])
-        return np.asarray(c - np.linalg.solve(W, beside))
+        moved = self._held_directions @ self._held_directions.T @ W @ (c - self.anchor[0])
+        return np.asarray(c - np.linalg.solve(W, moved))
 
-    def _reduced(self) -> tuple[gtsam.GaussianBayesNet, Array, Array]:
+    def _reduced_system(self) -> tuple[gtsam.GaussianBayesNet, Array, Array]:
         """All nodes but the newest eliminated, without anchor and hold, which are on c alone.
 
         Kept until a factor or a value is replaced: anchor, hold and damping change more often.
         """
-        factors = self._all()
+        factors = self._all_factors()
         used: list[object] = [self.c, *factors, *self.nodes.values()]
-        kept = self._kept
-        if kept is None or len(kept[0]) != len(used) or any(map(is_not, kept[0], used)):
-            net, rest = _eliminated(self._linear(factors), self._older())
-            kept = self._kept = (used, (net, *_information(rest)))
-        return kept[1]
+        cached = self._cached
+        if cached is None or len(cached[0]) != len(used) or any(map(is_not, cached[0], used)):
+            net, rest = _eliminate(self._linear_graph(factors), self._older_nodes())
+            cached = self._cached = (used, (net, *_information_of(rest)))
+        return cached[1]
 
-    def _linear(self, factors: list[Factor]) -> gtsam.GaussianFactorGraph:
+    def _linear_graph(self, factors: list[Factor]) -> gtsam.GaussianFactorGraph:
         graph = gtsam.GaussianFactorGraph()
-        H, g = Stack(factors, self.c, self.nodes).here()
+        H, g = Stack(factors, self.c, self.nodes).quadratics()
         if not (np.isfinite(H).all() and np.isfinite(g).all()):
             raise SingularError("a factor is not finite")
         H, linear = H * np.outer(_UNITS, _UNITS), -g * _UNITS
         for k, factor in enumerate(factors):
-            graph.add(_hessian(factor, H[k], linear[k]))
+            graph.add(_hessian_factor(factor, H[k], linear[k]))
         return graph
 
-    def _older(self) -> gtsam.Ordering:
+    def _older_nodes(self) -> gtsam.Ordering:
         """All nodes but the newest, from old to new."""
         ordering = gtsam.Ordering()
         for j in sorted(self.nodes)[:-1]:
-            ordering.push_back(_y(j))
+            ordering.push_back(_node_key(j))
         return ordering
 
     def fold_oldest(self) -> None:
@@ -545,26 +547,26 @@ class Graph:
         new = next(k for f in touching for k in (f.a, f.b) if k != old)
         factors = [self.prior, *touching]
         ordering = gtsam.Ordering()
-        ordering.push_back(_y(old))
-        H, g = _information(_eliminated(self._linear(factors), ordering)[1])
+        ordering.push_back(_node_key(old))
+        H, g = _information_of(_eliminate(self._linear_graph(factors), ordering)[1])
         node = self.nodes[new]
         self.prior = Factor(new, new, H, g, LinearisationPoint(self.c.copy(), node, node))
         self.factors = [f for f in self.factors if old not in (f.a, f.b)]
         del self.nodes[old]
 
 
-def _eliminated(
+def _eliminate(
     linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
     """The variables of `ordering` as conditionals, and what is left of the graph without them."""
     try:
         net, rest = linear.eliminatePartialSequential(ordering)
     except RuntimeError as error:
-        raise _singular(error) from error
+        raise _singular_error(error) from error
     return net, rest
 
 
-def _information(rest: gtsam.GaussianFactorGraph) -> tuple[Array, Array]:
+def _information_of(rest: gtsam.GaussianFactorGraph) -> tuple[Array, Array]:
     """H and gradient (SIZE) on [c, one node] of what an elimination left."""
     hessian = gtsam.HessianFactor(rest)
     augmented = np.array(hessian.augmentedInformation())

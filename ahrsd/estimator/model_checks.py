@@ -13,16 +13,16 @@ from ahrsd import so3
 from ahrsd.calibration import Affine
 from ahrsd.estimator import chain, locked
 from ahrsd.estimator.epoch import (
-    GYRO_OF_ALL,
+    GYRO_AMONG_IMPERFECTIONS,
     LOCKED,
     TURN,
     InformationStack,
+    InstrumentCorrection,
     LockedInformation,
-    TakenOut,
     WindowEpoch,
-    believed,
     disagreement,
-    instrument,
+    estimate_instrument,
+    prior_quadratic,
 )
 from ahrsd.estimator.graph import Graph, retract
 from ahrsd.samples import Array
@@ -44,9 +44,12 @@ from ahrsd.samples import Array
 # and known no better than that.
 
 _HARD = slice(6, 9)
-_CHI2, _CALMED = 100.0, 3.0  # of a second hard iron; times by which the disagreement must fall
-_SIDE = 2  # epochs before and behind: a single one may have been somewhere else
-_LEAST = 0.03  # of the field: a smaller change may be a place
+_CHI2, _MISFIT_RATIO = (
+    100.0,
+    3.0,
+)  # of a second hard iron; times by which the disagreement must fall
+_LEAST_EPOCHS = 2  # epochs before and behind: a single one may have been somewhere else
+_LEAST_CHANGE = 0.03  # of the field: a smaller change may be a place
 _CHANCE = 12.0  # chi squared of the best of all times, in units of the misfit, that chance makes
 
 
@@ -56,7 +59,7 @@ def change_message(at_s: float) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Division:
+class IronChange:
     """What two parts of the data say of each other.
 
     first: which of the epochs is the first of those that another hard iron explains; None if none
@@ -65,12 +68,12 @@ class Division:
     """
 
     first: int | None
-    parted: float
+    variance_factor: float
 
 
-def divided(
+def find_iron_change(
     epochs: InformationStack, graph: Graph, sigma_bias: float, sigma_b: float
-) -> Division | None:
+) -> IronChange | None:
     """Whether a second hard iron is asked for from some epoch on; None for too few epochs.
 
     epochs: what they say (`epoch.informations`) at a settled calibration, linear around it.
@@ -78,25 +81,29 @@ def divided(
     without data.
     """
     Hs, gs = epochs
-    if len(Hs) < 2 * _SIDE:
+    if len(Hs) < 2 * _LEAST_EPOCHS:
         return None
-    H, g = believed(graph, sigma_bias)
+    H, g = prior_quadratic(graph, sigma_bias)
     H, g = H + Hs.sum(axis=0), g + gs.sum(axis=0)
-    steps, chi2 = _seconds(H, g, Hs, gs, np.eye(3) * graph.temper / sigma_b**2)
-    first = int(np.argmax(chi2[_SIDE - 1 : len(Hs) - _SIDE])) + _SIDE
+    steps, chi2 = _second_iron_steps(H, g, Hs, gs, np.eye(3) * graph.temper / sigma_b**2)
+    first = int(np.argmax(chi2[_LEAST_EPOCHS - 1 : len(Hs) - _LEAST_EPOCHS])) + _LEAST_EPOCHS
     step, change = steps[first - 1, :-3], steps[first - 1, -3:]
-    own = np.tile(step, (len(Hs), 1))
-    own[first:, _HARD] += change
-    one = disagreement(Hs, gs, -np.linalg.solve(H, g))
-    two = max(1.0, disagreement(Hs, gs, own))
+    steps_by_epoch = np.tile(step, (len(Hs), 1))
+    steps_by_epoch[first:, _HARD] += change
+    misfit_single = disagreement(Hs, gs, -np.linalg.solve(H, g))
+    misfit_second = max(1.0, disagreement(Hs, gs, steps_by_epoch))
     size = float(np.cbrt(np.linalg.det(chain.symmetric(graph.c[:6]))))
-    told = chi2[first - 1] > _CHI2 * two and one > _CALMED * two
-    told = told and bool(np.linalg.norm(change) > _LEAST * size)
-    parted = max(1.0, float(np.max(chi2)) / (graph.temper * _CHANCE))
-    return Division(first if told else None, parted)
+    is_change = (
+        chi2[first - 1] > _CHI2 * misfit_second and misfit_single > _MISFIT_RATIO * misfit_second
+    )
+    is_change = is_change and bool(np.linalg.norm(change) > _LEAST_CHANGE * size)
+    variance_factor = max(1.0, float(np.max(chi2)) / (graph.temper * _CHANCE))
+    return IronChange(first if is_change else None, variance_factor)
 
 
-def _seconds(H: Array, g: Array, Hs: Array, gs: Array, prior: Array) -> tuple[Array, Array]:
+def _second_iron_steps(
+    H: Array, g: Array, Hs: Array, gs: Array, prior: Array
+) -> tuple[Array, Array]:
     """Steps (N - 1, 20) and chi squared (N - 1,) of a second hard iron from each epoch on."""
     late_H = np.cumsum(Hs[:0:-1], axis=0)[::-1]
     late_g = np.cumsum(gs[:0:-1], axis=0)[::-1]
@@ -146,15 +153,15 @@ class Misalignment:
         return worth and self.chi2 > _EVIDENCE and self.misfit < _MISFIT
 
 
-def misalignment(
-    epochs: InformationStack, graph: Graph, sigma_bias: float, taken_rad: Array
+def estimate_misalignment(
+    epochs: InformationStack, graph: Graph, sigma_bias: float, corrected_rad: Array
 ) -> Misalignment:
     """From what the epochs of a settled window say.  LinAlgError where the motion does not tell.
 
     taken_rad (3,): turn that is taken out of the gyro's angles already
     """
-    found = instrument(epochs, graph, sigma_bias)
-    theta, spread = taken_rad + found.step[TURN], found.covariance[TURN, TURN]
+    found = estimate_instrument(epochs, graph, sigma_bias)
+    theta, spread = corrected_rad + found.step[TURN], found.covariance[TURN, TURN]
     c = retract(graph.c, found.step[:9], graph.moments)
     C = so3.exp(-theta[None])[0] @ np.linalg.inv(chain.symmetric(c[:6]))
     full = Affine(C / np.cbrt(np.linalg.det(C)), c[6:9].copy())
@@ -184,15 +191,15 @@ def misalignment(
 
 _MODES = 3  # half waves over the window: slower than epochs are long
 _SIZES = np.exp(np.arange(-4.0, 3.0))  # times what is ordinary
-_SPREAD = 2.0  # of their logarithm: `diagnosis/priors.py`, 1.5 to 2.2
-_SHOWN = 1e-6  # information of a direction over that of the best one: less is none
-_THERE = 1.0 / 20.0  # probability before the data; `diagnosis/priors.py: COURSE`
-_NAMED = 12.0  # nats; `diagnosis/priors.py: ODDS_REAL`: the laws are not exact
+_LOG_SPREAD = 2.0  # of their logarithm: `diagnosis/priors.py`, 1.5 to 2.2
+_LEAST_INFORMATION = 1e-6  # information of a direction over that of the best one: less is none
+_PRIOR_PROBABILITY = 1.0 / 20.0  # probability before the data; `diagnosis/priors.py: COURSE`
+_REPORT_NATS = 12.0  # nats; `diagnosis/priors.py: ODDS_REAL`: the laws are not exact
 _FOLLOWS = {"attitude": "the attitude", "rate": "the rate of turn", "time": "the time"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LeftOver:
+class ResidualComponent:
     """The likeliest component of what is left over.
 
     key: of `LOCKED`; nats: by which it is likelier than nothing; size_gauss: rms of what it makes
@@ -207,7 +214,7 @@ class LeftOver:
     @property
     def words(self) -> str:
         """What it is and what to do; empty: it may be chance."""
-        if not self.nats > _NAMED:
+        if not self.nats > _REPORT_NATS:
             return ""
         return (
             f"what is left follows {_FOLLOWS[self.key]}: {1e3 * self.size_gauss:.2g} mG; run "
@@ -223,7 +230,7 @@ class LeftOver:
         )
 
 
-def widened(covariance: Array, plain: Array, left: LeftOver | None) -> Array:
+def widen_covariance(covariance: Array, plain: Array, left: ResidualComponent | None) -> Array:
     """covariance (12, 12), which is wider than `plain` for what epochs disagree about, and no less
     wide than for what is left over."""
     if left is None:
@@ -235,13 +242,13 @@ def widened(covariance: Array, plain: Array, left: LeftOver | None) -> Array:
     return np.asarray(covariance + size * ((vectors * np.clip(values, 0.0, None)) @ vectors.T))
 
 
-def left_over(
+def find_residual_component(
     epochs: Sequence[WindowEpoch],
     graph: Graph,
-    believed_of: tuple[float, Array],
-    taken: TakenOut,
+    prior_sigmas: tuple[float, Array],
+    correction: InstrumentCorrection,
     noise_gauss: float,
-) -> LeftOver | None:
+) -> ResidualComponent | None:
     """By those epochs of a window that `linearise_locked` saw; None where nothing is likelier than
     nothing, or too few are there.
 
@@ -252,32 +259,36 @@ def left_over(
     moving = [epoch for epoch in epochs if epoch.locked is not None]
     if len(moving) < 2:
         return None
-    told = [(epoch, epoch.locked) for epoch in moving if epoch.locked is not None]
-    known = [one for _, one in told]
-    H = np.array([one.told.H for one in known])
-    g = np.array([one.told.at(graph.c, graph.nodes[epoch.a].bias) for epoch, one in told])
-    sigma_bias, sigmas = believed_of
+    moving_locked = [(epoch, epoch.locked) for epoch in moving if epoch.locked is not None]
+    known = [one for _, one in moving_locked]
+    H = np.array([one.information.H for one in known])
+    g = np.array(
+        [one.information.at(graph.c, graph.nodes[epoch.a].bias) for epoch, one in moving_locked]
+    )
+    sigma_bias, sigmas = prior_sigmas
     n = 12 + len(sigmas)
     prior, pull = np.zeros((n, n)), np.zeros(n)
-    own_H, own_g = believed(graph, sigma_bias)
-    prior[:12, :12], pull[:12] = own_H[:12, :12], own_g[:12]
+    prior_H, prior_g = prior_quadratic(graph, sigma_bias)
+    prior[:12, :12], pull[:12] = prior_H[:12, :12], prior_g[:12]
     prior[12:, 12:] = np.diag(graph.temper / np.square(sigmas))
-    pull[12 + GYRO_OF_ALL] = graph.temper / np.square(sigmas[GYRO_OF_ALL]) * taken.numbers
+    pull[12 + GYRO_AMONG_IMPERFECTIONS] = (
+        graph.temper / np.square(sigmas[GYRO_AMONG_IMPERFECTIONS]) * correction.gyro_parameters
+    )
     rows = sum(epoch.data.steps for epoch in moving)
     time_s = np.array([float(epoch.data.time_s[[0, -1]].mean()) for epoch in moving])
-    course = locked.COURSE * locked.courses(time_s, _MODES)
+    modes = locked.COURSE * locked.courses(time_s, _MODES)
     found = []
     for key in LOCKED:
-        column = course if key == "time" else np.ones((len(moving), 1))
-        asked = _Asked.of(key, (H, g), known, column, (prior, pull))
-        if asked is not None:
-            found.append(asked.weighed(key, noise_gauss / np.sqrt(rows)))
+        column = modes if key == "time" else np.ones((len(moving), 1))
+        scores = _ComponentScores.of(key, (H, g), known, column, (prior, pull))
+        if scores is not None:
+            found.append(scores.posterior(key, noise_gauss / np.sqrt(rows)))
     best = max(found, key=lambda one: one.nats, default=None)
     return best if best is not None and best.nats > 0.0 else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Asked:
+class _ComponentScores:
     """What epochs ask of a component, in the k directions of it that they tell.
 
     scores (k,): whitened by all that else may be; told (k,): information in units of what is
@@ -286,7 +297,7 @@ class _Asked:
     """
 
     scores: Array
-    told: Array
+    information: Array
     chance: Array
     freedom: float
     by_one: Array
@@ -298,62 +309,78 @@ class _Asked:
         known: Sequence[LockedInformation],
         course: Array,
         before: tuple[Array, Array],
-    ) -> _Asked | None:
+    ) -> _ComponentScores | None:
         """course (N, m): by how much each coefficient of the component counts in each epoch, m
         times; before: what is believed of all else. None where the epochs can hardly
         disagree."""
         (H, g), at, others = epochs, LOCKED[key], slice(0, len(before[1]))
         own_H, own_g = H[:, at[:, None], at], g[:, at]
         to_others, modes = H[:, at, others], course.shape[1]
-        beside = np.tensordot(course, to_others, (0, 0)).reshape(modes * len(at), -1).T
+        cross = np.tensordot(course, to_others, (0, 0)).reshape(modes * len(at), -1).T
         pairs = course[:, :, None] * course[:, None]
-        own = np.tensordot(pairs, own_H, (0, 0)).transpose(0, 2, 1, 3).reshape(beside.shape[1], -1)
+        own = np.tensordot(pairs, own_H, (0, 0)).transpose(0, 2, 1, 3).reshape(cross.shape[1], -1)
         gradient = (course.T @ own_g).ravel()
-        rest_H, rest_g = H[:, others, others].sum(axis=0) + before[0], g[:, others].sum(axis=0)
-        rest_g = rest_g + before[1]
-        scale = 1.0 / np.sqrt(np.diag(rest_H))
-        solved = partial(np.linalg.solve, rest_H * np.outer(scale, scale))
-        gain = scale[:, None] * solved(scale[:, None] * beside)
-        values, vectors = np.linalg.eigh(own - beside.T @ gain)
-        shown = values > _SHOWN * max(float(values[-1]), 1e-30)
-        values, vectors = values[shown], vectors[:, shown]
-        score = vectors.T @ (gradient - gain.T @ rest_g)
+        others_H, others_g = H[:, others, others].sum(axis=0) + before[0], g[:, others].sum(axis=0)
+        others_g = others_g + before[1]
+        scale = 1.0 / np.sqrt(np.diag(others_H))
+        solved = partial(np.linalg.solve, others_H * np.outer(scale, scale))
+        gain = scale[:, None] * solved(scale[:, None] * cross)
+        values, vectors = np.linalg.eigh(own - cross.T @ gain)
+        determined = values > _LEAST_INFORMATION * max(float(values[-1]), 1e-30)
+        values, vectors = values[determined], vectors[:, determined]
+        score = vectors.T @ (gradient - gain.T @ others_g)
         step = -vectors @ (score / values)
-        rest = -scale * solved(scale * (rest_g + beside @ step))
+        others_step = -scale * solved(scale * (others_g + cross @ step))
         each = course @ step.reshape(modes, -1)
-        left = own_g + to_others @ rest + chain.times(own_H, each)
+        residual_g = own_g + to_others @ others_step + chain.times(own_H, each)
         roots = np.array([one.roots[key] for one in known])
         by_others = (roots @ to_others).reshape(-1, len(scale)) * scale
         fitted = float(np.sum(by_others.T * solved(by_others.T)))
         freedom = float(sum(one.freedom[key] for one in known)) - len(values) - fitted
         if freedom < len(values):
             return None
-        alike = float(np.sum(chain.times(roots, left) ** 2)) / freedom
-        ways = np.tensordot(course, vectors.reshape(modes, len(at), -1), (1, 0))
-        each_way = chain.times(np.swapaxes(ways, 1, 2), left) ** 2
-        told = np.sum(ways * (own_H @ ways), axis=(0, 1))
-        own_way = each_way.sum(axis=0) / told * len(known) / max(len(known) - 1, 1)
-        chance = np.maximum(alike, own_way)
-        return _Asked(score / np.sqrt(values), values, chance, freedom, -(gain[:12] @ vectors))
+        pooled_variance = float(np.sum(chain.times(roots, residual_g) ** 2)) / freedom
+        epoch_vectors = np.tensordot(course, vectors.reshape(modes, len(at), -1), (1, 0))
+        squared_by_direction = chain.times(np.swapaxes(epoch_vectors, 1, 2), residual_g) ** 2
+        direction_information = np.sum(epoch_vectors * (own_H @ epoch_vectors), axis=(0, 1))
+        variance_by_direction = (
+            squared_by_direction.sum(axis=0)
+            / direction_information
+            * len(known)
+            / max(len(known) - 1, 1)
+        )
+        chance = np.maximum(pooled_variance, variance_by_direction)
+        return _ComponentScores(
+            score / np.sqrt(values), values, chance, freedom, -(gain[:12] @ vectors)
+        )
 
-    def weighed(self, key: str, of_one: float) -> LeftOver:
+    def posterior(self, key: str, of_one: float) -> ResidualComponent:
         """of_one (gauss): rms of a component that asks for one."""
         variance = _SIZES[:, None] ** 2
-        likely = np.exp(-0.5 * (np.log(_SIZES) / _SPREAD) ** 2)
-        likely /= likely.sum()
-        more = variance * self.told / self.chance
+        size_prior = np.exp(-0.5 * (np.log(_SIZES) / _LOG_SPREAD) ** 2)
+        size_prior /= size_prior.sum()
+        signal_to_chance = variance * self.information / self.chance
         squares = self.scores**2 / self.chance
         known = self.freedom + len(squares)
-        nothing = np.log1p(squares.sum() / self.freedom)
-        there = np.log1p(np.sum(squares / (1.0 + more), axis=1) / self.freedom)
-        nats = 0.5 * (known * (nothing - there) - np.sum(np.log1p(more), axis=1))
+        null_log = np.log1p(squares.sum() / self.freedom)
+        component_log = np.log1p(np.sum(squares / (1.0 + signal_to_chance), axis=1) / self.freedom)
+        nats = 0.5 * (
+            known * (null_log - component_log) - np.sum(np.log1p(signal_to_chance), axis=1)
+        )
         most = float(nats.max())
-        weights = likely * np.exp(nats - most)
+        weights = size_prior * np.exp(nats - most)
         odds = most + float(np.log(weights.sum()))
-        against = (1.0 / _THERE - 1.0) * float(np.exp(-np.clip(odds, -50.0, 50.0)))
-        weights *= 1.0 / weights.sum() / (1.0 + against)
-        mean = -np.sqrt(self.told) * self.scores * variance / (self.chance * (1.0 + more))
-        spread = np.diag(weights @ (variance / (1.0 + more))) + (weights * mean.T) @ mean
+        null_odds = (1.0 / _PRIOR_PROBABILITY - 1.0) * float(np.exp(-np.clip(odds, -50.0, 50.0)))
+        weights *= 1.0 / weights.sum() / (1.0 + null_odds)
+        mean = (
+            -np.sqrt(self.information)
+            * self.scores
+            * variance
+            / (self.chance * (1.0 + signal_to_chance))
+        )
+        spread = (
+            np.diag(weights @ (variance / (1.0 + signal_to_chance))) + (weights * mean.T) @ mean
+        )
         added = self.by_one @ spread @ self.by_one.T
-        left = max(float(np.sum(self.scores**2 - self.chance)), 0.0)
-        return LeftOver(key, odds, of_one * float(np.sqrt(left)), (added + added.T) / 2)
+        excess = max(float(np.sum(self.scores**2 - self.chance)), 0.0)
+        return ResidualComponent(key, odds, of_one * float(np.sqrt(excess)), (added + added.T) / 2)

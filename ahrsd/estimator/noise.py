@@ -190,12 +190,12 @@ class DirectionCells:
     def of(directions: Array, each: Array | float) -> DirectionCells:
         """Of unit vectors (n, 3), each standing for that many steps."""
         weights = np.broadcast_to(each, len(directions))
-        cells = DirectionCells.numbers(directions)
+        cells = DirectionCells.cell_indices(directions)
         count = np.bincount(cells, weights, minlength=_BANDS * _SECTORS)
         return DirectionCells(count.astype(np.float64))
 
     @staticmethod
-    def numbers(directions: Array) -> NDArray[np.intp]:
+    def cell_indices(directions: Array) -> NDArray[np.intp]:
         """(n,) cells of unit vectors (n, 3)."""
         band = np.minimum((directions[:, 2] + 1) / 2 * _BANDS, _BANDS - 1).astype(np.intp)
         angle = np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) % 1.0
@@ -395,7 +395,7 @@ def _visits(
     """Correlation of what is left over in the same directions, at times that far apart."""
     time_s = np.concatenate([data.time_s for data, *_ in parts])
     left = np.concatenate([part[2] for part in parts])
-    cell = DirectionCells.numbers(np.concatenate([part[3] for part in parts]))
+    cell = DirectionCells.cell_indices(np.concatenate([part[3] for part in parts]))
     edges = np.flatnonzero(np.diff(cell) != 0) + 1
     begins = np.r_[0, edges]
     count = np.diff(np.r_[begins, len(cell)])

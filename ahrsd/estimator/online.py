@@ -23,34 +23,40 @@ from ahrsd import so3
 from ahrsd.calibration import Affine, Estimate, Observability
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.epoch import (
-    GYRO_OF_ALL,
-    TOLD,
-    Considered,
+    GYRO_AMONG_IMPERFECTIONS,
+    REQUIRED_NATS,
+    ImperfectionLikelihood,
     Instrument,
-    TakenOut,
-    Weighed,
+    InstrumentCorrection,
+    InstrumentPosterior,
     Widening,
-    considered,
-    gyro_asked,
-    informations,
-    instrument,
+    estimate_instrument,
+    full_instrument_quadratics,
+    instrument_quadratics,
     linearise_locked,
-    of_rests,
-    walk_asked,
-    whole_informations,
+    required_bias_walk,
+    required_gyro_correction,
+    rest_quadratics,
+    widening_by_imperfections,
 )
 from ahrsd.estimator.epoch_data import EpochBuilder, check_samples, with_border
-from ahrsd.estimator.graph import BLIND, Node, SingularError, curvature, whitening
-from ahrsd.estimator.model_checks import (
-    LeftOver,
-    Misalignment,
-    change_message,
-    divided,
-    left_over,
-    misalignment,
-    widened,
+from ahrsd.estimator.graph import (
+    UNDETERMINED_RATIO,
+    Node,
+    SingularError,
+    curvature_covariance,
+    whitening,
 )
-from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters, instruments
+from ahrsd.estimator.model_checks import (
+    Misalignment,
+    ResidualComponent,
+    change_message,
+    estimate_misalignment,
+    find_iron_change,
+    find_residual_component,
+    widen_covariance,
+)
+from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters, possible_instruments
 from ahrsd.estimator.window import Window, search
 from ahrsd.samples import Array, SampleBlock
 
@@ -91,7 +97,7 @@ def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float
     direction u is the tangential part of M^-1 (dM u + db); its part along (down x u) turns the
     heading by that over cos(dip).
     """
-    u, across = _headings(down_b, dip_rad)
+    u, across = _headings_at_tilts(down_b, dip_rad)
     along = across @ np.linalg.inv(chain.symmetric(c[:6]))
     J = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], axis=2)
     row = (along[:, None, :] @ J)[:, 0]
@@ -99,13 +105,13 @@ def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float
     return float(np.degrees(np.sqrt(np.maximum(np.max(variance), 0.0))))
 
 
-def turned_heading_deg(turn_rad: Array, down_b: Array, dip_rad: float) -> float:
+def misalignment_heading_deg(turn_rad: Array, down_b: Array, dip_rad: float) -> float:
     """Worst heading error over the same headings where the magnetometer's axes are turned (3,)."""
-    u, across = _headings(down_b, dip_rad)
+    u, across = _headings_at_tilts(down_b, dip_rad)
     return float(np.degrees(np.max(np.abs(np.sum(np.cross(turn_rad, u) * across, axis=1)))))
 
 
-def _headings(down_b: Array, dip_rad: float) -> tuple[Array, Array]:
+def _headings_at_tilts(down_b: Array, dip_rad: float) -> tuple[Array, Array]:
     """Field directions (n, 3) over 12 headings at each tilt, and what turns each heading (n, 3)."""
     psi = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
     helper = np.eye(3)[np.argmin(np.abs(down_b), axis=1)]
@@ -117,7 +123,7 @@ def _headings(down_b: Array, dip_rad: float) -> tuple[Array, Array]:
     return u, np.cross(down_b, level).reshape(-1, 3) / np.cos(dip_rad)
 
 
-_TELLS_DEG = 0.5  # a heading that is known better needs no advice
+_KNOWN_DEG = 0.5  # a heading that is known better needs no advice
 _MOTION = "the motion so far tells too little: {}"
 _WIDENED = {
     "misfit": "the field differs with place or attitude, or the iron changes meanwhile: repeat the "
@@ -132,7 +138,7 @@ _WIDENED = {
     "bias": "the gyro's bias may still follow its temperature: go on until it is warm",
 }
 _LEAN_RAD = float(np.radians(30.0))
-_AS_WELL = 1.5  # times the least sigma that counts as the same
+_SAME_SIGMA_RATIO = 1.5  # times the least sigma that counts as the same
 _SECONDS, _ROWS = 60.0, 20.0  # that a manoeuvre lasts, and readings at each of its attitudes
 
 
@@ -145,7 +151,7 @@ def motion_and_misfit(plain: Array, answer: Array, W: Array) -> dict[str, Array]
     """
     scaled = W @ answer @ W.T
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
-    blind = vectors[:, values > BLIND**2]
+    blind = vectors[:, values > UNDETERMINED_RATIO**2]
     at_blind = np.linalg.solve(W, blind @ blind.T @ W)
     others = np.eye(len(W)) - at_blind
     more = answer - plain
@@ -167,12 +173,12 @@ class HeadingAdvice:
     dip_rad: float
     noise_gauss: float
 
-    def widened_by(
+    def main_cause(
         self,
         parts: Mapping[str, Array],
         covariance: Array,
-        turned_deg: float = 0.0,
-        left: Callable[[], str] = str,
+        misaligned_deg: float = 0.0,
+        misfit_cause: Callable[[], str] = str,
     ) -> str:
         """What makes more than half of the heading's variance, in words; empty: it is known well.
 
@@ -181,36 +187,40 @@ class HeadingAdvice:
         were found to be turned make of the heading; left: what is known of misfit, in words, or
         empty
         """
-        if not np.hypot(self._sigma_deg(covariance), turned_deg) > _TELLS_DEG:
+        if not np.hypot(self._sigma_deg(covariance), misaligned_deg) > _KNOWN_DEG:
             return ""
         variances = {name: self._sigma_deg(one) ** 2 for name, one in parts.items()}
-        variances["turned"] = turned_deg**2
+        variances["turned"] = misaligned_deg**2
         most = max(variances, key=lambda name: variances[name])
         if not variances[most] > 0.5 * sum(variances.values()):
             return ""
         if most == "motion":
-            return _MOTION.format(self.manoeuvre(covariance))
-        return (left() if most == "misfit" else "") or _WIDENED[most]
+            return _MOTION.format(self.best_manoeuvre(covariance))
+        return (misfit_cause() if most == "misfit" else "") or _WIDENED[most]
 
-    def by_place_deg(self, parts: Mapping[str, Array]) -> float:
+    def place_heading_deg(self, parts: Mapping[str, Array]) -> float:
         """What a field that differs by place makes of the heading, 1 sigma; nan: unknown.
 
         Where it does not differ with the heading it is misfit.
         """
         return self._sigma_deg(parts["place"] + parts["misfit"]) if "place" in parts else np.nan
 
-    def manoeuvre(self, covariance: Array) -> str:
+    def best_manoeuvre(self, covariance: Array) -> str:
         """The easiest of a turn, a roll and a pitch after which the heading is known as well as
         after any of them."""
         sigma = np.sqrt(np.diag(covariance))
         size = np.outer(sigma, sigma)
-        known = np.linalg.inv(covariance / size)
+        information = np.linalg.inv(covariance / size)
         after = {
-            name: self._sigma_deg(size * np.linalg.inv(known + self._told(attitudes) * size))
+            name: self._sigma_deg(
+                size * np.linalg.inv(information + self._manoeuvre_information(attitudes) * size)
+            )
             for name, attitudes in self._manoeuvres().items()
         }
         least = min(after.values())
-        return next((name for name in after if after[name] <= _AS_WELL * least), "turn and lean")
+        return next(
+            (name for name in after if after[name] <= _SAME_SIGMA_RATIO * least), "turn and lean"
+        )
 
     def _sigma_deg(self, covariance: Array) -> float:
         return heading_sigma_deg(self.c, covariance, self.down, self.dip_rad)
@@ -218,7 +228,7 @@ class HeadingAdvice:
     def _manoeuvres(self) -> dict[str, list[Array]]:
         """Attitudes (n, 3, 3) from the level to the sensor, one after the other, in pieces."""
         mean = np.mean(self.down, axis=0)
-        level = _level(mean / np.linalg.norm(mean))
+        level = _level_frame(mean / np.linalg.norm(mean))
         headings = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
         turned = so3.exp(headings[:, None] * level[:, 2]) @ level
         lean = _LEAN_RAD * np.sin(headings)[:, None]
@@ -230,7 +240,7 @@ class HeadingAdvice:
             ]
         return found
 
-    def _told(self, pieces: Sequence[Array]) -> Array:
+    def _manoeuvre_information(self, pieces: Sequence[Array]) -> Array:
         """Information (12, 12) of a manoeuvre; where each piece begins to point is not known.
 
         As much for a manoeuvre of several pieces as of one.
@@ -241,8 +251,8 @@ class HeadingAdvice:
         total = np.zeros((12, 12))
         for R in pieces:
             columns = chain.symmetric_columns(R @ field)
-            gone = np.cumsum(np.swapaxes(R, 1, 2), axis=0) * (_SECONDS / len(pieces) / len(R))
-            bias = -M @ R @ so3.skew(field) @ gone  # the gyro's error in the level, by its bias
+            integral = np.cumsum(np.swapaxes(R, 1, 2), axis=0) * (_SECONDS / len(pieces) / len(R))
+            bias = -M @ R @ so3.skew(field) @ integral  # the gyro's error in the level, by its bias
             iron = np.concatenate([columns, np.tile(np.eye(3), (len(R), 1, 1)), bias], axis=2)
             J = np.concatenate([iron, M @ R @ across], axis=2).reshape(-1, 14)
             H = J.T @ J
@@ -251,14 +261,16 @@ class HeadingAdvice:
         return total * _ROWS / self.noise_gauss**2
 
 
-def _level(down: Array) -> Array:
+def _level_frame(down: Array) -> Array:
     """Columns north, east, down (3, 3) in the sensor's frame, north in some direction."""
     north = np.cross(np.eye(3)[np.argmin(np.abs(down))], down)
     north /= np.linalg.norm(north)
     return np.column_stack([north, np.cross(down, north), down])
 
 
-def attitude(tilts: Iterable[Array], epochs: Sequence[tuple[Array, Array]]) -> tuple[Array, float]:
+def tilts_and_dip(
+    tilts: Iterable[Array], epochs: Sequence[tuple[Array, Array]]
+) -> tuple[Array, float]:
     """Tilts driven (K, 3) and the field's dip in rad, from gravity; level and steep without it.
 
     tilts: unit vectors towards the earth, some nan; epochs: directions (n, 3) of the field and of
@@ -288,12 +300,12 @@ def observability(covariance: Array, W: Array) -> Observability:
     ratio = np.sqrt(np.clip(values, 0.0, None))
     return Observability(
         prior_ratio=ratio,
-        unobservable=blind_names(vectors[:, ratio > BLIND]),
+        unobservable=undetermined_names(vectors[:, ratio > UNDETERMINED_RATIO]),
         score=float(_FLOOR / max(float(ratio[-1]), 1e-9)),
     )
 
 
-def blind_names(vectors: Array) -> tuple[str, ...]:
+def undetermined_names(vectors: Array) -> tuple[str, ...]:
     """One name for each dimension of the subspace that the orthonormal vectors (12, K) span.
 
     Eigenvectors of equal eigenvalues are any basis, another on each processor. So the parameter
@@ -311,10 +323,10 @@ def blind_names(vectors: Array) -> tuple[str, ...]:
     return tuple(names)
 
 
-def misfit_words(left: LeftOver | None, window: Window) -> str:
+def misfit_words(component: ResidualComponent | None, window: Window) -> str:
     """What is known of misfit; empty: nothing."""
-    if left is not None and left.words:
-        return left.cause
+    if component is not None and component.words:
+        return component.cause
     slow = window.slow_residual()
     return "" if slow is None else slow.words
 
@@ -323,11 +335,13 @@ def misfit_words(left: LeftOver | None, window: Window) -> str:
 
 
 _FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at every half more
-_CHANGED = 2  # epochs one after the other that contradict the answer: the iron has changed
-_FEW = 6  # epochs up to which each new one is iterated to the end over all: cheap, and soon good
+_CHANGED_EPOCHS = 2  # epochs one after the other that contradict the answer: the iron has changed
+_FEW_EPOCHS = (
+    6  # epochs up to which each new one is iterated to the end over all: cheap, and soon good
+)
 # Sigmas from what a search found at which the answer goes there. Thinned data alone make about 1.
 _AWAY, _AWAY_UNSETTLED = 1.5, 0.5
-_LOOKS = 4  # of the first search
+_FIRST_LOOKS = 4  # of the first search
 _GAIN_FOLDED = 20.0  # of log likelihood, tempered, that is needed against data a search cannot see
 _HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the estimate converged
 _SETTLED = 0.5  # sigmas: a larger last step means that the answer still moves
@@ -336,10 +350,10 @@ _SCALE = 0.5  # 1-sigma of the field's magnitude over its size in the present ca
 _LAG_SIGMAS, _LAG_SAME = 3.2, 0.3  # of a lag's sigma: evidence that there is one; settled
 _LAG_PASSES, _LONGEST_LAG_S = 3, 0.1
 _PASSES, _QUIETER = 8, 0.95  # over a gyro that is wrong; while the noise falls below that of itself
-_EXPLAINED = 1.5  # misfit of data that an instrument with imperfections explains
-_DOUBTFUL = -15.0  # nats from which a gyro that is wrong is tried where something is left over
+_EXPLAINED_MISFIT = 1.5  # misfit of data that an instrument with imperfections explains
+_TRIED_NATS = -15.0  # nats from which a gyro that is wrong is tried where something is left over
 _MOST_OF_KIND = 4.0  # sigmas of an imperfection beyond which something else is wrong
-_SURE = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
+_KNOWN_SIGMA = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
 
 
 WHOLE = 32  # `at_once` for a recording that is there as a whole: what a window holds
@@ -372,14 +386,18 @@ class Estimator:
         self._builder = EpochBuilder(self.parameters)
         self._window: Window | None = None
         self._whitening = np.eye(12)
-        self._down: deque[Array] = deque(maxlen=64)
-        self._searching, self._agreed, self._apart = True, False, 0.0
+        self._tilts: deque[Array] = deque(maxlen=64)
+        self._searching, self._agreed, self._agreement_sigmas = True, False, 0.0
         self._moving_epochs = 0
         self._next_search = _FIRST_SEARCH
-        self._strange = 0
+        self._contradictions = 0
         self._is_copy = False  # made for one answer
-        self._doubted_s: float | None = None  # since when the newest motion contradicts the answer
-        self._parted = 1.0  # variance over the expected of what earlier and later data ask for
+        self._contradicted_s: float | None = (
+            None  # since when the newest motion contradicts the answer
+        )
+        self._split_factor = (
+            1.0  # variance over the expected of what earlier and later data ask for
+        )
         self._misscaled = 0.0  # share of themselves by which the gyro's angles are too small
         self.restarted_s: float | None = None  # when the iron changed, if it did
 
@@ -415,19 +433,19 @@ class Estimator:
             else:
                 self._window.track(everything=True, exactly=True)
             settled = self._window.step_sigmas < _SETTLED
-            self._window = self._undivided(self._window)
+            self._window = self._split_at_change(self._window)
             self._window, changed = self._examine(self._window)
             if changed and self._searching:
                 self._search(self._window, exactly=True)
             if not settled:  # nobody could be asked before
-                self._window = self._undivided(self._window)
-        return self._answer()
+                self._window = self._split_at_change(self._window)
+        return self._current_estimate()
 
     def _append(self, data: chain.EpochData) -> None:
         if self._last is not None and not data.measures_first:
             data = with_border(data, self._last)
         self._last = data
-        self._down.append(data.down_b[len(data) // 2])
+        self._tilts.append(data.down_b[len(data) // 2])
         self._new.append(data)
         if len(self._new) >= self._at_once:
             self._follow(*self._grow())
@@ -435,74 +453,81 @@ class Estimator:
     def _grow(self) -> tuple[Window, int]:
         """The window with the new epochs in it, and how many they were."""
         new, self._new = self._new, []
-        window = self._window = self._window or self._begin(new[0])
-        self._moving_epochs += window.take(new)
-        return self._unchanged(window, len(new)), len(new)
+        window = self._window = self._window or self._create_window(new[0])
+        self._moving_epochs += window.queue(new)
+        return self._detect_change(window, len(new)), len(new)
 
     def _follow(self, window: Window, new: int) -> None:
         """Let the answer follow the new epochs, unless the last one waits for the next."""
-        if self._strange > 0:
+        if self._contradictions > 0:
             return
         due = self._moving_epochs >= self._next_search
-        if not (due and window.untried):  # else there is nothing yet to go on from
-            window.track(new, everything=self._searching and len(window.epochs) <= _FEW)
+        if not (due and window.never_moved):  # else there is nothing yet to go on from
+            window.track(new, everything=self._searching and len(window.epochs) <= _FEW_EPOCHS)
         if due:
             self._next_search = self._moving_epochs + max(1, self._moving_epochs // 2)
             if self._searching:
                 self._search(window)
-            window, _ = self._examine(self._undivided(window))
+            window, _ = self._examine(self._split_at_change(window))
             self._window = window
         window.fold()
 
-    def _unchanged(self, window: Window, new: int) -> Window:
+    def _detect_change(self, window: Window, new: int) -> Window:
         """The window, or a new one where two epochs one after the other contradict a sure answer.
 
         Then the iron has changed: everything before them is forgotten. One that does waits for the
         next to do so too, and until motion agrees again the answer is in doubt.
         """
-        sure = not self._searching and window.step_sigmas < _SETTLED
-        if sure:
-            window.join()
+        is_sure = not self._searching and window.step_sigmas < _SETTLED
+        if is_sure:
+            window.attach_waiting()
         for k in range(-new, 0):
-            strange = sure and window.contradicted(k)
-            self._strange = self._strange + 1 if strange else 0
-            if not sure or (window.epochs[k].turned and not strange):
-                self._doubted_s = None
-            elif strange and self._doubted_s is None:
-                self._doubted_s = float(window.epochs[k].data.time_s[0])
-            if self._strange == _CHANGED:
-                window = self._window = self._anew(window, _CHANGED - 1 - k)
+            contradicts = is_sure and window.epoch_contradicts(k)
+            self._contradictions = self._contradictions + 1 if contradicts else 0
+            if not is_sure or (window.epochs[k].has_motion and not contradicts):
+                self._contradicted_s = None
+            elif contradicts and self._contradicted_s is None:
+                self._contradicted_s = float(window.epochs[k].data.time_s[0])
+            if self._contradictions == _CHANGED_EPOCHS:
+                window = self._window = self._restart_after_change(window, _CHANGED_EPOCHS - 1 - k)
                 break
         return window
 
-    def _anew(self, window: Window, count: int) -> Window:
+    def _restart_after_change(self, window: Window, count: int) -> Window:
         """The iron changed before the last `count` epochs: what was before is forgotten."""
         self.restarted_s = float(window.epochs[-count].data.time_s[0])
-        self._searching, self._agreed, self._strange, self._doubted_s = True, False, 0, None
-        self._moving_epochs = sum(epoch.turned for epoch in window.epochs[-count:])
-        self._next_search, self._parted = _FIRST_SEARCH, 1.0
-        return window.anew(count)
+        self._searching, self._agreed, self._contradictions, self._contradicted_s = (
+            True,
+            False,
+            0,
+            None,
+        )
+        self._moving_epochs = sum(epoch.has_motion for epoch in window.epochs[-count:])
+        self._next_search, self._split_factor = _FIRST_SEARCH, 1.0
+        return window.restart_with_last(count)
 
-    def _undivided(self, window: Window) -> Window:
+    def _split_at_change(self, window: Window) -> Window:
         """The window, or a new one from where the iron changed before the answer was sure."""
         if not window.step_sigmas < _SETTLED:
             return window
         p = self.parameters
         try:
-            told = informations(window.epochs, window.graph)
-            found = divided(told, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss)
+            quadratics = instrument_quadratics(window.epochs, window.graph)
+            change = find_iron_change(
+                quadratics, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss
+            )
         except np.linalg.LinAlgError:
             return window
-        self._parted = 1.0 if found is None else found.parted
-        if found is None or found.first is None:
+        self._split_factor = 1.0 if change is None else change.variance_factor
+        if change is None or change.first is None:
             return window
-        turned = [k for k, epoch in enumerate(window.epochs) if epoch.turned]
-        window = self._anew(window, len(window.epochs) - turned[found.first])
+        moving = [k for k, epoch in enumerate(window.epochs) if epoch.has_motion]
+        window = self._restart_after_change(window, len(window.epochs) - moving[change.first])
         window.track(everything=True)
         self._search(window, exactly=True)
         return window
 
-    def _begin(self, data: chain.EpochData) -> Window:
+    def _create_window(self, data: chain.EpochData) -> Window:
         A0 = np.linalg.inv(self._present.matrix)
         A0 = (A0 + A0.T) / 2  # what is not symmetric in the device's register cannot be held here
         size = float(np.median(np.linalg.norm(self._present.apply(data.field_b_gauss), axis=1)))
@@ -524,9 +549,9 @@ class Estimator:
         With `exactly` the answer is then iterated to the end over all. A first look at many epochs
         cannot know what is held and how loud the residuals are, so that it is given more looks.
         """
-        looks = _LOOKS if window.untried else looks
+        looks = _FIRST_LOOKS if window.never_moved else looks
         found = search(self.parameters, window, self._present_bias, window.data)
-        window.loud = found.loud
+        window.search_residual_ratio = found.search_residual_ratio
         unsettled = window.step_sigmas > _SETTLED
         better = found.gain > _GAIN_FOLDED * window.graph.temper
         if (
@@ -536,12 +561,12 @@ class Estimator:
         ):
             window.restart_at(found.c, found.bias)
             window.track(everything=True, exactly=exactly, here=True)
-        elif exactly or window.untried:
+        elif exactly or window.never_moved:
             window.track(everything=True, exactly=exactly)
-        self._agreed, self._apart = found.agreed, 0.0 if found.agreed else found.apart
+        self._agreed, self._agreement_sigmas = found.agreed, 0.0 if found.agreed else found.apart
         settled = window.step_sigmas < _SETTLED
-        self._searching = not (found.agreed and settled and self._sure(window))
-        if looks > 1 and not (found.agreed or window.untried):
+        self._searching = not (found.agreed and settled and self._is_iron_known(window))
+        if looks > 1 and not (found.agreed or window.never_moved):
             self._search(window, exactly=exactly, looks=looks - 1)
 
     def _examine(self, window: Window) -> tuple[Window, bool]:
@@ -551,112 +576,141 @@ class Estimator:
         What is wrong with a gyro is taken out only if the data are then explained: a field that
         differs by place asks for it too, and is not.
         """
-        late = self._take_out(window)
+        changed = self._correct_until_settled(window)
         if self.parameters.imperfections:
-            for told in (TOLD, _DOUBTFUL):
+            for required_nats in (REQUIRED_NATS, _TRIED_NATS):
                 trial, misscaled = window.copy(), self._misscaled
-                if self._take_out(trial, gyro_told=told) and self._explained(trial, window, told):
-                    window, late = trial, True
+                if self._correct_until_settled(
+                    trial, gyro_nats=required_nats
+                ) and self._correction_explains(trial, window, required_nats):
+                    window, changed = trial, True
                     break
                 self._misscaled = misscaled
-                if not window.left_over:
+                if not window.has_unmodelled_residual:
                     break
-        return window, late
+        return window, changed
 
-    def _explained(self, trial: Window, before: Window, told: float) -> bool:
+    def _correction_explains(self, trial: Window, before: Window, required_nats: float) -> bool:
         """Whether the data are explained once that is taken out; and, where the gyro was not likely
         to be wrong before, likely to be."""
-        most = np.max(instruments(*self.parameters.kinds).sigmas, axis=0)
-        limit = _MOST_OF_KIND * most[GYRO_OF_ALL]
-        within = bool(np.all(np.abs(trial.taken.numbers) < limit))
-        if not within or trial.unexplained >= _EXPLAINED or told == TOLD:
-            return within and trial.unexplained < _EXPLAINED
-        weighed = self._weighed(trial)
-        if weighed is None:
+        largest = np.max(possible_instruments(*self.parameters.kinds).sigmas, axis=0)
+        limit = _MOST_OF_KIND * largest[GYRO_AMONG_IMPERFECTIONS]
+        within = bool(np.all(np.abs(trial.correction.gyro_parameters) < limit))
+        if (
+            not within
+            or trial.residual_ratio >= _EXPLAINED_MISFIT
+            or required_nats == REQUIRED_NATS
+        ):
+            return within and trial.residual_ratio < _EXPLAINED_MISFIT
+        posterior = self._instrument_posterior(trial)
+        if posterior is None:
             return False
         # what it left over passed for noise of the gyro, which is less likely by this
-        quieter = np.log(before.usual.gyro_rad_s / trial.usual.gyro_rad_s)
-        gain = weighed.against_plain(GYRO_OF_ALL)[1] + trial.gyro_freedom * quieter
-        return bool(gain > TOLD)
+        log_noise_ratio = np.log(before.usual.gyro_rad_s / trial.usual.gyro_rad_s)
+        gain = (
+            posterior.log_odds_against_smallest(GYRO_AMONG_IMPERFECTIONS)[1]
+            + trial.gyro_freedom * log_noise_ratio
+        )
+        return bool(gain > REQUIRED_NATS)
 
-    def _take_out(self, window: Window, *, gyro_told: float | None = None) -> bool:
+    def _correct_until_settled(self, window: Window, *, gyro_nats: float | None = None) -> bool:
         """Take out what is asked for until no more is; whether anything was.
 
         gyro_told: nats by which what is wrong with it must be told to be taken out too, None: it is
         not; then the noise that it passed for has to settle as well.
         """
-        gyro = gyro_told is not None
-        least, changed, quiet = _LAG_SIGMAS if window.taken.lag_s == 0.0 else 1.0, False, False
+        gyro = gyro_nats is not None
+        least, changed, noise_settled = (
+            _LAG_SIGMAS if window.correction.lag_s == 0.0 else 1.0,
+            False,
+            False,
+        )
         for _ in range(_PASSES if gyro else _LAG_PASSES):
-            found = self._instrument(window)
+            found = self._estimate_instrument(window)
             if found is None:
                 break
             self._misscaled = found.misscaled
-            more, sigma = found.lag_s
-            taken = window.taken if gyro_told is None else self._gyro_out(window, gyro_told)
-            if gyro and taken is window.taken and not changed:
+            more_lag_s, sigma = found.lag_s
+            correction = (
+                window.correction
+                if gyro_nats is None
+                else self._add_gyro_correction(window, gyro_nats)
+            )
+            if gyro and correction is window.correction and not changed:
                 break
-            if abs(more) >= least * sigma:
-                lag_s = np.clip(taken.lag_s + more, -_LONGEST_LAG_S, _LONGEST_LAG_S)
-                taken, least = replace(taken, lag_s=float(lag_s)), _LAG_SAME
+            if abs(more_lag_s) >= least * sigma:
+                lag_s = np.clip(correction.lag_s + more_lag_s, -_LONGEST_LAG_S, _LONGEST_LAG_S)
+                correction, least = replace(correction, lag_s=float(lag_s)), _LAG_SAME
             noise_gauss = window.usual.mag_gauss
-            if taken is not window.taken:
-                window.take_out(taken)
-            elif not gyro or quiet:
+            if correction is not window.correction:
+                window.correct_instrument(correction)
+            elif not gyro or noise_settled:
                 break
             window.track(everything=True, here=True)
-            changed, quiet = True, window.usual.mag_gauss > _QUIETER * noise_gauss
+            changed, noise_settled = True, window.usual.mag_gauss > _QUIETER * noise_gauss
         return changed
 
-    def _instrument(self, window: Window) -> Instrument | None:
+    def _estimate_instrument(self, window: Window) -> Instrument | None:
         try:
-            told = informations(window.epochs, window.graph)
-            before = window.past.at(window.graph.c, window.taken)
-            sigma_bias, scaled = self.parameters.prior_gyro_bias_rad_s, window.taken.numbers[3]
-            return instrument(told, window.graph, sigma_bias, before, scaled)
+            quadratics = instrument_quadratics(window.epochs, window.graph)
+            before = window.folded_since_correction.at(window.graph.c, window.correction)
+            sigma_bias, scaled = (
+                self.parameters.prior_gyro_bias_rad_s,
+                window.correction.gyro_parameters[3],
+            )
+            return estimate_instrument(quadratics, window.graph, sigma_bias, before, scaled)
         except np.linalg.LinAlgError:
             return None
 
-    def _weighed(self, window: Window) -> Weighed | None:
+    def _instrument_posterior(self, window: Window) -> InstrumentPosterior | None:
         """What is known of the instrument and the place; None where they are not to be asked."""
         if not self.parameters.imperfections:
             return None
-        before = window.folded_information.at(window.graph.c, window.taken)
+        before = window.folded_information.at(window.graph.c, window.correction)
         try:
-            moving = whole_informations(window.epochs, window.graph)
-            rests = of_rests(window.epochs, window.graph)
-            said = np.concatenate([moving[0], rests[0]]), np.concatenate([moving[1], rests[1]])
-            apart = sorted(window.epochs, key=lambda e: not e.turned)
-            times_s = np.array([float(e.data.time_s[[0, -1]].mean()) for e in apart])
+            moving = full_instrument_quadratics(window.epochs, window.graph)
+            rests = rest_quadratics(window.epochs, window.graph)
+            quadratics = (
+                np.concatenate([moving[0], rests[0]]),
+                np.concatenate([moving[1], rests[1]]),
+            )
+            moving_first = sorted(window.epochs, key=lambda e: not e.has_motion)
+            times_s = np.array([float(e.data.time_s[[0, -1]].mean()) for e in moving_first])
             sigma_bias = self.parameters.prior_gyro_bias_rad_s
-            known = Considered.of(said, times_s, window.graph, sigma_bias, before, window.taken)
-            return Weighed.of(known, window.graph, self.parameters.kinds)
+            likelihood = ImperfectionLikelihood.of(
+                quadratics, times_s, window.graph, sigma_bias, before, window.correction
+            )
+            return InstrumentPosterior.of(likelihood, window.graph, self.parameters.kinds)
         except np.linalg.LinAlgError:
             return None
 
-    def _gyro_out(self, window: Window, told: float) -> TakenOut:
+    def _add_gyro_correction(self, window: Window, required_nats: float) -> InstrumentCorrection:
         """What is to be taken out, with what else the gyro's axes and scales are asked for."""
-        weighed = self._weighed(window)
-        if weighed is None:
-            return window.taken
-        taken, first, last = window.taken, window.epochs[0].data, window.epochs[-1].data
+        posterior = self._instrument_posterior(window)
+        if posterior is None:
+            return window.correction
+        correction, first, last = window.correction, window.epochs[0].data, window.epochs[-1].data
         try:
-            more = gyro_asked(weighed, told)
+            more = required_gyro_correction(posterior, required_nats)
         except np.linalg.LinAlgError:
-            return window.taken
+            return window.correction
         if more is not None:
-            taken = taken.with_gyro(more)
-        walk = walk_asked(weighed, float(last.time_s[-1] - first.time_s[0]))
-        return taken if walk == 0.0 else replace(taken, walk=float(np.hypot(taken.walk, walk)))
+            correction = correction.with_gyro(more)
+        walk = required_bias_walk(posterior, float(last.time_s[-1] - first.time_s[0]))
+        return (
+            correction
+            if walk == 0.0
+            else replace(correction, walk=float(np.hypot(correction.walk, walk)))
+        )
 
     @staticmethod
-    def _sure(window: Window) -> bool:
+    def _is_iron_known(window: Window) -> bool:
         try:
             sigma = np.sqrt(window.graph.temper * np.diag(window.graph.covariance())[6:9])
         except SingularError:
             return False
         size = np.cbrt(np.linalg.det(chain.symmetric(window.graph.c[:6])))
-        return bool(np.all(sigma < _SURE * size))
+        return bool(np.all(sigma < _KNOWN_SIGMA * size))
 
     def estimate(self) -> Estimate | None:
         """The present answer, None before the first epoch or where nothing at all is determined.
@@ -664,56 +718,56 @@ class Estimator:
         An epoch that is under way counts as far as it is, if it is long enough to be one.
         """
         if self._new or (self._window and self._builder.pending >= MIN_EPOCH_STEPS):
-            self._watch()
+            self._linearise_locked()
             return self._copy().finish()
-        return self._answer()
+        return self._current_estimate()
 
     @staticmethod
-    def _by_lag(window: Window) -> Array:
+    def _lag_covariance(window: Window) -> Array:
         """What doubt about the lag, by all data so far, adds to the covariance (12, 12)."""
-        known = window.lag_known() if window.taken.lag_s != 0.0 else None
+        known = window.lag_uncertainty() if window.correction.lag_s != 0.0 else None
         return np.zeros((12, 12)) if known is None else np.outer(known.spread, known.spread)
 
-    def _by_imperfections(self, window: Window) -> Widening:
+    def _imperfection_widening(self, window: Window) -> Widening:
         """What an instrument that is not perfect does to the answer."""
-        weighed = self._weighed(window)
-        return Widening.nothing() if weighed is None else considered(weighed)
+        posterior = self._instrument_posterior(window)
+        return Widening.zero() if posterior is None else widening_by_imperfections(posterior)
 
-    def _left_over(self, window: Window) -> LeftOver | None:
+    def _residual_component(self, window: Window) -> ResidualComponent | None:
         """What the epochs of the window leave that is locked to attitude, rate or time.
 
         What an answer leaves that is not the best yet is its own.
         """
-        if not self._is_watched(window):
+        if not self._is_residual_tested(window):
             return None
         if not self._is_copy:
-            self._watch()
-        most = np.max(instruments(*self.parameters.kinds).sigmas, axis=0)[:16]
+            self._linearise_locked()
+        largest = np.max(possible_instruments(*self.parameters.kinds).sigmas, axis=0)[:16]
         try:
-            return left_over(
+            return find_residual_component(
                 window.epochs,
                 window.graph,
-                (self.parameters.prior_gyro_bias_rad_s, most),
-                window.taken,
+                (self.parameters.prior_gyro_bias_rad_s, largest),
+                window.correction,
                 window.usual.mag_gauss,
             )
         except np.linalg.LinAlgError:
             return None
 
-    def _watch(self) -> None:
+    def _linearise_locked(self) -> None:
         """Ask the epochs what is locked, each once: what is made for one answer keeps it."""
-        if self._window is None or not self._is_watched(self._window):
+        if self._window is None or not self._is_residual_tested(self._window):
             return
         with suppress(np.linalg.LinAlgError):
             linearise_locked(self._window.epochs)
 
-    def _is_watched(self, window: Window) -> bool:
+    def _is_residual_tested(self, window: Window) -> bool:
         settled = self._agreed and window.step_sigmas < _SETTLED
         return bool(self.parameters.imperfections) and settled
 
-    def _warnings(self, left: LeftOver | None) -> tuple[str, ...]:
+    def _warnings(self, component: ResidualComponent | None) -> tuple[str, ...]:
         changed = () if self.restarted_s is None else (change_message(self.restarted_s),)
-        return (*changed, left.words) if left is not None and left.words else changed
+        return (*changed, component.words) if component is not None and component.words else changed
 
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
@@ -721,21 +775,24 @@ class Estimator:
         if window is None or not self._agreed:
             return None
         try:
-            told = informations(window.epochs, window.graph)
-            sigma_bias, taken = self.parameters.prior_gyro_bias_rad_s, window.taken.numbers[:3]
-            return misalignment(told, window.graph, sigma_bias, taken)
+            information = instrument_quadratics(window.epochs, window.graph)
+            sigma_bias, corrected_rad = (
+                self.parameters.prior_gyro_bias_rad_s,
+                window.correction.gyro_parameters[:3],
+            )
+            return estimate_misalignment(information, window.graph, sigma_bias, corrected_rad)
         except np.linalg.LinAlgError:
             return None
 
     def _copy(self) -> Estimator:
         other = copy(self)
         other._is_copy = True
-        other._builder, other._down = self._builder.copy(), self._down.copy()
+        other._builder, other._tilts = self._builder.copy(), self._tilts.copy()
         other._new = list(self._new)
         other._window = None if self._window is None else self._window.copy()
         return other
 
-    def _answer(self) -> Estimate | None:
+    def _current_estimate(self) -> Estimate | None:
         window = self._window
         if window is None or not window.epochs:
             return None
@@ -746,21 +803,21 @@ class Estimator:
             return None
         observed = observability(covariance * graph.temper, self._whitening)
         # An answer that moves, or that other starts do not reach, is no better known than that.
-        doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
-        widening = self._by_imperfections(window)
-        plain, left = window.explained_covariance(), self._left_over(window)
-        divided = widened(window.covariance() * self._parted, plain, left)
-        parts = widening.parts | motion_and_misfit(plain, divided, self._whitening)
-        covariance = divided * (1.0 + doubt**2)
-        covariance = covariance + self._by_lag(window) + widening.added
-        covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
+        doubt = min(max(window.step_sigmas, self._agreement_sigmas), _MOST_SIGMAS)
+        widening = self._imperfection_widening(window)
+        explained, component = window.explained_covariance(), self._residual_component(window)
+        tempered = widen_covariance(window.covariance() * self._split_factor, explained, component)
+        parts = widening.parts | motion_and_misfit(explained, tempered, self._whitening)
+        covariance = tempered * (1.0 + doubt**2)
+        covariance = covariance + self._lag_covariance(window) + widening.added
+        covariance[:9, :9] += curvature_covariance(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = unit_volume(graph.c)
         K = np.eye(12)
-        K[:9, :9], K[9:, 9:] = J, np.linalg.inv(window.taken.gyro)
-        down, dip = attitude(self._down, [(e.u, e.data.down_b) for e in window.epochs])
-        turned = turned_heading_deg(window.taken.numbers[:3], down, dip)
-        heading = float(np.hypot(heading_sigma_deg(graph.c, covariance, down, dip), turned))
-        words = partial(misfit_words, left, window)
+        K[:9, :9], K[9:, 9:] = J, np.linalg.inv(window.correction.gyro)
+        down, dip = tilts_and_dip(self._tilts, [(e.u, e.data.down_b) for e in window.epochs])
+        misaligned_deg = misalignment_heading_deg(window.correction.gyro_parameters[:3], down, dip)
+        heading = float(np.hypot(heading_sigma_deg(graph.c, covariance, down, dip), misaligned_deg))
+        words = partial(misfit_words, component, window)
         advice = HeadingAdvice(graph.c, down, dip, window.usual.mag_gauss)
         averaged = self._builder.averaged
         return Estimate(
@@ -782,15 +839,15 @@ class Estimator:
                 and window.step_sigmas < _SETTLED
                 and heading < _HOPELESS_DEG
                 and self._misscaled == 0.0
-                and self._doubted_s is None
+                and self._contradicted_s is None
             ),
-            warnings=self._warnings(left),
-            mag_lag_s=window.taken.lag_s,
+            warnings=self._warnings(component),
+            mag_lag_s=window.correction.lag_s,
             gyro_misscaled=self._misscaled,
-            contradicted_s=self._doubted_s,
-            widened_by=advice.widened_by(parts, covariance, turned, words),
+            contradicted_s=self._contradicted_s,
+            widened_by=advice.main_cause(parts, covariance, misaligned_deg, words),
             place_gauss=widening.place_gauss,
-            place_deg=advice.by_place_deg(parts),
-            gyro_correction=window.taken.gyro,
+            place_deg=advice.place_heading_deg(parts),
+            gyro_correction=window.correction.gyro,
             gyro_covariance=widening.joint(K @ covariance @ K.T, K),
         )

@@ -99,7 +99,9 @@ class Instruments:
 
 
 @lru_cache
-def instruments(kinds: tuple[Imperfections, ...], places: tuple[float, ...]) -> Instruments:
+def possible_instruments(
+    kinds: tuple[Imperfections, ...], places: tuple[float, ...]
+) -> Instruments:
     """All instruments that may be.
 
     Its axes are of one of the kinds, its lag is, its gyro's scales and its gyro's bias are, each
@@ -108,7 +110,9 @@ def instruments(kinds: tuple[Imperfections, ...], places: tuple[float, ...]) -> 
     better one (`_gyros`).
     """
     every, prior = [], []
-    for (axes, late, bias), gyro, place in product(product(kinds, repeat=3), _gyros(kinds), places):
+    for (axes, late, bias), gyro, place in product(
+        product(kinds, repeat=3), _gyro_kinds(kinds), places
+    ):
         (scale, apart, askew), odds = gyro
         every.append(
             (
@@ -127,7 +131,7 @@ def instruments(kinds: tuple[Imperfections, ...], places: tuple[float, ...]) -> 
     return found
 
 
-def _gyros(kinds: tuple[Imperfections, ...]) -> list[tuple[tuple[float, float, float], float]]:
+def _gyro_kinds(kinds: tuple[Imperfections, ...]) -> list[tuple[tuple[float, float, float], float]]:
     """Sigmas of a gyro's scale, of how its scales differ and of the angles between its axes, and
     how likely it is.
 

@@ -38,7 +38,7 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.calibration import Estimate
-from ahrsd.estimator.epoch import GYRO_WAYS, TakenOut
+from ahrsd.estimator.epoch import GYRO_BASIS, InstrumentCorrection
 from ahrsd.samples import Array, SampleBlock
 
 ROWS = 128  # thinned samples in a block
@@ -83,9 +83,14 @@ class ReferenceCalibration:
         # so different are their units that the small ones would be lost
         size = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
         values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
-        gyro = replace(TakenOut.nothing(), gyro=estimate.gyro_correction)
+        gyro = replace(InstrumentCorrection.identity(), gyro=estimate.gyro_correction)
         return ReferenceCalibration(
-            np.r_[A[_ENTRIES], estimate.hard_iron_gauss, estimate.gyro_bias_rad_s, gyro.numbers],
+            np.r_[
+                A[_ENTRIES],
+                estimate.hard_iron_gauss,
+                estimate.gyro_bias_rad_s,
+                gyro.gyro_parameters,
+            ],
             size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)),
             np.asarray(np.linalg.inv(A), float),
             estimate.hard_iron_gauss,
@@ -146,7 +151,7 @@ class Scorer:
         Z[:, :, IRON] = lever
         gone = np.cumsum(R * dt_s[:, None, None], axis=0) @ reference.gyro_correction
         Z[:, :, GYRO] = -across @ gone
-        ways = np.einsum("nij,kjl,nl->nik", R, GYRO_WAYS, turn, optimize=True)
+        ways = np.einsum("nij,kjl,nl->nik", R, GYRO_BASIS, turn, optimize=True)
         Z[:, :, MATRIX] = across @ np.cumsum(ways, axis=0)
         Z[:, [0, 1, 2], [21, 22, 23]] = np.linspace(-1.0, 1.0, n)[:, None]
         Z[:, [0, 1, 2], [24, 25, 26]] = 1.0

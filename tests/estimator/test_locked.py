@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from ahrsd.estimator import locked
-from ahrsd.estimator.model_checks import LeftOver, widened
+from ahrsd.estimator.model_checks import ResidualComponent, widen_covariance
 from ahrsd.estimator.online import WHOLE, Estimator
 
 RICH = (("circles", 40.0), ("roll", 30.0), ("pitch", 30.0), ("circles", 40.0), ("roll", 30.0))
@@ -131,10 +131,10 @@ def test_an_answer_is_no_less_wide_than_what_is_left_makes_it():
     """By hand: what misfit makes already counts, and what is more is added."""
     plain, tempered = np.eye(12), 3.0 * np.eye(12)
     added = np.diag([*[1.0] * 6, *[7.0] * 6])
-    left = LeftOver("attitude", 20.0, 1e-3, added)
-    wider = widened(tempered, plain, left)
+    left = ResidualComponent("attitude", 20.0, 1e-3, added)
+    wider = widen_covariance(tempered, plain, left)
     np.testing.assert_allclose(wider, np.diag([*[3.0] * 6, *[8.0] * 6]), atol=1e-12)
-    assert widened(tempered, plain, None) is tempered
+    assert widen_covariance(tempered, plain, None) is tempered
     assert left.words == (
         "what is left follows the attitude: 1 mG; run `ahrsd diagnose` on the recording"
     )
