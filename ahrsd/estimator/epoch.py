@@ -1,7 +1,8 @@
-"""An epoch in the window: what it measured, where it was linearised, and the factor it became.
+"""An epoch in the window: its measurements, its linearisation point and the factor made from them.
 
-And what it says beyond that factor: of the noise, of the model's misfit, of an instrument's turned
-axes, lag and scale, and whether it contradicts a calibration that is sure.
+Besides the factor, an epoch gives its noise residuals, its misfit score, its information on the
+instrument's imperfections (turned axes, lag, gyro scales), and a test whether it contradicts a
+calibration that is already well known.
 """
 
 from __future__ import annotations
@@ -36,9 +37,10 @@ _SHORTEST_GAP_S = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpochContent:
-    """What an epoch is, wherever it is linearised: from node a to the next.
+    """What of an epoch, from node a to a + 1, does not depend on the linearisation point.
 
-    walk: information of the gyro bias's random walk over it; turned: whether it calibrates.
+    walk: information of the random walk of the gyro bias over the epoch, 1/(rad/s)^2; has_motion:
+    whether the epoch carries information on the calibration; typical: medians of its rows.
     """
 
     data: chain.EpochData
@@ -50,8 +52,10 @@ class EpochContent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstrumentInformation:
-    """Quadratic of an epoch in iron, gyro's bias and instrument (see `instrument`): H (28, 28), and
-    g (28,) at c (9,) and bias (3,), where the epoch was linearised."""
+    """Quadratic of an epoch in iron, gyro bias and imperfections of the instrument.
+
+    H (28, 28), and the gradient g (28,) at the linearisation point c (9,) and bias (3,).
+    """
 
     H: Array
     g: Array
@@ -59,17 +63,19 @@ class InstrumentInformation:
     bias: Array
 
     def at(self, c: Array, bias: Array) -> Array:
-        """Gradient (28,) there."""
+        """Gradient (28,) at another calibration and bias."""
         return np.asarray(self.g + self.H[:, :12] @ np.r_[c - self.c, bias - self.bias])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LockedInformation:
-    """An epoch's quadratic in what is in `InstrumentInformation` and in what is `locked` besides,
-    in units of its ordinary sizes (`LOCKED` says where): `told`.
+    """Quadratic of an epoch in the columns of the instrument and in those of `locked`.
 
-    roots: by what each of `LOCKED` is whitened, (n, n); freedom: and how many directions of it the
-    epoch tells; noise: that it was linearised with
+    The latter are in units of their ordinary sizes; `LOCKED` has their indices.
+
+    roots (n, n): by component of `LOCKED`, the matrix that whitens its gradient; freedom: by
+    component, the number of directions that the epoch determines; noise: the levels at the
+    linearisation.
     """
 
     information: InstrumentInformation
@@ -80,7 +86,7 @@ class LockedInformation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisationPlan:
-    """Where one is to be linearised: directions, noise, weights of the fields (None for 1)."""
+    """Where to linearise an epoch: directions u, noise levels, field weights (None for 1)."""
 
     piece: EpochContent
     u: Array
@@ -90,10 +96,10 @@ class LinearisationPlan:
 
 @dataclass(slots=True, eq=False)
 class WindowEpoch:
-    """One epoch in the window: what it is, directions, noise, and its factor.
+    """One epoch in the window: content, directions, noise and factor.
 
-    used: the noise that it was linearised with; usual: that of the window then; instrument, locked:
-    set by `linearise_instrument` and `linearise_locked`.
+    used: noise levels at its linearisation; usual: those of the window at that time; instrument,
+    locked: set by `linearise_instrument` and `linearise_locked`.
     """
 
     piece: EpochContent
@@ -110,34 +116,34 @@ class WindowEpoch:
 
     @property
     def data(self) -> chain.EpochData:
-        """What it measured."""
+        """The measurements."""
         return self.piece.data
 
     @property
     def a(self) -> int:
-        """The node at its beginning; the next one is at its end."""
+        """Index of the node at its beginning; the node at its end is a + 1."""
         return self.piece.a
 
     @property
     def has_motion(self) -> bool:
-        """Whether it calibrates."""
+        """Whether it carries information on the calibration."""
         return self.piece.has_motion
 
     @property
     def weights(self) -> Array:
-        """Of its fields."""
+        """Weights of its field residuals."""
         return self.quadratic.weights
 
     @property
     def cells(self) -> DirectionCells:
-        """Where its directions were."""
+        """Cells of the sphere that its directions visited."""
         if self._cells is None:
             self._cells = DirectionCells.of(self.u, self.data.count)
         return self._cells
 
     @property
     def residuals(self) -> noise.Residuals:
-        """What it says about the noise, at its linearisation point."""
+        """Sums of squares of its residuals at the linearisation point."""
         if self._residuals is None:
             self._residuals = noise.residuals(
                 self.quadratic, self.data, self.used, self.piece.typical
@@ -146,12 +152,12 @@ class WindowEpoch:
 
     @property
     def cost(self) -> float:
-        """Half the sum of squares with the interior directions at their best."""
+        """Half the sum of squared whitened residuals, minimised over the interior directions."""
         return self.quadratic.cost
 
 
 def epoch_scores(epochs: Sequence[WindowEpoch]) -> list[MisfitScore]:
-    """What epochs ask for, found once where each was linearised."""
+    """Misfit scores of epochs; each is computed once per linearisation."""
     new = [e for e in epochs if e.score is None]
     for epoch, score in zip(
         new, misfit_scores([e.factor for e in new]) if new else [], strict=True
@@ -163,9 +169,9 @@ def epoch_scores(epochs: Sequence[WindowEpoch]) -> list[MisfitScore]:
 def begin_epoch(
     graph: Graph, data: chain.EpochData, walk: float, *, has_motion: bool
 ) -> tuple[EpochContent, Array]:
-    """A new epoch, with the nodes that it needs in the graph, and directions to start from.
+    """Add the nodes of a new epoch to the graph; returns its content and directions to start from.
 
-    walk: of the gyro's bias, rad/s/sqrt(s).
+    walk: random walk of the gyro bias, rad/s/sqrt(s).
     """
     a = graph.last
     u = chain.start_directions(chain.symmetric(graph.c[:6]), graph.c[6:], data.field_b_gauss)
@@ -183,10 +189,11 @@ def begin_epoch(
 
 
 def place_borders(graph: Graph, new_epochs: Sequence[WindowEpoch]) -> None:
-    """Put borders that are at directions of single fields to where their epochs alone want them.
+    """Move border directions that come from single fields to the optimum of their epochs.
 
-    Until then a chain is bent towards the noise of one field and seems that noisy itself; for an
-    epoch at rest, whose borders only a token moves, for long.
+    Until then each chain is bent towards the noise of one field, which inflates the noise estimate.
+    The borders of an epoch at rest have only a token of information, so they would stay wrong for
+    long.
     """
     for epoch in new_epochs:
         step = border_step(epoch.quadratic)
@@ -199,10 +206,7 @@ def place_borders(graph: Graph, new_epochs: Sequence[WindowEpoch]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """A window's calibration c (9,), nodes by index, epochs and factors at one moment.
-
-    damping: of the next step
-    """
+    """Calibration c (9,), nodes, epochs and factors of a window, and damping of its next step."""
 
     damping: float
     c: Array
@@ -213,25 +217,26 @@ class Snapshot:
 
 # -- Misfit ----------------------------------------------------------------------------------------
 #
-# How much more the epochs disagree than their covariances allow: 1 for a perfect model.
+# Ratio of the disagreement of the epochs to what their covariances allow: 1 for a perfect model.
 #
-# At the optimum an epoch's gradient r_i on (c, bias) has the covariance S_i (its information) if
-# the model is right, so r_i^T S_i^-1 r_i averages to its rank, less what the fit used up. Coloured
-# noise, a wandering field or a lag make it larger, and the covariance of the estimate is multiplied
-# by it.
+# At the optimum the gradient r_i of an epoch with respect to (c, bias) has the covariance S_i,
+# which is its information, if the model is right. So r_i^T S_i^-1 r_i has the mean of its rank,
+# less the degrees of freedom that the fit used. Coloured noise, a field that is not uniform or a
+# lag make it larger, and the covariance of the estimate is multiplied by the ratio.
 
 _CALIBRATION_AND_BIAS = np.r_[0:12]
-_FITTED_PARAMETERS = 12.0  # parameters that the fit took from the misfit_scores
-_MEMORY = 0.98  # per epoch that left the window
+_FITTED_PARAMETERS = 12.0  # degrees of freedom that the fit used
+_MEMORY = 0.98  # factor on remembered scores, per epoch that leaves the window
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MisfitScore:
-    """What an epoch asks of z = [c, bias] (12,) from where it was linearised, its borders at best.
+    """Whitened gradient of an epoch by z = [c, bias] (12,), minimised over its borders.
 
-    The whitened gradient is `asked` (12,) there and `turning` (12, 12) z more elsewhere.
+    The gradient is `whitened_gradient` (12,) at the linearisation point and changes by `root` (12,
+    12) z away from it.
 
-    freedom: degrees of freedom; directions of which the epoch says nothing ask for nothing.
+    freedom: degrees of freedom. Directions that the epoch does not determine have a zero gradient.
     """
 
     whitened_gradient: Array
@@ -240,12 +245,12 @@ class MisfitScore:
 
     @property
     def information(self) -> Array:
-        """On z (12, 12)."""
+        """Information on z (12, 12)."""
         return np.asarray(self.root.T @ self.root)
 
 
 def misfit_scores(factors: Sequence[Factor]) -> list[MisfitScore]:
-    """Of several epochs' factors."""
+    """Scores of the factors of several epochs."""
     H, g = np.array([f.H for f in factors]), np.array([f.g for f in factors])
     cross = H[:, _CALIBRATION_AND_BIAS[:, None], BORDERS]
     gain = cross @ np.linalg.pinv(H[:, BORDERS[:, None], BORDERS], rcond=1e-12, hermitian=True)
@@ -260,7 +265,7 @@ def misfit_scores(factors: Sequence[Factor]) -> list[MisfitScore]:
 
 
 class Misfit:
-    """Scores of the epochs that left the window, and the figure with those that are in it."""
+    """Misfit of all epochs: those in the window, and the remembered sums of those that left it."""
 
     def __init__(self) -> None:
         self._sum = 0.0
@@ -268,11 +273,11 @@ class Misfit:
 
     @property
     def epochs(self) -> float:
-        """How many whole epochs are remembered."""
+        """Effective number of remembered epochs."""
         return self._count / _FITTED_PARAMETERS
 
     def remember(self, factor: Factor, score: MisfitScore, graph: Graph) -> None:
-        """An epoch leaves the window: keep its score."""
+        """Keep the score of an epoch that leaves the window."""
         bias = graph.nodes[factor.a].bias
         s, n = _sum_of_squares([factor], [score], graph.c, bias[None])
         self._sum, self._count = _MEMORY * self._sum + s, _MEMORY * self._count + n
@@ -284,11 +289,11 @@ class Misfit:
         graph: Graph,
         step: Step,
     ) -> tuple[float, float]:
-        """Mean square of the scores per degree of freedom, where `step` leads, and its sigma by
-        chance were the model right.
+        """Mean square of the scores per degree of freedom after `step`, and its 1-sigma by chance
+        if the model is right.
 
-        At the joint optimum, not at the present values: what all epochs ask for together is not
-        disagreement.
+        It is evaluated at the joint optimum, not at the present values: a gradient that all epochs
+        share is no disagreement.
         """
         dc, dy = step
         biases = np.array([graph.nodes[f.a].bias + dy[f.a][:3] for f in factors])
@@ -301,7 +306,7 @@ class Misfit:
 def _sum_of_squares(
     factors: Sequence[Factor], scores: Sequence[MisfitScore], c: Array, biases: Array
 ) -> tuple[float, float]:
-    """Sum of squares of what is asked for at c and the biases (N, 3), and degrees of freedom."""
+    """Sum of squared whitened gradients at c and biases (N, 3), and their degrees of freedom."""
     z = np.empty((len(factors), 12))
     z[:, :9] = c - np.array([f.point.c for f in factors])
     z[:, 9:] = biases - np.array([f.point.a.bias for f in factors])
@@ -312,41 +317,43 @@ def _sum_of_squares(
 
 # -- Instrument ------------------------------------------------------------------------------------
 #
-# What an instrument may have besides iron and bias: turned axes, a lag, a wrong scale of angles.
+# Imperfections of an instrument besides iron and bias: turned axes, a lag, a gyro scale, and more.
 #
-# Turn: the magnetometer's axes are taken to be the gyro's. If they are not, the rate in the
-# magnetometer's frame is R w with R = Exp(theta), and a step's rotation is R phi, phi without the
-# bias: what rests tell of the bias in the readings is then nothing of the gyro's matrix, and the
-# bias is in the gyro's own axes. Derivative: dq/dtheta = dq/dphi dphi/dtheta = (dq/dw_b / dt)
-# [phi]x.
+# Turn: the model assumes that the magnetometer's axes are those of the gyro. If they are turned,
+# the rate in the magnetometer's frame is R w with R = Exp(theta), and the rotation of a step is R
+# phi. Here phi is without the bias: the bias acts in the gyro's own axes, so what epochs at rest
+# determine of it says nothing about the gyro's matrix. Derivative: dq/dtheta = dq/dphi dphi/dtheta
+# = (dq/dw_b / dt) [phi]x.
 #
-# Lag: a reading of the field that is tau late is that of the direction u(t - tau). With du/dt = -w
-# x u its derivative is dr/dtau = -M (w x u) / s_m.
+# Lag: a field reading that is late by tau belongs to the direction u(t - tau). With du/dt = -w x u
+# its derivative is dr/dtau = -M (w x u) / s_m.
 #
-# Scale: the gyro's angles are (1 + s) times too small if its unit or the time between samples is
-# wrong: a host's clock, messages lost without a trace. Whoever turns a full circle sees it; what is
-# estimated with it means nothing. dq/ds = -(dq/dw_b / dt) phi.
+# Scale: the gyro's angles are too small by the factor 1 + s if its unit or the sampling interval is
+# wrong (the clock of a host, messages lost without a trace). A full turn shows it; the estimate is
+# void with it. dq/ds = -(dq/dw_b / dt) phi.
 #
-# Shape: the gyro's axes have scales of their own and are not at right angles: its angles are (1 +
-# E) times too small, E symmetric and traceless (5). It is not asked for, only considered: what it
-# may do to the answer widens the answer.
+# Shape: the gyro's axes have different scales and are not orthogonal: its angles are too small by I
+# + E, E symmetric and traceless (5 numbers). It is not estimated but considered: it widens the
+# covariance of the answer.
 #
-# Place: the field in the world differs by place, and a vehicle that circles is at another place on
-# each heading: dh = G e, e the heading's cosine and sine, G (3, 2) in the world's axes. A part of
-# that is the same on all headings in the sensor and passes for hard iron, another for soft iron: no
-# fit shows them. dr/dG = -M R (axis) e / s_m / |h|, R from the field's direction and gravity. It is
-# only considered too, and of one of `parameters.PLACES`, as likely as what does show makes it.
+# Place: the field in the world differs with position, and a circling vehicle has another position
+# on each heading: dh = G e, where e is the cosine and sine of the heading and G (3, 2) is in world
+# axes. A part of it is constant in the sensor frame and looks like hard iron, another part looks
+# like soft iron: no fit shows them. dr/dG = -M R (axis) e / s_m / |h|, with R from gravity and the
+# field's direction. Place is considered too: its size is one of `parameters.PLACES`, each with the
+# posterior probability that the visible part of the effect gives it.
 #
-# One Gauss-Newton step from the answer gives them beside M, b and the bias. On fast motion one
-# looks like another, so they are asked for together. Every epoch stands alone here, its borders
-# free.
+# One Gauss-Newton step from the answer estimates them together with M, b and the bias. In fast
+# motion their effects resemble each other, so they are estimated jointly. Each epoch is taken on
+# its own here, with free borders.
 
-# What the data ask for is taken out of them (`TakenOut`): the field is taken to be late, the gyro's
-# angles are multiplied by a matrix. The step is then one more from there.
+# Imperfections that the data support are removed from the data (`InstrumentCorrection`): the field
+# is taken to be late, and the gyro's angles are multiplied by a matrix. The next step starts from
+# the corrected data.
 
 TURN, LAG, SCALE = slice(12, 15), 15, 16
-_ESTIMATED = 17  # what an instrument is asked for; its shape (5) is only considered
-PLACE = slice(22, 28)  # of how the field differs with where the sensor heads
+_ESTIMATED = 17  # numbers that are estimated; shape (5) and place (6) are only considered
+PLACE = slice(22, 28)  # dependence of the field on the heading
 _SIZE = 28
 _CALIBRATION, _BIAS, _IMPERFECT = slice(0, 12), slice(9, 12), slice(12, _SIZE + 3)
 _ANGLE_COLUMNS = np.r_[12:15, 16:22]
@@ -361,23 +368,23 @@ _IMPERFECTION_ROWS = (
     np.r_[4:10],
     _PLACE,
     np.r_[16:19],
-)  # of what is considered
-_MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
-_GYRO = np.r_[TURN, SCALE:22]  # what turns or scales the gyro's angles
-GYRO_AMONG_IMPERFECTIONS = _GYRO - 12  # the same among what is considered
-REQUIRED_NATS = 5.0  # nats by which an instrument with imperfections must be likelier
-_WORTH_SIGMAS = 0.3  # of what is known of them: less is not worth another step
-_CONSTANT = np.r_[0:9, 12:_SIZE]  # all but the gyro's bias
-_LEAST_HORIZONTAL = 0.05  # sine of an angle: less tells no heading
-_WEAKEST = 1e-4  # scaled information of a direction of which an epoch says something
+)  # among the 19 imperfections
+_MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # beyond any gyro's tolerance; and significant
+_GYRO = np.r_[TURN, SCALE:22]  # turn, scale and shape of the gyro's angles
+GYRO_AMONG_IMPERFECTIONS = _GYRO - 12  # the same among the 19 imperfections
+REQUIRED_NATS = 5.0  # log odds from which imperfections are removed from the data
+_WORTH_SIGMAS = 0.3  # posterior sigmas of a correction that is worth another step
+_CONSTANT = np.r_[0:9, 12:_SIZE]  # everything but the gyro bias, which walks
+_LEAST_HORIZONTAL = 0.05  # sine of the angle between field and gravity: less gives no heading
+_WEAKEST = 1e-4  # scaled information from which an epoch determines a direction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstrumentCorrection:
-    """What of an instrument is taken out of the epochs' data already.
+    """Imperfections that are already removed from the data of the epochs.
 
-    lag_s: by which the field is late; gyro: (3, 3) by which the gyro's angles are multiplied
-    walk: by which its bias is let go, besides what every gyro's does, rad/s/sqrt(s)
+    lag_s: lag of the field; gyro (3, 3): matrix on the gyro's angles; walk: random walk of the gyro
+    bias besides that of every gyro, rad/s/sqrt(s).
     """
 
     lag_s: float
@@ -386,17 +393,17 @@ class InstrumentCorrection:
 
     @staticmethod
     def identity() -> InstrumentCorrection:
-        """Of a perfect instrument."""
+        """No correction: a perfect instrument."""
         return InstrumentCorrection(0.0, np.eye(3))
 
     @property
     def is_nonzero(self) -> bool:
-        """Whether there is any."""
+        """Whether anything is corrected."""
         return self.lag_s != 0.0 or self.walk > 0.0 or not np.array_equal(self.gyro, np.eye(3))
 
     @property
     def gyro_parameters(self) -> Array:
-        """Turn (3), scale and shape (5) of the matrix."""
+        """Turn (3), scale and shape (5) of the gyro's matrix."""
         E = self.gyro - np.eye(3)
         scale = float(np.trace(E)) / 3
         S = (E + E.T) / 2 - scale * np.eye(3)
@@ -405,7 +412,7 @@ class InstrumentCorrection:
         return np.array([*turn, scale, *apart, S[1, 2], S[0, 2], S[0, 1]])
 
     def with_gyro(self, parameters: Array) -> InstrumentCorrection:
-        """With this much more of turn (3), scale and shape (5)."""
+        """The correction with a further turn (3), scale and shape (5) of the gyro."""
         (x, y, z), scale, (apart, against, yz, xz, xy) = (
             parameters[:3],
             parameters[3],
@@ -418,7 +425,7 @@ class InstrumentCorrection:
         return replace(self, gyro=(np.eye(3) + more) @ self.gyro)
 
 
-#: (9, 3, 3) matrices of one of each of turn, scale and shape, on the gyro's angles
+#: (9, 3, 3) matrices on the gyro's angles for a unit turn, scale and shape
 GYRO_BASIS = np.array(
     [InstrumentCorrection.identity().with_gyro(one).gyro - np.eye(3) for one in np.eye(9)]
 )
@@ -428,8 +435,8 @@ GYRO_BASIS = np.array(
 class Instrument:
     """Step (17,) from the answer in [M (6), b (3), w_b (3), theta (3), tau, s], and its covariance.
 
-    misfit: how much the epochs still disagree after the step; it is in the covariance
-    scaled: by how much the gyro's angles were scaled before
+    misfit: misfit of the epochs after the step; the covariance includes it. scaled: scale of the
+    gyro's angles that was corrected before.
     """
 
     step: Array
@@ -444,7 +451,7 @@ class Instrument:
 
     @property
     def misscaled(self) -> float:
-        """Share of themselves by which the gyro's angles are too small; 0: they may be right."""
+        """Relative amount by which the gyro's angles are too small; 0 if they may be right."""
         scale, sigma = self._of(SCALE)
         scale += self.scaled
         return scale if abs(scale) > max(_MISSCALED, _MISSCALED_SIGMAS * sigma) else 0.0
@@ -458,9 +465,9 @@ InformationStack = tuple[Array, Array]
 
 
 def instrument_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
-    """Quadratics of the epochs with motion around the present estimate.
+    """Quadratics of the epochs with motion at the present estimate.
 
-    LinAlgError where none has motion, or its directions are not determined.
+    LinAlgError if there is no motion or the directions are not determined.
     """
     H, g = full_instrument_quadratics(epochs, graph)
     return H[:, :_ESTIMATED, :_ESTIMATED], g[:, :_ESTIMATED]
@@ -469,7 +476,8 @@ def instrument_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> Inform
 def full_instrument_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
     """The same with the gyro's shape and the place: H (N, 28, 28) and gradient (N, 28).
 
-    Each as it was where the epoch was linearised, so that it is computed once for each.
+    H is computed once, where each epoch was linearised; the gradient is moved to the present
+    values.
     """
     linearise_instrument(epochs)
     moving = [(e.instrument, graph.nodes[e.a].bias) for e in epochs if e.has_motion]
@@ -481,8 +489,10 @@ def full_instrument_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> I
 
 
 def rest_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
-    """Quadratics (R, 28, 28) and gradients (R, 28) of the epochs without motion: of the gyro's bias
-    alone, around that of their nodes."""
+    """Quadratics (R, 28, 28) and gradients (R, 28) of the epochs at rest.
+
+    They are in the gyro bias only, at the bias of their nodes.
+    """
     resting = [e for e in epochs if not e.has_motion]
     H, g = np.zeros((len(resting), _SIZE, _SIZE)), np.zeros((len(resting), _SIZE))
     for k, epoch in enumerate(resting):
@@ -496,12 +506,12 @@ def rest_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationS
 class FoldedInformation:
     """Information on iron, turn, lag and scale from epochs that left the window, as one Gaussian.
 
-    The gyro's bias walks, so each epoch had its own, which is eliminated.
+    The gyro bias walks, so each epoch has its own, which is marginalised.
     """
 
     def __init__(self) -> None:
         self._H: Array = np.zeros((_SIZE, _SIZE))
-        self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x as `_place`
+        self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x of `_instrument_point`
 
     @staticmethod
     def of_iron(graph: Graph, correction: InstrumentCorrection) -> FoldedInformation:
@@ -516,7 +526,7 @@ class FoldedInformation:
 
     @staticmethod
     def of_lag(lag_s: float, sigma_s: float) -> FoldedInformation:
-        """A lag is known, and nothing of the iron."""
+        """A known lag, and no information on the iron."""
         past = FoldedInformation()
         past._H[LAG, LAG] = 1.0 / sigma_s**2
         past._eta[LAG] = lag_s / sigma_s**2
@@ -528,7 +538,9 @@ class FoldedInformation:
         correction: InstrumentCorrection,
         sigma_bias: float,
     ) -> FoldedInformation:
-        """With one epoch more, which was linearised with this taken out; sigma_bias in rad/s."""
+        """The same with one epoch added, which was linearised with this correction; sigma_bias in
+        rad/s.
+        """
         bias = slice(9, 12)
         own = information.H[bias, bias] + np.eye(3) / sigma_bias**2
         gain = np.linalg.solve(own, information.H[bias]).T
@@ -548,7 +560,7 @@ class FoldedInformation:
         self._eta = self._eta + H @ _instrument_point(c, correction) - g
 
     def at(self, c: Array, correction: InstrumentCorrection) -> tuple[Array, Array]:
-        """H (28, 28) and gradient (28,) there."""
+        """H (28, 28) and gradient (28,) at a calibration and correction."""
         return self._H, self._H @ _instrument_point(c, correction) - self._eta
 
 
@@ -559,8 +571,9 @@ def _instrument_point(c: Array, correction: InstrumentCorrection) -> Array:
 
 
 def linearise_instrument(epochs: Sequence[WindowEpoch]) -> None:
-    """Compute `WindowEpoch.instrument` of the epochs with motion that do not have it yet, together
-    those that were linearised at one calibration."""
+    """Compute `WindowEpoch.instrument` of the epochs with motion that lack it. Epochs that were
+    linearised at the same calibration are handled together.
+    """
     missing = [epoch for epoch in epochs if epoch.has_motion and epoch.instrument is None]
     for point in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in missing}.values():
         _set_instrument_information(
@@ -571,10 +584,11 @@ def linearise_instrument(epochs: Sequence[WindowEpoch]) -> None:
 def lag_uncertainty(
     epochs: Sequence[WindowEpoch], graph: Graph, past: FoldedInformation, sigma_bias: float
 ) -> Lag:
-    """Sigma of the lag that is taken out of the field, from all data.  LinAlgError: unobservable.
+    """Sigma of the lag that is removed from the field, from all data. LinAlgError if it is
+    unobservable.
 
-    The iron is estimated with that lag. Its errors at the true lag do not correlate with that of
-    the lag, so what both make adds up.
+    The iron is estimated at that lag. The errors of the iron at the true lag are not correlated
+    with the error of the lag, so the two contributions add up.
     """
     linearise_instrument(epochs)
     H = past.at(graph.c, InstrumentCorrection.identity())[0]
@@ -586,14 +600,14 @@ def lag_uncertainty(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lag:
-    """1-sigma of a lag, and by how much [M, b, w_b] (12,) would be wrong were it one sigma off."""
+    """1-sigma of a lag, and the error of [M, b, w_b] (12,) if the lag is one sigma off."""
 
     sigma_s: float
     spread: Array
 
 
 def _inverses(H: Array) -> Array:
-    """Of each (..., n, n), as `_inverse`."""
+    """Inverse of each matrix (..., n, n), as `_inverse`."""
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=-2, axis2=-1), 1e-30))
     sizes = scale[..., :, None] * scale[..., None, :]
     return np.asarray(np.linalg.inv(H * sizes) * sizes)
@@ -613,7 +627,7 @@ def estimate_instrument(
 ) -> Instrument:
     """Misalignment, lag and scale from the epochs of a settled window and those before it.
 
-    LinAlgError where the motion does not tell.
+    LinAlgError if the motion does not determine them.
     """
     H, g = prior_quadratic(graph, sigma_bias)
     if before is not None:
@@ -627,13 +641,13 @@ def estimate_instrument(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImperfectionLikelihood:
-    """What is known of an instrument's imperfections (`_REST`, 19), and what they do to the answer.
+    """Likelihood of the imperfections (19, `_IMPERFECT`), and their effect on the answer.
 
-    alone (12, 12) covariance of [M, b, w_b] were it perfect; by_rest (12, 19): what one of each
-    does to them; own (12,) their gradient; known (19, 19) and asked (19,): information and gradient
-    of the imperfections from the data, the answer following them; already (19,): what of them is
-    taken out of the data
-    disagree: how much the epochs disagree after a step (31,) of all
+    covariance (12, 12): of [M, b, w_b] for a perfect instrument; response (12, 19): change of [M,
+    b, w_b] per unit of each imperfection; gradient (12,): of [M, b, w_b]; information (19, 19) and
+    imperfection_gradient (19,): of the imperfections, marginalised over [M, b, w_b]; corrected
+    (19,): what is removed from the data already; misfit_after: misfit of the epochs after a step
+    (31,) of all
     """
 
     covariance: Array
@@ -653,7 +667,9 @@ class ImperfectionLikelihood:
         before: tuple[Array, Array],
         correction: InstrumentCorrection,
     ) -> ImperfectionLikelihood:
-        """Of epochs (of these times, (N,)) and those before.  LinAlgError: the motion tells not."""
+        """From the epochs (times_s (N,)) and those folded before. LinAlgError if the motion does
+        not determine the answer.
+        """
         epochs = add_bias_drift(epochs, times_s)
         H, g = epochs[0].sum(axis=0), epochs[1].sum(axis=0)
         H[:_SIZE, :_SIZE] += before[0]
@@ -679,8 +695,9 @@ class ImperfectionLikelihood:
         )
 
     def posterior(self, sigmas: Array, temper: float) -> tuple[Array, Array]:
-        """Spread (..., 19, 19) over the temper, and what they are beyond what is taken out
-        (..., 19), of instruments like that (..., 19)."""
+        """Covariance (..., 19, 19) over the temper, and mean (..., 19) beyond what is corrected
+        already, for instruments with prior sigmas (..., 19).
+        """
         pull = temper / sigmas**2
         spread = _inverses(self.information + pull[..., None] * np.eye(pull.shape[-1]))
         return spread, -(spread @ (self.imperfection_gradient + pull * self.corrected)[..., None])[
@@ -688,15 +705,14 @@ class ImperfectionLikelihood:
         ]
 
     def temper(self, sigmas: Array, most: float) -> float:
-        """By how much the epochs disagree once what they say of the imperfections is in."""
+        """Misfit of the epochs after the maximum a posteriori step, between 1 and `most`."""
         mean = self.posterior(sigmas, most)[1]
         step = np.r_[-self.covariance @ self.gradient + self.response @ mean, mean]
         return min(most, max(1.0, self.misfit_after(step)))
 
     def log_evidence(self, sigmas: Array, mean: Array, temper: float) -> Array:
-        """Log of how likely the data are of instruments like that (..., 19), up to a constant.
-
-        rest: what they were found to be
+        """Log evidence for prior sigmas (..., 19), up to a constant. mean: the posterior mean for
+        them.
         """
         outer = sigmas[..., :, None] * sigmas[..., None, :]
         log_determinant = np.linalg.slogdet(
@@ -712,11 +728,11 @@ class ImperfectionLikelihood:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstrumentPosterior:
-    """All instruments that may be, at all places, against what the data say of them.
+    """All possible instruments at all places, with their evidence.
 
-    every (K, 19) their sigmas; prior (K,) log of how likely they are without the data; evidence
-    (K,); spread (K, 19, 19) and rest (K, 19) what the data leave open of each and say that it is,
-    beyond what is taken out already
+    sigmas (K, 19): prior sigmas; log_prior (K,); log_evidence (K,); spread (K, 19, 19) and means
+    (K, 19): posterior covariance and mean of the imperfections of each, beyond what is corrected
+    already
     """
 
     likelihood: ImperfectionLikelihood
@@ -728,7 +744,9 @@ class InstrumentPosterior:
 
     @staticmethod
     def of(likelihood: ImperfectionLikelihood, graph: Graph, kinds: Kinds) -> InstrumentPosterior:
-        """What an imperfection makes the epochs disagree is no noise."""
+        """The temper is the misfit after the imperfections are fitted: disagreement that they
+        explain is no noise.
+        """
         may_be = possible_instruments(*kinds)
         sigmas = may_be.sigmas
         temper = likelihood.temper(sigmas.max(axis=0), graph.temper)
@@ -739,7 +757,7 @@ class InstrumentPosterior:
         )
 
     def probabilities(self) -> Array:
-        """How likely each is (K,), the data and all else taken together."""
+        """Posterior probabilities (K,)."""
         log_weights = self.log_evidence + self.log_prior
         shares = np.exp(log_weights - log_weights.max())
         return np.asarray(shares / shares.sum())
@@ -747,17 +765,18 @@ class InstrumentPosterior:
     def most_probable(
         self, which: Array | slice, required_nats: float = REQUIRED_NATS
     ) -> int | None:
-        """The likeliest of those in which some of `which` are larger than need be; None where it is
-        not likelier than the others by `told` nats."""
+        """The instrument of the largest evidence among those in which some of `which` exceed their
+        least size. None if its evidence exceeds that of the others by less than `required_nats`.
+        """
         found, gain = self.log_odds_against_smallest(which)
         return None if gain < required_nats else found
 
     def log_odds_against_smallest(self, which: Array | slice) -> tuple[int, float]:
-        """The likeliest of those in which some of `which` are larger than need be, and by how many
-        nats it is likelier than the likeliest of those in which all are as small as may be.
+        """The instrument of the largest evidence among those in which some of `which` exceed their
+        least size, and its log odds against the best of those in which all have their least size.
 
-        Whatever else is wrong with either is free: a field that differs by place may be what looks
-        like a gyro.
+        The other imperfections are free in both: a field that differs by place may look like a gyro
+        error.
         """
         sizes = self.sigmas[:, which]
         smallest = np.all(sizes == sizes.min(axis=0), axis=1)
@@ -769,12 +788,12 @@ class InstrumentPosterior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Widening:
-    """What imperfections of the instrument and the place do to an answer.
+    """Effect of the imperfections and of the place on the covariance of an answer.
 
-    added: to the covariance (12, 12) of [M, b, w_b]; parts: what each of `IMPERFECTIONS` alone
-    adds, which together may be more or less; place_gauss: by how much the field differs with the
-    heading, rms of what is expected of its six numbers; gyro (9, 9): covariance of turn, scale and
-    shape of the gyro's angles beyond what is taken out; with_gyro (12, 9): and with [M, b, w_b]
+    added (12, 12): to the covariance of [M, b, w_b]; parts: the part of each of `IMPERFECTIONS`
+    alone (they need not add up to `added`); place_gauss: rms of the six numbers of the field's
+    dependence on the heading; gyro (9, 9): covariance of turn, scale and shape of the gyro's angles
+    beyond the correction; with_gyro (12, 9): cross covariance with [M, b, w_b]
     """
 
     added: Array
@@ -784,23 +803,26 @@ class Widening:
     with_gyro: Array
 
     def joint(self, covariance: Array, K: Array) -> Array:
-        """(21, 21) of K (12, 12) times [M, b, w_b], whose covariance is given, and the gyro's."""
+        """(21, 21) covariance of K (12, 12) [M, b, w_b], whose covariance is given, and of the
+        gyro.
+        """
         cross = K @ self.with_gyro
         return np.block([[covariance, cross], [cross.T, self.gyro]])
 
     @staticmethod
     def zero() -> Widening:
-        """Of a perfect instrument, or where nobody can tell."""
+        """For a perfect instrument, or if the imperfections are unknown."""
         return Widening(np.zeros((12, 12)), {}, float("nan"), np.zeros((9, 9)), np.zeros((12, 9)))
 
 
 def widening_by_imperfections(posterior: InstrumentPosterior) -> Widening:
-    """What imperfections of the instrument do to the answer.
+    """Effect of the imperfections on the answer, which assumes a perfect instrument.
 
-    The answer takes the instrument to be perfect. It is one of `instruments`, each as likely as
-    the data make it. Of each, what the data leave open of the imperfections spreads the answer, and
-    what they say that they are is an error of it. So their sizes, which a few numbers tell badly,
-    count as far as they are not known: the mean of the variances, not that of the likeliest.
+    The instrument is one of `possible_instruments`, with their posterior probabilities. For each of
+    them, the posterior covariance of the imperfections spreads the answer, and their posterior mean
+    is an error of it. The sizes of the imperfections are poorly determined by a few numbers, so the
+    result is the mean of the variances over the instruments, not the variance of the most probable
+    one.
     """
     response, means, probabilities = (
         posterior.likelihood.response,
@@ -820,9 +842,9 @@ def widening_by_imperfections(posterior: InstrumentPosterior) -> Widening:
 
 
 def required_bias_walk(posterior: InstrumentPosterior, span_s: float) -> float:
-    """Walk of the gyro's bias (rad/s/sqrt(s)) by which it would drift as far as it did in span_s.
+    """Walk of the gyro bias (rad/s/sqrt(s)) that would produce the drift found over span_s.
 
-    0 where an instrument that does not drift is as likely.
+    0 if an instrument without drift is as probable.
     """
     found = posterior.most_probable(slice(-3, None))
     drift = np.zeros(3) if found is None else posterior.means[found][-3:]
@@ -830,10 +852,10 @@ def required_bias_walk(posterior: InstrumentPosterior, span_s: float) -> float:
 
 
 def required_gyro_correction(posterior: InstrumentPosterior, required_nats: float) -> Array | None:
-    """Turn (3), scale and shape (5) that the gyro's angles are to be corrected by, once more.
+    """Further turn (3), scale and shape (5) by which to correct the gyro's angles.
 
-    None where an instrument like that is not likelier than its maker's by `told` nats, unless some
-    of it is taken out already, or where the step is not worth it.
+    None if the log odds against an instrument within its specification are below `required_nats`
+    and nothing is corrected yet, or if the step is not worth it.
     """
     found = posterior.most_probable(
         GYRO_AMONG_IMPERFECTIONS, -np.inf if posterior.likelihood.corrected.any() else required_nats
@@ -847,9 +869,10 @@ def required_gyro_correction(posterior: InstrumentPosterior, required_nats: floa
 
 
 def add_bias_drift(epochs: InformationStack, times_s: Array) -> InformationStack:
-    """H (N, 31, 31) and g (N, 31): and by how much the gyro's bias came to be in all the epochs.
+    """H (N, 31, 31) and g (N, 31) with three more columns: the total drift of the gyro bias over
+    all epochs.
 
-    It moved at one rate; w_b is that of the newest epoch.
+    The drift has a constant rate; w_b is the bias in the newest epoch.
     """
     H, g = epochs
     span_s = max(float(np.ptp(times_s)), 1e-9)
@@ -860,7 +883,7 @@ def add_bias_drift(epochs: InformationStack, times_s: Array) -> InformationStack
 
 
 def prior_quadratic(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:
-    """H (17, 17) and gradient (17,) of what is known without the epochs."""
+    """H (17, 17) and gradient (17,) of the prior, without the epochs."""
     H, g = np.zeros((_ESTIMATED, _ESTIMATED)), np.zeros(_ESTIMATED)
     pull = graph.temper * graph.anchor[1] + graph.hold
     H[:9, :9], g[:9] = pull, pull @ (graph.c - graph.anchor[0])
@@ -872,7 +895,7 @@ def prior_quadratic(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:
 def disagreement(H: Array, g: Array, steps: Array) -> float:
     """Mean square per degree of freedom of the gradients of epochs (N, n, n), (N, n) after steps.
 
-    steps (n,), or (N, n) where each takes its own.
+    steps (n,), or (N, n) with one for each epoch.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-30))
     values, vectors = np.linalg.eigh(H * scale[:, :, None] * scale[:, None, :])
@@ -884,7 +907,7 @@ def disagreement(H: Array, g: Array, steps: Array) -> float:
 
 
 def _set_instrument_information(epochs: Sequence[WindowEpoch], c: Array) -> None:
-    """`WindowEpoch.instrument` of epochs that were linearised at c."""
+    """Set `WindowEpoch.instrument` of epochs that were linearised at c."""
     for epoch, own in zip(epochs, _quadratics(epochs, c), strict=True):
         at = c, epoch.factor.point.a.bias
         epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], *at)
@@ -895,8 +918,8 @@ def _quadratics(
 ) -> Array:
     """H (E, n, n) with the gradient as its last column, of epochs that were linearised at c.
 
-    further: makes of both parts, directions, rates and rows more columns, whose numbers come after
-    those of the instrument, the field's before the motion's
+    further: returns more columns for given field and motion parts, directions, rates and rows.
+    Their indices follow those of the instrument, the field's columns before the motion's.
     """
     rows = chain.Rows.of(
         [chain.Chain(e.data, e.u, e.factor.point.a.bias, e.used, e.weights) for e in epochs]
@@ -945,10 +968,11 @@ _Columns = tuple[Array, Array]
 
 
 def _place_columns(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Array:
-    """Residuals (3, 6, N) by a field that differs with the heading, gauss: north, east and down of
-    it, each with the heading's cosine and sine.
+    """Derivatives (3, 6, N) of the residuals by a field that depends on the heading, in gauss: its
+    north, east and down components, each with the cosine and the sine of the heading.
 
-    seen, down (N, 3): directions of the field and to the earth. Nothing where they do not tell.
+    seen, down (N, 3): directions of the field and towards the earth. Zero where they give no
+    heading.
     """
     down = np.nan_to_num(down)
     east = np.cross(down, seen)
@@ -970,23 +994,24 @@ def _place_columns(field: chain.FieldPart, seen: Array, down: Array, c: Array) -
 
 
 def _gyro_noise_gradient(epoch: WindowEpoch) -> Array:
-    """What the gyro's own noise seems to ask of scale (1) and shape (5): the gradient that it has.
+    """Gradient by scale (1) and shape (5) that the gyro's noise alone produces.
 
-    Angles that are made smaller have less noise. A step's noise (1 + E) n is seen across the field,
-    so half its square grows by n' (1 - u u') E n, of which a half is in each direction.
+    Smaller angles have less noise, so noise alone favours them. The noise (1 + E) n of a step is
+    seen across the field, so half its square grows by n' (1 - u u') E n, of which one half is in
+    each direction.
     """
     uu = epoch.u.T @ epoch.u / len(epoch.u)
     along = [uu[0, 0] - uu[1, 1], (uu[0, 0] + uu[1, 1] - 2 * uu[2, 2]) / np.sqrt(3.0)]
     along += [2 * uu[1, 2], 2 * uu[0, 2], 2 * uu[0, 1]]
-    # of squares beyond what noise makes, the gyro is not the cause
+    # more squares than noise makes are not due to the gyro
     squares = min(epoch.quadratic.sum_gyro, epoch.residuals.gyro_freedom)
     return np.asarray(squares * np.array([1.0, *(-0.5 * x for x in along)]))
 
 
 def _gyro_matrix_columns(by_angle: Array, angle: Array) -> Array:
-    """dq/dtheta, dq/ds and dq/dE, (2, 9, N), of dq/dphi (2, 3, N) and phi (3, N).
+    """dq/dtheta, dq/ds and dq/dE, (2, 9, N), from dq/dphi (2, 3, N) and phi (3, N).
 
-    E: x and y apart, z against both, then the three shears.
+    E: x against y, both against z, then the three shears.
     """
     (x, y, z), (p, q, r) = by_angle.transpose(1, 0, 2), angle
     turn = [y * r - z * q, z * p - x * r, x * q - y * p]  # by_angle [phi]x
@@ -997,16 +1022,14 @@ def _gyro_matrix_columns(by_angle: Array, angle: Array) -> Array:
 
 # -- What is locked to attitude, rate and time -----------------------------------------------------
 #
-# What real instruments and places leave over besides (`locked`): harmonics of the field's direction
-# on each axis of the sensor; the field by the rate, and its change by axes that are late by
-# different times; products of the gyro's rates. They are not asked for, only watched
-# (`model_checks`). What follows time is a hard iron of each epoch's own, and needs no columns.
+# What real instruments and places leave in the residuals besides (`locked`): harmonics of the
+# field's direction on each axis of the sensor; terms in the rate, and in the field's change with a
+# different delay on each axis; products of the gyro's rates. They are not estimated, only tested
+# (`model_checks`). What follows time is a hard iron of its own in each epoch and needs no columns.
 
 _FIRST_LOCKED = _SIZE
-_SAME_CALIBRATION = (
-    1e-2  # of the field: a calibration that moved by less leaves 1e-4 of it to second order
-)
-_SAME_NOISE = 0.1  # of a noise level, by which another makes another epoch
+_SAME_CALIBRATION = 1e-2  # of the field: a smaller move changes the result by 1e-4 (second order)
+_SAME_NOISE = 0.1  # relative change of a noise level up to which the result is kept
 LOCKED = {
     "attitude": np.arange(_FIRST_LOCKED, _FIRST_LOCKED + 36),
     "rate": np.arange(_FIRST_LOCKED + 36, _FIRST_LOCKED + 36 + 9 + 8 + 18),
@@ -1015,8 +1038,9 @@ LOCKED = {
 
 
 def linearise_locked(epochs: Sequence[WindowEpoch]) -> None:
-    """Compute `WindowEpoch.locked` of the epochs with motion that do not have it yet, as
-    `linearise_instrument`."""
+    """Compute `WindowEpoch.locked` of the epochs with motion that lack it, as
+    `linearise_instrument`.
+    """
     missing = [epoch for epoch in epochs if epoch.has_motion and epoch.locked is None]
     for point in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in missing}.values():
         here = [epoch for epoch in missing if epoch.factor.point.c is point]
@@ -1031,7 +1055,7 @@ def linearise_locked(epochs: Sequence[WindowEpoch]) -> None:
 
 
 def reusable_locked(old: WindowEpoch, new: WindowEpoch) -> LockedInformation | None:
-    """What is locked in an epoch that was linearised again, where that is as good as before."""
+    """The `locked` information of an epoch that was linearised again, if it is still accurate."""
     known = old.locked
     if known is None or old.data is not new.data:
         return None
@@ -1055,7 +1079,7 @@ def _locked_columns(
     *,
     c: Array,
 ) -> _Columns:
-    """Of directions seen and rates (N, 3) at the rows, and of the step to each (3, N)."""
+    """Columns for directions and rates (N, 3) at the rows, and rates of the step to each (3, N)."""
     change = np.cross(seen, rate) @ chain.symmetric(c[:6])
     by_field = np.concatenate(
         [
@@ -1072,8 +1096,9 @@ def _locked_columns(
 
 
 def _whitening(H: Array) -> tuple[Array, Array]:
-    """Roots (E, n, n) by which gradients of H (E, n, n) are whitened, and how many directions each
-    tells (E,)."""
+    """Roots (E, n, n) that whiten gradients of H (E, n, n), and the number of determined directions
+    (E,).
+    """
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-30))
     values, vectors = np.linalg.eigh(H * scale[:, :, None] * scale[:, None, :])
     good = values > _WEAKEST
@@ -1084,11 +1109,11 @@ def _whitening(H: Array) -> tuple[Array, Array]:
 
 # -- A contradiction -------------------------------------------------------------------------------
 #
-# A magnet that passes disturbs some rows; one that stays with the sensor disturbs them all, and
-# another hard iron explains what it does (`model_checks.py`).
+# A passing magnet disturbs some rows. A magnet that stays with the sensor disturbs all of them, and
+# another hard iron explains the residuals (`model_checks.py`).
 
-_MOST_ROWS = 0.6
-_LEAST_SPREAD_RAD = 0.1  # rad, spread of the field's direction over the rows that contradict
+_MOST_ROWS = 0.6  # share of the rows that must contradict
+_LEAST_SPREAD_RAD = 0.1  # spread of the field's direction over the rows that contradict
 _EXPLAINED = 0.9  # share of the epoch's cost that another hard iron alone must take away
 _IRON_AND_BORDERS = np.r_[
     6:9, 12:16
@@ -1098,11 +1123,13 @@ _IRON_AND_BORDERS = np.r_[
 def contradicts(
     epoch: WindowEpoch, c: Array, covariance: Array, usual: chain.Noise, limit_sigma: float
 ) -> bool:
-    """Most of its rows are beyond what noise and the covariance (9, 9) of c allow, and b mends it.
+    """Whether most rows are beyond what noise and the covariance (9, 9) of c allow, and another
+    hard iron explains the epoch.
 
-    They must be of more than one attitude: in one, another iron and another place are the same.
+    The rows must have more than one attitude: at a single attitude, a change of the iron and a
+    change of place look the same.
 
-    Its directions must still be where the epoch was linearised, at c.
+    The directions must still be where the epoch was linearised, at c.
     """
     u = chain.move(epoch.u, epoch.quadratic, np.zeros(chain.WIDTH))
     jacobian = chain.symmetric_columns(epoch.data.seen(u))

@@ -1,15 +1,16 @@
-"""The factor graph of epochs on GTSAM: solve, marginals, and folding of what is old.
+"""The factor graph of epochs on GTSAM: solution, marginals, and folding of old epochs.
 
 Keys: `c` for the calibration, `y j` for node j. Every factor is a HessianFactor around the present
-values, so one Gauss-Newton step of the graph is one linear solve, and its cost depends on the
-number of factors only. The oldest node is folded away by GTSAM's own
-elimination, which leaves one factor on (c, y 1) that holds all that the past said.
+values, so one Gauss-Newton step of the graph is one linear solution, whose cost depends only on the
+number of factors. The oldest node is folded away by GTSAM's own elimination, which leaves one
+factor on (c, y 1) with all information of the past.
 
-Traps of the wrapper that shaped this file: HessianFactor's linear term is minus the gradient; views
-that it returns die with their owner, so they are copied at once; a rank-deficient system raises
-RuntimeError; and a block counts as rank-deficient where its last pivot is 2^12 below the others, as
-it is where little is known. So GTSAM eliminates the nodes but the newest, in units in which their
-pivots are alike, and what is left on c and the newest node (14 numbers) is solved here.
+Traps of the wrapper that shaped this file: the linear term of HessianFactor is minus the gradient;
+the views that it returns die with their owner, so they are copied at once; a rank-deficient system
+raises RuntimeError; and a block counts as rank-deficient if its last pivot is 2^12 below the
+others, as happens where little is known. So GTSAM eliminates all nodes but the newest, in units in
+which their pivots are similar, and the remaining system in c and the newest node (14 numbers) is
+solved here.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ _CHAIN_BLOCK = np.ix_(_FROM_CHAIN, _FROM_CHAIN)
 class Node:
     """Border between two epochs: the gyro bias from here on (rad/s) and the field's direction.
 
-    Its arrays are never written to: nodes are replaced, and shared until then.
+    Its arrays are never written to: nodes are shared, and replaced as a whole.
     """
 
     bias: Array
@@ -110,7 +111,8 @@ class Factor:
 
 
 class Stack:
-    """Factors around the present values, all at once: z (F, 19), how far each is from its `point`.
+    """Factors around the present values, all at once: z (F, 19), the displacement of each from its
+    `point`.
 
     `nodes` are the present ones by index.
     """
@@ -135,7 +137,7 @@ class Stack:
         self._bias_change = np.array([nodes[f.b].bias - nodes[f.a].bias for f in factors])
 
     def cost_increases(self) -> Array:
-        """Costs (F,) above those at each factor's `point`, the walk of the bias included."""
+        """Costs (F,) above those at the `point` of each factor, including the walk of the bias."""
         pulled = (self._H @ self.z[:, :, None])[:, :, 0]
         walks = 0.5 * self._walk * np.sum(self._bias_change**2, axis=1)
         return np.asarray(np.sum((self._g + 0.5 * pulled) * self.z, axis=1) + walks)
@@ -168,11 +170,12 @@ def epoch_factor(
 ) -> Factor:
     """The factor of one epoch, between nodes a and a + 1, from its eliminated chain.
 
-    One at rest does not calibrate, it speaks of the gyro's bias only, and that whatever c is: the
-    rate that was read is the bias, across the field's direction `rest` (3,), a mean over the epoch.
-    What seems to be said along it comes from the noise of the directions. Its borders keep a token
-    of information, to stay determined. The first and the last, as `drawn` says, are drawn by it to
-    where the epoch wants them; one that an epoch with motion shares is not.
+    An epoch at rest has no information on the calibration, only on the gyro bias, whatever c is:
+    the rate that was read is the bias, across the field's direction `rest` (3,), a mean over the
+    epoch. Apparent information along the field comes from the noise of the directions and is
+    projected out. Its borders keep a token of information, so that they stay determined. `drawn`
+    says whether the first and the last border are drawn to the epoch's own optimum; a border shared
+    with an epoch with motion is not.
     """
     H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
     H[_CHAIN_BLOCK] = q.H
@@ -190,16 +193,16 @@ def epoch_factor(
 
 
 def border_step(q: chain.Quadratic) -> Array:
-    """Where an epoch alone wants its borders (4,), first and last, from where they are.
+    """Step (4,) from the present borders, first and last, to the optimum of the epoch alone.
 
-    A direction that it does not tell stays: against that a rad of doubt is nothing.
+    A direction that it does not determine stays: a prior of 1 rad, which is negligible otherwise.
     """
     H, g = q.H[_CHAIN_BORDERS][:, _CHAIN_BORDERS], q.g[_CHAIN_BORDERS]
     return np.asarray(-np.linalg.solve(H + np.eye(len(g)), g), dtype=np.float64)
 
 
 def chain_step(z: Array, *, calibrates: bool = True) -> Array:
-    """The 16 numbers of `chain.move` out of a factor's 19; only the bias for `not calibrates`."""
+    """The 16 numbers of `chain.move` from the 19 of a factor; only the bias if not `calibrates`."""
     step = np.array(z[_FROM_CHAIN])
     if not calibrates:
         step[C], step[12:] = 0.0, 0.0
@@ -207,7 +210,7 @@ def chain_step(z: Array, *, calibrates: bool = True) -> Array:
 
 
 def gap_factor(a: int, c: Array, node_a: Node, node_b: Node, walk: float) -> Factor:
-    """Across a gap, between nodes a and a + 1, only the gyro bias is linked."""
+    """Factor across a gap, between nodes a and a + 1: it links only the gyro bias."""
     point = LinearisationPoint(c.copy(), node_a, node_b)
     return Factor(a, a + 1, np.zeros((SIZE, SIZE)), np.zeros(SIZE), point, walk)
 
@@ -223,12 +226,12 @@ def bias_prior(node: int, c: Array, at: Node, sigma_bias: float) -> Factor:
 #
 # How the calibration moves by a finite step: along the valley of the likelihood, not straight.
 #
-# Where motion is nearly planar the data fix the field's directions u_k up to a common shift along
-# the turn's axis. With C = M^-1 and d = C b, u_k = (C m_k - d) / r, and that family is linear in
-# (C, d) up to the common scale r; in (M, b) it is strongly curved, and a Gauss-Newton step leaves
-# it at once. So a step dc of [M (6), b (3)] is taken in (C, d), and the scale is restored from the
-# field's moments. To first order nothing changes: derivatives, sigmas and the optimum are those of
-# [M, b].
+# If motion is nearly planar, the data determine the field's directions u_k up to a common shift
+# along the axis of the turn. With C = M^-1 and d = C b, u_k = (C m_k - d) / r, and that family is
+# linear in (C, d) up to the common scale r. In (M, b) it is strongly curved, and a Gauss-Newton
+# step leaves it at once. So a step dc of [M (6), b (3)] is taken in (C, d), and the scale is
+# restored from the moments of the field. To first order nothing changes: derivatives, sigmas and
+# the optimum are those of [M, b].
 
 
 class Moments:
@@ -254,13 +257,13 @@ class Moments:
 
 
 def retract(c: Array, dc: Array, moments: Moments) -> Array:
-    """c = [M (6), b (3)] after a step dc; plainly c + dc where C would not stay positive."""
+    """c = [M (6), b (3)] after a step dc; plain c + dc if C would not stay positive definite."""
     found = retract_in_valley(c, dc, moments)
     return np.asarray(c + dc) if found is None else found
 
 
 def retract_in_valley(c: Array, dc: Array, moments: Moments) -> Array | None:
-    """c after a step dc; None where the valley does not reach that far: C would not be positive."""
+    """c after a step dc; None if C would not stay positive definite."""
     M, dM = chain.symmetric(c[:6]), chain.symmetric(dc[:6])
     C = np.linalg.inv(M)
     dC = -C @ dM @ C
@@ -273,9 +276,9 @@ def retract_in_valley(c: Array, dc: Array, moments: Moments) -> Array | None:
 
 
 def valley_step(c: Array, to: Array, moments: Moments) -> Array:
-    """The step dc (9,) after which `retract` is at another calibration; to - c where there is none.
+    """The step dc (9,) by which `retract` leads to another calibration; to - c if there is none.
 
-    With v = C m - d of each and s the scale that is restored, s^2 = 1 + mean |s v' - v|^2.
+    With v = C m - d of each and the restored scale s, s^2 = 1 + mean |s v' - v|^2.
     """
     M = chain.symmetric(c[:6])
     C = np.asarray(np.linalg.inv(M), dtype=np.float64)
@@ -292,10 +295,10 @@ def valley_step(c: Array, to: Array, moments: Moments) -> Array:
 
 
 def curvature_covariance(c: Array, covariance: Array, moments: Moments) -> Array:
-    """What the valley's curvature adds to the covariance (9, 9) of c.
+    """Addition to the covariance (9, 9) of c by the curvature of the valley.
 
-    One sigma along a principal direction ends q beside the straight line, t sigmas t^2 q: of a
-    standard normal t that has the mean square 3 q q^T.
+    One sigma along a principal direction ends at q from the straight line, t sigmas at t^2 q. For a
+    standard normal t the mean square is 3 q q^T.
     """
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -318,10 +321,8 @@ _C = gtsam.symbol("c", 0)
 # Unit of the gyro bias inside GTSAM: (rad/s) / 100, which brings its pivots near the directions'.
 _UNITS = np.r_[np.ones(9), np.full(3, 1e-2), 1.0, 1.0, np.full(3, 1e-2), 1.0, 1.0]
 _BADLY_KNOWN = 0.1
-UNDETERMINED_RATIO = (
-    0.5  # posterior over prior sigma above which a direction counts as not determined
-)
-_HOLD = 1e4  # a held direction is this much stiffer than the prior
+UNDETERMINED_RATIO = 0.5  # posterior over prior sigma of an undetermined direction
+_HOLD = 1e4  # information on a held direction over that of the prior
 
 
 _FIRST_Y = gtsam.symbol("y", 0)
@@ -365,10 +366,10 @@ Step = tuple[Array, dict[int, Array]]
 class Graph:
     """Calibration c (9,), nodes and factors; all values are the present linearisation point.
 
-    `anchor` is what is believed of c without data, its mean (9,) and information (9, 9); it is
-    never folded, because its weight against the data changes: `temper` multiplies its information
-    (see `epoch.Misfit`), and `hold` (9, 9) is added to it, which keeps the directions of c that
-    nothing determines at the mean.
+    `anchor` is the prior of c, its mean (9,) and information (9, 9). It is never folded, because
+    its weight relative to the data changes: `temper` multiplies its information (see
+    `epoch.Misfit`), and `hold` (9, 9) is added to it, which keeps undetermined directions of c at
+    the mean.
     """
 
     def __init__(self, c: Array, belief: Array, first: Node, prior: Factor) -> None:
@@ -382,12 +383,12 @@ class Graph:
         self.moments = Moments()
         self.nodes: dict[int, Node] = {prior.a: first}
         self.prior = prior
-        self.until_s: float | None = None  # when the newest node is
+        self.until_s: float | None = None  # time of the newest node
         self.factors: list[Factor] = []
         self._cached: tuple[list[object], tuple[gtsam.GaussianBayesNet, Array, Array]] | None = None
 
     def copy(self) -> Graph:
-        """A copy that goes its own way; nodes and factors are shared, they never change."""
+        """An independent copy; nodes and factors are shared, since they never change."""
         other = copy(self)
         other.nodes, other.factors = dict(self.nodes), list(self.factors)
         other.moments = copy(self.moments)
@@ -407,16 +408,17 @@ class Graph:
         return np.asarray(self.temper * self.anchor[1])
 
     def anchor_cost(self) -> float:
-        """What departing from the anchor costs, as a negative log likelihood."""
+        """Negative log density of the prior at c, up to a constant."""
         d = self.c - self.anchor[0]
         return float(0.5 * d @ (self._anchor_information() + self.hold) @ d)
 
     def distance_from_prior(self, covariance: Array) -> float:
-        """Mean square in sigmas of the prior of where c is in the directions that are badly known.
+        """Mean square, in prior sigmas, of the distance of c from the prior in poorly known
+        directions.
 
-        covariance (9, 9) of c, tempered; badly: to no more than _BADLY of the prior's sigma. Beyond
-        1 belief and data disagree by more than either allows. In planar motion directions that fit
-        the noise lead up a valley to any size; this holds them back.
+        covariance (9, 9) of c, tempered. Poorly known: sigma above _BADLY_KNOWN of the prior's.
+        Above 1, prior and data disagree by more than either allows. In planar motion, directions
+        that fit the noise lead along the valley to a calibration of any size; this limits them.
         """
         values, vectors = self._variance_over_prior(covariance)
         badly_known = vectors[:, values > _BADLY_KNOWN**2]
@@ -424,10 +426,10 @@ class Graph:
         return float(np.mean(away * away)) if len(away) else 0.0
 
     def hold_undetermined(self, limit: float, covariance: Array) -> None:
-        """Hold the directions whose sigma stays above `limit` of the prior's at the prior's mean.
+        """Hold directions whose sigma exceeds `limit` of the prior's at the prior's mean.
 
-        covariance (9, 9) of c, tempered. In the eigenbasis of the posterior, whitened by
-        the prior, both are diagonal: holding one direction moves no other.
+        covariance (9, 9) of c, tempered. In the eigenbasis of the posterior, whitened by the prior,
+        both are diagonal, so holding one direction moves no other.
         """
         values, vectors = self._variance_over_prior(covariance)
         self._held_directions = vectors[:, values > limit**2]
@@ -435,7 +437,9 @@ class Graph:
         self.hold = np.asarray(_HOLD * self.temper * blind @ blind.T)
 
     def _variance_over_prior(self, covariance: Array) -> tuple[Array, Array]:
-        """Variances (9,) over the prior's and their directions, columns, whitened by the prior."""
+        """Variances (9,) over those of the prior, and their directions (columns), whitened by the
+        prior.
+        """
         W = self._whitening
         scaled = W @ covariance @ W.T
         values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
@@ -447,9 +451,9 @@ class Graph:
     def step(self, damping: float = 0.0) -> Step:
         """One Gauss-Newton step: dc (9,) and dy (5,) per node.
 
-        `damping` holds c back by that multiple of the anchor's information (Levenberg-Marquardt).
+        `damping` adds that multiple of the anchor's information (Levenberg-Marquardt).
 
-        Raises SingularError where the graph does not determine all of it.
+        Raises SingularError if the graph does not determine all variables.
         """
         net, H, g = self._reduced_system()
         H, g = H[:14, :14].copy(), g[:14].copy()
@@ -467,7 +471,7 @@ class Graph:
         return np.asarray(solved[C], dtype=np.float64), dy
 
     def predict_step(self) -> tuple[Array, Array]:
-        """Where an undamped step would take c, dc (9,), and the information (9, 9) of c.
+        """The undamped step dc (9,), and the information (9, 9) of c.
 
         Raises SingularError as `step` does.
         """
@@ -489,23 +493,25 @@ class Graph:
         )
 
     def rotate_first(self, R: Array) -> None:
-        """Turn the oldest node's direction by R (3, 3), and with it what was folded about it."""
+        """Rotate the direction of the oldest node by R (3, 3), together with the folded factor on
+        it.
+        """
         prior = self.prior
         point = replace(prior.point, a=prior.point.a.rotated(R), b=prior.point.b.rotated(R))
         self.prior = replace(prior, point=point)
         self.nodes[self.first] = self.nodes[self.first].rotated(R)
 
     def covariance(self) -> Array:
-        """Joint covariance (12, 12) of c and the newest node's gyro bias, noise as assumed.
+        """Joint covariance (12, 12) of c and the newest node's gyro bias, for the assumed noise.
 
-        As if nothing were held: what is not determined has the sigma of the prior.
+        Without `hold`: an undetermined direction has the sigma of the prior.
         """
         H = self._reduced_system()[1][:14, :14].copy()
         H[C, C] += self._anchor_information()
         return _inverse(H)[:12, :12]
 
     def project_held(self, c: Array) -> Array:
-        """c with the directions that are held put where they are held."""
+        """c with the held directions set to the values at which they are held."""
         W = self._whitening
         moved = self._held_directions @ self._held_directions.T @ W @ (c - self.anchor[0])
         return np.asarray(c - np.linalg.solve(W, moved))
@@ -513,7 +519,7 @@ class Graph:
     def _reduced_system(self) -> tuple[gtsam.GaussianBayesNet, Array, Array]:
         """All nodes but the newest eliminated, without anchor and hold, which are on c alone.
 
-        Kept until a factor or a value is replaced: anchor, hold and damping change more often.
+        Cached until a factor or a value is replaced: anchor, hold and damping change more often.
         """
         factors = self._all_factors()
         used: list[object] = [self.c, *factors, *self.nodes.values()]
@@ -534,7 +540,7 @@ class Graph:
         return graph
 
     def _older_nodes(self) -> gtsam.Ordering:
-        """All nodes but the newest, from old to new."""
+        """Ordering of all nodes but the newest, from old to new."""
         ordering = gtsam.Ordering()
         for j in sorted(self.nodes)[:-1]:
             ordering.push_back(_node_key(j))
@@ -558,7 +564,7 @@ class Graph:
 def _eliminate(
     linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
-    """The variables of `ordering` as conditionals, and what is left of the graph without them."""
+    """The variables of `ordering` as conditionals, and the remaining graph without them."""
     try:
         net, rest = linear.eliminatePartialSequential(ordering)
     except RuntimeError as error:
@@ -567,7 +573,7 @@ def _eliminate(
 
 
 def _information_of(rest: gtsam.GaussianFactorGraph) -> tuple[Array, Array]:
-    """H and gradient (SIZE) on [c, one node] of what an elimination left."""
+    """H and gradient (SIZE) on [c, one node] of the graph that an elimination left."""
     hessian = gtsam.HessianFactor(rest)
     augmented = np.array(hessian.augmentedInformation())
     keys: list[int] = list(hessian.keys())
@@ -585,7 +591,9 @@ def sigmas(step: Array, information: Array) -> float:
 
 
 def whitening(covariance: Array) -> Array:
-    """W with W P W^T = I that mixes the numbers as little as it can: R^(-1/2) D^-1 of P = D R D."""
+    """W with W P W^T = I that mixes the numbers as little as possible: R^(-1/2) D^-1 of
+    P = D R D.
+    """
     sigma = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
     return np.asarray((vectors / np.sqrt(values)) @ vectors.T / sigma)

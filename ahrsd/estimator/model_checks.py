@@ -1,5 +1,6 @@
-"""Whether a settled window contradicts the model: an iron that changed, axes that are turned, or
-something that is left over and locked to attitude, rate or time."""
+"""Checks of a settled window against the model: an iron that changed, turned axes, and residuals
+that follow attitude, rate or time.
+"""
 
 from __future__ import annotations
 
@@ -29,28 +30,29 @@ from ahrsd.samples import Array
 
 # -- A change of the iron --------------------------------------------------------------------------
 #
-# Whether the iron has changed: an epoch contradicts a sure calibration, or two parts of all do.
+# The iron has changed if an epoch contradicts a well-known calibration, or if two parts of the data
+# do.
 #
-# A magnet that passes disturbs some rows; one that stays with the sensor disturbs them all, and
-# another hard iron explains what it does. A field that differs from place to place does neither.
+# A passing magnet disturbs some rows. A magnet that stays with the sensor disturbs all of them, and
+# another hard iron explains the residuals. A field that differs from place to place does neither.
 #
-# A change before the answer was sure leaves a mixture that no epoch agrees with. There, a second
-# hard iron from some epoch on must take most of the disagreement away, more than what an instrument
-# may have besides iron and bias (`epoch.instrument`): a lag of the field looks like a change to few
-# epochs.
+# A change before the answer was well known leaves a mixture with which no epoch agrees. There, a
+# second hard iron from some epoch on must remove most of the disagreement, more than the
+# imperfections of an instrument can (`epoch.estimate_instrument`): over few epochs a lag of the
+# field looks like a change.
 #
-# Where it does not, but earlier and later data still ask for different irons by more than the
-# covariance allows (a drift, a change amid other trouble, two places), the answer is in between,
-# and known no better than that.
+# Otherwise, earlier and later data may still require different irons by more than the covariance
+# allows (a drift, a change with other errors, two places). The answer then lies in between, and its
+# covariance is widened accordingly.
 
 _HARD = slice(6, 9)
 _CHI2, _MISFIT_RATIO = (
     100.0,
     3.0,
-)  # of a second hard iron; times by which the disagreement must fall
-_LEAST_EPOCHS = 2  # epochs before and behind: a single one may have been somewhere else
-_LEAST_CHANGE = 0.03  # of the field: a smaller change may be a place
-_CHANCE = 12.0  # chi squared of the best of all times, in units of the misfit, that chance makes
+)  # of a second hard iron; factor by which the misfit must fall
+_LEAST_EPOCHS = 2  # before and after: a single epoch may have been at another place
+_LEAST_CHANGE = 0.03  # of the field: a smaller change may be due to place
+_CHANCE = 12.0  # chi squared of the best time by chance, in units of the misfit
 
 
 def change_message(at_s: float) -> str:
@@ -60,11 +62,10 @@ def change_message(at_s: float) -> str:
 
 @dataclass(frozen=True, slots=True)
 class IronChange:
-    """What two parts of the data say of each other.
+    """Comparison of the earlier with the later epochs.
 
-    first: which of the epochs is the first of those that another hard iron explains; None if none
-        is
-    parted: by how much the variance of the answer is larger for what they differ, at least 1
+    first: index of the first epoch after the change; None if there is none. variance_factor: factor
+    by which their difference widens the variance of the answer, at least 1.
     """
 
     first: int | None
@@ -74,11 +75,10 @@ class IronChange:
 def find_iron_change(
     epochs: InformationStack, graph: Graph, sigma_bias: float, sigma_b: float
 ) -> IronChange | None:
-    """Whether a second hard iron is asked for from some epoch on; None for too few epochs.
+    """Test for a second hard iron from some epoch on; None if there are too few epochs.
 
-    epochs: what they say (`epoch.informations`) at a settled calibration, linear around it.
-    sigma_bias (rad/s) and sigma_b (gauss): what is believed of gyro bias and of a change
-    without data.
+    epochs: their quadratics (`epoch.instrument_quadratics`) at a settled calibration. sigma_bias
+    (rad/s) and sigma_b (gauss): prior sigmas of the gyro bias and of a change.
     """
     Hs, gs = epochs
     if len(Hs) < 2 * _LEAST_EPOCHS:
@@ -121,23 +121,24 @@ def _second_iron_steps(
 
 # -- Turned axes -----------------------------------------------------------------------------------
 #
-# Is the magnetometer turned against the gyro?  The antisymmetric part of a 3x3 correction.
+# Is the magnetometer turned against the gyro? This is the antisymmetric part of a 3x3 correction.
 #
-# The estimator's A is symmetric: the magnetometer's axes are taken to be the gyro's. What the
-# epochs ask for beyond that (`epoch.instrument`), in sigmas, is the evidence.
+# The estimator's A is symmetric: it assumes that the magnetometer's axes are those of the gyro. The
+# evidence against this is the rotation that the epochs require (`epoch.estimate_instrument`), in
+# sigmas.
 
-_EVIDENCE = 30.0  # chi squared with 3 degrees of freedom: once in a million where there is none
+_EVIDENCE = 30.0  # chi squared with 3 degrees of freedom: one in a million by chance
 _MISFIT = 5.0
-_WORTH_RAD = 0.002  # less is not worth a correction of its own
+_WORTH_RAD = 0.002  # a smaller rotation is not worth a correction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Misalignment:
     """Rotation vector theta (3,) in rad from the gyro's to the magnetometer's axes.
 
-    covariance (3, 3), chi2: theta in sigmas, squared; misfit: how much the epochs still disagree,
-    because a lag or a wandering field can look like a rotation; correction: C (3, 3) and b that
-    include it, det C = 1, and give the field in the gyro's axes.
+    covariance (3, 3); chi2: theta in sigmas, squared; misfit: remaining disagreement of the epochs,
+    since a lag or a field that is not uniform can look like a rotation; correction: C (3, 3), det C
+    = 1, and b that include theta and give the field in the gyro's axes.
     """
 
     rotation_rad: Array
@@ -148,7 +149,7 @@ class Misalignment:
 
     @property
     def significant(self) -> bool:
-        """Whether the full correction should be preferred to the symmetric one."""
+        """Whether the full correction is preferable to the symmetric one."""
         worth = float(np.linalg.norm(self.rotation_rad)) > _WORTH_RAD
         return worth and self.chi2 > _EVIDENCE and self.misfit < _MISFIT
 
@@ -156,9 +157,9 @@ class Misalignment:
 def estimate_misalignment(
     epochs: InformationStack, graph: Graph, sigma_bias: float, corrected_rad: Array
 ) -> Misalignment:
-    """From what the epochs of a settled window say.  LinAlgError where the motion does not tell.
+    """From the quadratics of a settled window. LinAlgError if the motion does not determine it.
 
-    taken_rad (3,): turn that is taken out of the gyro's angles already
+    corrected_rad (3,): turn that is removed from the gyro's angles already.
     """
     found = estimate_instrument(epochs, graph, sigma_bias)
     theta, spread = corrected_rad + found.step[TURN], found.covariance[TURN, TURN]
@@ -171,39 +172,38 @@ def estimate_misalignment(
 
 # -- What is left over, locked to attitude, rate or time -------------------------------------------
 #
-# What the epochs ask for beyond iron, bias and whatever an instrument and a place may have, against
-# the columns that `diagnose` has for what real recordings leave (`locked`): a score test for each
-# component, in the directions of it that the motion shows.
+# A score test for each component of `locked`, the columns that `diagnose` uses for the ordinary
+# residuals of real recordings. It is made in the directions that the motion determines, given iron,
+# bias and all imperfections of instrument and place.
 #
-# Chance: at the answer its whitened scores z have the variance `chance` each, were nothing there.
-# It is what the epochs disagree about among themselves once the component is in, in all of its
-# directions or in that one, whichever is more: a field that is another at each visit, and noise
-# that is slow, make them disagree, and what is locked to the attitude does not. It is known by as
-# many degrees of freedom as are left, so that the test is Student's; where there are fewer than
-# directions that are asked, nothing is said.
+# Chance: under the null hypothesis the whitened scores z at the answer have the variance `chance`
+# each. It is the disagreement of the epochs once the component is in the model, in all of its
+# directions or in a single one, whichever is larger: slow noise, and a field that differs at each
+# visit, make epochs disagree; an effect locked to the attitude does not. The variance is known with
+# the remaining degrees of freedom, so the likelihood is Student's. If these are fewer than the
+# tested directions, there is no test.
 #
-# Size: each coefficient has the deviation t times what is ordinary, t lognormal as real recordings
-# have it, or nothing is there (`_THERE`). A direction in which the epochs tell l, in units of what
-# is ordinary, then has scores of the variance chance + t^2 l. So a component that is likelier than
-# nothing has a posterior: what it is found to be, and what the data leave open of it, is an error
-# of the answer, as it is for an instrument's imperfections. What that does to an answer that is
-# wider already for what epochs disagree about counts only as far as it is more.
+# Size: each coefficient has the deviation t times the ordinary one, with t lognormal as in real
+# recordings, or the component is absent (`_PRIOR_PROBABILITY`). In a direction with information l,
+# in units of the ordinary deviation, the score has the variance chance + t^2 l. The posterior mean
+# and covariance of the most probable component are an error of the answer, like the imperfections
+# of an instrument. They count only as far as they exceed the widening by misfit.
 
-_MODES = 3  # half waves over the window: slower than epochs are long
-_SIZES = np.exp(np.arange(-4.0, 3.0))  # times what is ordinary
-_LOG_SPREAD = 2.0  # of their logarithm: `diagnosis/priors.py`, 1.5 to 2.2
-_LEAST_INFORMATION = 1e-6  # information of a direction over that of the best one: less is none
-_PRIOR_PROBABILITY = 1.0 / 20.0  # probability before the data; `diagnosis/priors.py: COURSE`
-_REPORT_NATS = 12.0  # nats; `diagnosis/priors.py: ODDS_REAL`: the laws are not exact
+_MODES = 3  # half waves over the window: slow compared with an epoch
+_SIZES = np.exp(np.arange(-4.0, 3.0))  # t
+_LOG_SPREAD = 2.0  # of log t: `diagnosis/priors.py`, 1.5 to 2.2
+_LEAST_INFORMATION = 1e-6  # of a determined direction, over that of the best one
+_PRIOR_PROBABILITY = 1.0 / 20.0  # `diagnosis/priors.py: COURSE`
+_REPORT_NATS = 12.0  # `diagnosis/priors.py: ODDS_REAL`: the likelihood is not exact
 _FOLLOWS = {"attitude": "the attitude", "rate": "the rate of turn", "time": "the time"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualComponent:
-    """The likeliest component of what is left over.
+    """The most probable component of the residuals.
 
-    key: of `LOCKED`; nats: by which it is likelier than nothing; size_gauss: rms of what it makes
-    of the field where it shows; added: to the covariance (12, 12) of [M, b, w_b]
+    key: of `LOCKED`; nats: log odds against the null; size_gauss: rms of its effect on the field in
+    the determined directions; added: to the covariance (12, 12) of [M, b, w_b].
     """
 
     key: str
@@ -213,7 +213,7 @@ class ResidualComponent:
 
     @property
     def words(self) -> str:
-        """What it is and what to do; empty: it may be chance."""
+        """What it is and what to do; empty if it may be chance."""
         if not self.nats > _REPORT_NATS:
             return ""
         return (
@@ -223,7 +223,7 @@ class ResidualComponent:
 
     @property
     def cause(self) -> str:
-        """The same as what makes the most of a sigma."""
+        """The same as the main cause of a large sigma."""
         return (
             f"what the model leaves over follows {_FOLLOWS[self.key]}: `ahrsd diagnose` of the "
             "recording says what it is"
@@ -231,8 +231,9 @@ class ResidualComponent:
 
 
 def widen_covariance(covariance: Array, plain: Array, left: ResidualComponent | None) -> Array:
-    """covariance (12, 12), which is wider than `plain` for what epochs disagree about, and no less
-    wide than for what is left over."""
+    """The covariance (12, 12), which exceeds `plain` by the misfit, widened to include at least the
+    error by `left`.
+    """
     if left is None:
         return covariance
     scale = np.sqrt(np.diag(covariance))
@@ -249,12 +250,12 @@ def find_residual_component(
     correction: InstrumentCorrection,
     noise_gauss: float,
 ) -> ResidualComponent | None:
-    """By those epochs of a window that `linearise_locked` saw; None where nothing is likelier than
-    nothing, or too few are there.
+    """The most probable component in the epochs that `linearise_locked` linearised. None if no
+    component has positive log odds, or if there are too few epochs.
 
-    believed_of: sigma of the gyro's bias (rad/s), and of the instrument's imperfections and the
-    place (16,), the largest that may be; noise_gauss: of one reading. LinAlgError: the motion
-    tells too little.
+    prior_sigmas: of the gyro bias (rad/s), and (16,) of the instrument's imperfections and the
+    place, each the largest one that is possible; noise_gauss: of one reading. LinAlgError: the
+    motion determines too little.
     """
     moving = [epoch for epoch in epochs if epoch.locked is not None]
     if len(moving) < 2:
@@ -289,11 +290,11 @@ def find_residual_component(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ComponentScores:
-    """What epochs ask of a component, in the k directions of it that they tell.
+    """Score test of a component, in the k directions that the epochs determine.
 
-    scores (k,): whitened by all that else may be; told (k,): information in units of what is
-    ordinary; chance (k,): variance of the scores were nothing there, known by so many degrees of
-    freedom; by_one (12, k): what one of each does to [M, b, w_b]
+    scores (k,): whitened, marginalised over all other parameters; information (k,): in units of the
+    ordinary size; chance (k,): variance of the scores under the null, known with `freedom` degrees
+    of freedom; by_one (12, k): change of [M, b, w_b] per unit of each.
     """
 
     scores: Array
@@ -307,19 +308,22 @@ class _ComponentScores:
         key: str,
         epochs: InformationStack,
         known: Sequence[LockedInformation],
-        course: Array,
+        weights: Array,
         before: tuple[Array, Array],
     ) -> _ComponentScores | None:
-        """course (N, m): by how much each coefficient of the component counts in each epoch, m
-        times; before: what is believed of all else. None where the epochs can hardly
-        disagree."""
+        """The scores of a component of `LOCKED`. None if the epochs leave too few degrees of
+        freedom.
+
+        weights (N, m): those of the coefficients in each epoch, m modes in time; before: quadratic
+        of the prior.
+        """
         (H, g), at, others = epochs, LOCKED[key], slice(0, len(before[1]))
         own_H, own_g = H[:, at[:, None], at], g[:, at]
-        to_others, modes = H[:, at, others], course.shape[1]
-        cross = np.tensordot(course, to_others, (0, 0)).reshape(modes * len(at), -1).T
-        pairs = course[:, :, None] * course[:, None]
+        to_others, modes = H[:, at, others], weights.shape[1]
+        cross = np.tensordot(weights, to_others, (0, 0)).reshape(modes * len(at), -1).T
+        pairs = weights[:, :, None] * weights[:, None]
         own = np.tensordot(pairs, own_H, (0, 0)).transpose(0, 2, 1, 3).reshape(cross.shape[1], -1)
-        gradient = (course.T @ own_g).ravel()
+        gradient = (weights.T @ own_g).ravel()
         others_H, others_g = H[:, others, others].sum(axis=0) + before[0], g[:, others].sum(axis=0)
         others_g = others_g + before[1]
         scale = 1.0 / np.sqrt(np.diag(others_H))
@@ -331,7 +335,7 @@ class _ComponentScores:
         score = vectors.T @ (gradient - gain.T @ others_g)
         step = -vectors @ (score / values)
         others_step = -scale * solved(scale * (others_g + cross @ step))
-        each = course @ step.reshape(modes, -1)
+        each = weights @ step.reshape(modes, -1)
         residual_g = own_g + to_others @ others_step + chain.times(own_H, each)
         roots = np.array([one.roots[key] for one in known])
         by_others = (roots @ to_others).reshape(-1, len(scale)) * scale
@@ -340,7 +344,7 @@ class _ComponentScores:
         if freedom < len(values):
             return None
         pooled_variance = float(np.sum(chain.times(roots, residual_g) ** 2)) / freedom
-        epoch_vectors = np.tensordot(course, vectors.reshape(modes, len(at), -1), (1, 0))
+        epoch_vectors = np.tensordot(weights, vectors.reshape(modes, len(at), -1), (1, 0))
         squared_by_direction = chain.times(np.swapaxes(epoch_vectors, 1, 2), residual_g) ** 2
         direction_information = np.sum(epoch_vectors * (own_H @ epoch_vectors), axis=(0, 1))
         variance_by_direction = (
@@ -355,7 +359,9 @@ class _ComponentScores:
         )
 
     def posterior(self, key: str, of_one: float) -> ResidualComponent:
-        """of_one (gauss): rms of a component that asks for one."""
+        """The component with its log odds and its effect; of_one (gauss): rms of a component of
+        unit size.
+        """
         variance = _SIZES[:, None] ** 2
         size_prior = np.exp(-0.5 * (np.log(_SIZES) / _LOG_SPREAD) ** 2)
         size_prior /= size_prior.sum()

@@ -1,11 +1,11 @@
-"""The estimator: samples in, estimates out, at a cost that does not grow.
+"""The estimator: samples in, estimates out, at a bounded cost per sample.
 
-Samples become steps, steps become epochs of constant size, each epoch becomes one factor of the
-graph. While the window of epochs holds everything, the answer is that of the batch smoother; what
-falls out of it is folded into the prior.
+Samples become steps, steps become epochs of constant size, and each epoch becomes one factor of the
+graph. While the window holds all epochs, the answer is that of the batch smoother; epochs that
+leave it are folded into the prior.
 
-An `Estimate` comes from the graph's numbers: scale as a gauge, sigmas, heading and what would make
-it better known, observability.
+An `Estimate` is derived from the graph: scale as a convention, sigmas, the heading and what would
+improve it, observability.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters, pos
 from ahrsd.estimator.window import Window, search
 from ahrsd.samples import Array, SampleBlock
 
-# -- What an estimate is worth ---------------------------------------------------------------------
+# -- Accuracy of an estimate -----------------------------------------------------------------------
 
 
 _NAMES = (
@@ -106,13 +106,15 @@ def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float
 
 
 def misalignment_heading_deg(turn_rad: Array, down_b: Array, dip_rad: float) -> float:
-    """Worst heading error over the same headings where the magnetometer's axes are turned (3,)."""
+    """Worst heading error over the same headings for a magnetometer turned by turn_rad (3,)."""
     u, across = _headings_at_tilts(down_b, dip_rad)
     return float(np.degrees(np.max(np.abs(np.sum(np.cross(turn_rad, u) * across, axis=1)))))
 
 
 def _headings_at_tilts(down_b: Array, dip_rad: float) -> tuple[Array, Array]:
-    """Field directions (n, 3) over 12 headings at each tilt, and what turns each heading (n, 3)."""
+    """Field directions (n, 3) over 12 headings at each tilt, and the error directions (n, 3) that
+    turn the heading.
+    """
     psi = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
     helper = np.eye(3)[np.argmin(np.abs(down_b), axis=1)]
     north = np.cross(helper, down_b)
@@ -123,7 +125,7 @@ def _headings_at_tilts(down_b: Array, dip_rad: float) -> tuple[Array, Array]:
     return u, np.cross(down_b, level).reshape(-1, 3) / np.cos(dip_rad)
 
 
-_KNOWN_DEG = 0.5  # a heading that is known better needs no advice
+_KNOWN_DEG = 0.5  # a better known heading needs no advice
 _MOTION = "the motion so far tells too little: {}"
 _WIDENED = {
     "misfit": "the field differs with place or attitude, or the iron changes meanwhile: repeat the "
@@ -138,16 +140,16 @@ _WIDENED = {
     "bias": "the gyro's bias may still follow its temperature: go on until it is warm",
 }
 _LEAN_RAD = float(np.radians(30.0))
-_SAME_SIGMA_RATIO = 1.5  # times the least sigma that counts as the same
-_SECONDS, _ROWS = 60.0, 20.0  # that a manoeuvre lasts, and readings at each of its attitudes
+_SAME_SIGMA_RATIO = 1.5  # of two sigmas that count as equal
+_SECONDS, _ROWS = 60.0, 20.0  # duration of a manoeuvre, and readings at each of its attitudes
 
 
 def motion_and_misfit(plain: Array, answer: Array, W: Array) -> dict[str, Array]:
-    """The answer's covariance (12, 12) of [M, b, w_b] shared out between motion and misfit.
+    """Split of the answer's covariance (12, 12) of [M, b, w_b] between motion and misfit.
 
-    plain (12, 12): what it were if the model explained the data; W whitens the prior. What misfit
-    does to a direction that is left undetermined is the motion's doing: the data say too little of
-    it to outweigh what they always leave over, and another place would change nothing.
+    plain (12, 12): the covariance if the model explained the data; W whitens the prior. In
+    directions that stay undetermined, the effect of misfit counts as motion: the data have too
+    little information there to outweigh the misfit, and another place would change nothing.
     """
     scaled = W @ answer @ W.T
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
@@ -163,9 +165,10 @@ def motion_and_misfit(plain: Array, answer: Array, W: Array) -> dict[str, Array]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadingAdvice:
-    """What `widened_by` asks: the calibration c (9,) = [M, b], attitudes and dip that were driven.
+    """Advice on what would improve the heading.
 
-    down, dip_rad: as for `heading_sigma_deg`; noise_gauss: of one reading
+    c (9,) = [M, b]: the calibration; down, dip_rad: attitudes and dip that were driven, as for
+    `heading_sigma_deg`; noise_gauss: of one reading.
     """
 
     c: Array
@@ -180,12 +183,13 @@ class HeadingAdvice:
         misaligned_deg: float = 0.0,
         misfit_cause: Callable[[], str] = str,
     ) -> str:
-        """What makes more than half of the heading's variance, in words; empty: it is known well.
+        """The cause of more than half of the heading's variance, in words; empty if the heading is
+        well known.
 
-        covariance (12, 12): the answer's; parts: covariances (12, 12) by "motion" and the names of
-        `_WIDENED`, which add up to it but for what they have in common; turned_deg: what axes that
-        were found to be turned make of the heading; left: what is known of misfit, in words, or
-        empty
+        covariance (12, 12): the answer's; parts: covariances (12, 12) by "motion" and the keys of
+        `_WIDENED`, which add up to it apart from correlations; misaligned_deg: heading error by
+        axes that were found to be turned; misfit_cause: returns the known cause of misfit in words,
+        or an empty text.
         """
         if not np.hypot(self._sigma_deg(covariance), misaligned_deg) > _KNOWN_DEG:
             return ""
@@ -199,15 +203,16 @@ class HeadingAdvice:
         return (misfit_cause() if most == "misfit" else "") or _WIDENED[most]
 
     def place_heading_deg(self, parts: Mapping[str, Array]) -> float:
-        """What a field that differs by place makes of the heading, 1 sigma; nan: unknown.
+        """1-sigma heading error by a field that differs by place; nan if unknown.
 
-        Where it does not differ with the heading it is misfit.
+        A field that differs by place but not with the heading is part of misfit.
         """
         return self._sigma_deg(parts["place"] + parts["misfit"]) if "place" in parts else np.nan
 
     def best_manoeuvre(self, covariance: Array) -> str:
-        """The easiest of a turn, a roll and a pitch after which the heading is known as well as
-        after any of them."""
+        """The easiest of a turn, a roll and a pitch after which the heading sigma is close to the
+        least of the three.
+        """
         sigma = np.sqrt(np.diag(covariance))
         size = np.outer(sigma, sigma)
         information = np.linalg.inv(covariance / size)
@@ -226,7 +231,7 @@ class HeadingAdvice:
         return heading_sigma_deg(self.c, covariance, self.down, self.dip_rad)
 
     def _manoeuvres(self) -> dict[str, list[Array]]:
-        """Attitudes (n, 3, 3) from the level to the sensor, one after the other, in pieces."""
+        """Attitudes (n, 3, 3) from the level frame to the sensor, in order, in pieces."""
         mean = np.mean(self.down, axis=0)
         level = _level_frame(mean / np.linalg.norm(mean))
         headings = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
@@ -241,9 +246,9 @@ class HeadingAdvice:
         return found
 
     def _manoeuvre_information(self, pieces: Sequence[Array]) -> Array:
-        """Information (12, 12) of a manoeuvre; where each piece begins to point is not known.
+        """Information (12, 12) of a manoeuvre; the direction at the start of each piece is unknown.
 
-        As much for a manoeuvre of several pieces as of one.
+        The total is the same for several pieces as for one.
         """
         M = chain.symmetric(self.c[:6])
         field = np.array([np.cos(self.dip_rad), 0.0, np.sin(self.dip_rad)])
@@ -252,7 +257,9 @@ class HeadingAdvice:
         for R in pieces:
             columns = chain.symmetric_columns(R @ field)
             integral = np.cumsum(np.swapaxes(R, 1, 2), axis=0) * (_SECONDS / len(pieces) / len(R))
-            bias = -M @ R @ so3.skew(field) @ integral  # the gyro's error in the level, by its bias
+            bias = (
+                -M @ R @ so3.skew(field) @ integral
+            )  # rotation error in the level frame by the gyro bias
             iron = np.concatenate([columns, np.tile(np.eye(3), (len(R), 1, 1)), bias], axis=2)
             J = np.concatenate([iron, M @ R @ across], axis=2).reshape(-1, 14)
             H = J.T @ J
@@ -262,7 +269,7 @@ class HeadingAdvice:
 
 
 def _level_frame(down: Array) -> Array:
-    """Columns north, east, down (3, 3) in the sensor's frame, north in some direction."""
+    """Columns north, east, down (3, 3) in the sensor frame; north is arbitrary."""
     north = np.cross(np.eye(3)[np.argmin(np.abs(down))], down)
     north /= np.linalg.norm(north)
     return np.column_stack([north, np.cross(down, north), down])
@@ -271,10 +278,11 @@ def _level_frame(down: Array) -> Array:
 def tilts_and_dip(
     tilts: Iterable[Array], epochs: Sequence[tuple[Array, Array]]
 ) -> tuple[Array, float]:
-    """Tilts driven (K, 3) and the field's dip in rad, from gravity; level and steep without it.
+    """Tilts driven (K, 3) and the dip of the field in rad, from gravity; without it, level and a
+    steep dip.
 
-    tilts: unit vectors towards the earth, some nan; epochs: directions (n, 3) of the field and of
-    down.
+    tilts: unit vectors towards the earth, possibly nan; epochs: directions (n, 3) of the field and
+    of down.
     """
     down = np.array([d for d in tilts if np.isfinite(d).all()])
     if len(down) == 0:
@@ -308,9 +316,9 @@ def observability(covariance: Array, W: Array) -> Observability:
 def undetermined_names(vectors: Array) -> tuple[str, ...]:
     """One name for each dimension of the subspace that the orthonormal vectors (12, K) span.
 
-    Eigenvectors of equal eigenvalues are any basis, another on each processor. So the parameter
-    that lies nearest to the subspace is taken, then the nearest to what is left of it: with
-    |P_ij| <= sqrt(P_ii P_jj) it leads its own projection, and no two names begin alike.
+    Eigenvectors of equal eigenvalues are an arbitrary basis that depends on the processor. So the
+    parameter nearest to the subspace is taken first, then the nearest to the remaining subspace:
+    since |P_ij| <= sqrt(P_ii P_jj) it dominates its own projection, and no two names begin alike.
     """
     P = vectors @ vectors.T
     names = []
@@ -324,7 +332,7 @@ def undetermined_names(vectors: Array) -> tuple[str, ...]:
 
 
 def misfit_words(component: ResidualComponent | None, window: Window) -> str:
-    """What is known of misfit; empty: nothing."""
+    """The known cause of misfit in words; empty if unknown."""
     if component is not None and component.words:
         return component.cause
     slow = window.slow_residual()
@@ -334,33 +342,34 @@ def misfit_words(component: ResidualComponent | None, window: Window) -> str:
 # -- The estimator ---------------------------------------------------------------------------------
 
 
-_FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at every half more
-_CHANGED_EPOCHS = 2  # epochs one after the other that contradict the answer: the iron has changed
-_FEW_EPOCHS = (
-    6  # epochs up to which each new one is iterated to the end over all: cheap, and soon good
-)
-# Sigmas from what a search found at which the answer goes there. Thinned data alone make about 1.
+_FIRST_SEARCH = 2  # epochs with motion before the first search; then at every half more
+_CHANGED_EPOCHS = 2  # contradicting epochs in a row after which the iron has changed
+_FEW_EPOCHS = 6  # epochs up to which each new one iterates over all to convergence
+# Sigmas from the result of a search at which the answer moves there. Thinned data alone make about
+# 1.
 _AWAY, _AWAY_UNSETTLED = 1.5, 0.5
 _FIRST_LOOKS = 4  # of the first search
-_GAIN_FOLDED = 20.0  # of log likelihood, tempered, that is needed against data a search cannot see
-_HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the estimate converged
-_SETTLED = 0.5  # sigmas: a larger last step means that the answer still moves
-_MOST_SIGMAS = 100.0  # of movement or disagreement that are counted
+_GAIN_FOLDED = 20.0  # tempered nats that outweigh folded data, which a search cannot use
+_HOPELESS_DEG = 5.0  # worst heading sigma of a converged estimate
+_SETTLED = 0.5  # sigmas of the last step of a settled answer
+_MOST_SIGMAS = 100.0  # limit on movement and disagreement
 _SCALE = 0.5  # 1-sigma of the field's magnitude over its size in the present calibration
-_LAG_SIGMAS, _LAG_SAME = 3.2, 0.3  # of a lag's sigma: evidence that there is one; settled
+_LAG_SIGMAS, _LAG_SAME = 3.2, 0.3  # sigmas of a lag that is corrected; of a settled lag
 _LAG_PASSES, _LONGEST_LAG_S = 3, 0.1
-_PASSES, _QUIETER = 8, 0.95  # over a gyro that is wrong; while the noise falls below that of itself
-_EXPLAINED_MISFIT = 1.5  # misfit of data that an instrument with imperfections explains
-_TRIED_NATS = -15.0  # nats from which a gyro that is wrong is tried where something is left over
-_MOST_OF_KIND = 4.0  # sigmas of an imperfection beyond which something else is wrong
-_KNOWN_SIGMA = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
+_PASSES, _QUIETER = 8, 0.95  # of correcting the gyro; while the noise falls below this ratio
+_EXPLAINED_MISFIT = 1.5  # limit on the residual ratio of explained data
+_TRIED_NATS = -15.0  # log odds from which a gyro correction is tried if residuals remain
+_MOST_OF_KIND = 4.0  # sigmas of an imperfection beyond which the cause is another
+_KNOWN_SIGMA = 0.05  # of the field: hard-iron sigmas at which agreeing starts end the search
 
 
-WHOLE = 32  # `at_once` for a recording that is there as a whole: what a window holds
+WHOLE = 32  # `at_once` for a complete recording: the size of a window
 
 
 class Estimator:
-    """Streaming MAGYC.  Not thread-safe; deterministic: the same samples give the same numbers."""
+    """The streaming estimator. Not thread-safe. Deterministic: the same samples give the same
+    numbers.
+    """
 
     def __init__(
         self,
@@ -370,10 +379,10 @@ class Estimator:
         *,
         at_once: int = 1,
     ) -> None:
-        """`present` is the device's calibration (registers 23 and 84): the prior's centre.
+        """`present` is the device's calibration (registers 23 and 84): the mean of the prior.
 
-        at_once: epochs that are collected before the answer follows them; where nobody asks in
-        between, more are faster.
+        at_once: number of epochs after which the answer is updated; more is faster if no estimate
+        is needed in between.
         """
         self.parameters = parameters or EstimatorParameters()
         self._present = present or Affine.identity()
@@ -381,7 +390,7 @@ class Estimator:
             np.zeros(3) if present_gyro_bias_rad_s is None else present_gyro_bias_rad_s.copy()
         )
         self._at_once = at_once
-        self._new: list[chain.EpochData] = []  # epochs that are not in the window yet
+        self._new: list[chain.EpochData] = []  # not in the window yet
         self._last: chain.EpochData | None = None  # the newest one
         self._builder = EpochBuilder(self.parameters)
         self._window: Window | None = None
@@ -391,21 +400,17 @@ class Estimator:
         self._moving_epochs = 0
         self._next_search = _FIRST_SEARCH
         self._contradictions = 0
-        self._is_copy = False  # made for one answer
-        self._contradicted_s: float | None = (
-            None  # since when the newest motion contradicts the answer
-        )
-        self._split_factor = (
-            1.0  # variance over the expected of what earlier and later data ask for
-        )
-        self._misscaled = 0.0  # share of themselves by which the gyro's angles are too small
+        self._is_copy = False  # made for one estimate
+        self._contradicted_s: float | None = None  # since when motion contradicts the answer
+        self._split_factor = 1.0  # `IronChange.variance_factor`
+        self._misscaled = 0.0  # `Instrument.misscaled`
         self.restarted_s: float | None = None  # when the iron changed, if it did
 
     def add(self, block: SampleBlock) -> bool:
-        """Take samples; true where they completed an epoch, so that `estimate` says something new.
+        """Take samples; true if they completed an epoch, so that `estimate` changes.
 
-        A block must not span a gap (`SampleBlock`). Raises ValueError, which names the row, where
-        a field, rate or step is not a finite number; nothing of the block is then taken.
+        A block must not span a gap (`SampleBlock`). Raises ValueError naming the row if a field,
+        rate or step is not a finite number; nothing of the block is then taken.
         """
         check_samples(block)
         gap = block.gap_before and len(block) > 0
@@ -416,14 +421,14 @@ class Estimator:
         return bool(closed)
 
     def interrupt(self) -> bool:
-        """Close the epoch with what is pending; what follows does not share one with it."""
+        """Close the epoch with the pending samples; later samples begin a new one."""
         data = self._builder.interrupt()
         if data is not None:
             self._append(data)
         return data is not None
 
     def finish(self) -> Estimate | None:
-        """End of the recording: use what is pending and iterate to the end."""
+        """End of the recording: use the pending samples and iterate to convergence."""
         self.interrupt()
         if self._new:
             self._grow()
@@ -437,7 +442,7 @@ class Estimator:
             self._window, changed = self._examine(self._window)
             if changed and self._searching:
                 self._search(self._window, exactly=True)
-            if not settled:  # nobody could be asked before
+            if not settled:  # the tests need a settled answer
                 self._window = self._split_at_change(self._window)
         return self._current_estimate()
 
@@ -451,18 +456,20 @@ class Estimator:
             self._follow(*self._grow())
 
     def _grow(self) -> tuple[Window, int]:
-        """The window with the new epochs in it, and how many they were."""
+        """The window with the new epochs queued, and their number."""
         new, self._new = self._new, []
         window = self._window = self._window or self._create_window(new[0])
         self._moving_epochs += window.queue(new)
         return self._detect_change(window, len(new)), len(new)
 
     def _follow(self, window: Window, new: int) -> None:
-        """Let the answer follow the new epochs, unless the last one waits for the next."""
+        """Update the answer with the new epochs, unless the last one awaits confirmation of a
+        change.
+        """
         if self._contradictions > 0:
             return
         due = self._moving_epochs >= self._next_search
-        if not (due and window.never_moved):  # else there is nothing yet to go on from
+        if not (due and window.never_moved):  # otherwise there is nothing yet to track from
             window.track(new, everything=self._searching and len(window.epochs) <= _FEW_EPOCHS)
         if due:
             self._next_search = self._moving_epochs + max(1, self._moving_epochs // 2)
@@ -473,10 +480,11 @@ class Estimator:
         window.fold()
 
     def _detect_change(self, window: Window, new: int) -> Window:
-        """The window, or a new one where two epochs one after the other contradict a sure answer.
+        """The window, or a new one if two epochs in a row contradict a well-known answer.
 
-        Then the iron has changed: everything before them is forgotten. One that does waits for the
-        next to do so too, and until motion agrees again the answer is in doubt.
+        Then the iron has changed and everything before them is forgotten. After a single
+        contradicting epoch the next one decides; until an epoch with motion agrees again the answer
+        is not converged.
         """
         is_sure = not self._searching and window.step_sigmas < _SETTLED
         if is_sure:
@@ -494,7 +502,7 @@ class Estimator:
         return window
 
     def _restart_after_change(self, window: Window, count: int) -> Window:
-        """The iron changed before the last `count` epochs: what was before is forgotten."""
+        """Forget everything before the last `count` epochs, at whose beginning the iron changed."""
         self.restarted_s = float(window.epochs[-count].data.time_s[0])
         self._searching, self._agreed, self._contradictions, self._contradicted_s = (
             True,
@@ -507,7 +515,7 @@ class Estimator:
         return window.restart_with_last(count)
 
     def _split_at_change(self, window: Window) -> Window:
-        """The window, or a new one from where the iron changed before the answer was sure."""
+        """The window, or a new one from a change of the iron before the answer was well known."""
         if not window.step_sigmas < _SETTLED:
             return window
         p = self.parameters
@@ -529,7 +537,7 @@ class Estimator:
 
     def _create_window(self, data: chain.EpochData) -> Window:
         A0 = np.linalg.inv(self._present.matrix)
-        A0 = (A0 + A0.T) / 2  # what is not symmetric in the device's register cannot be held here
+        A0 = (A0 + A0.T) / 2  # the model has no antisymmetric part
         size = float(np.median(np.linalg.norm(self._present.apply(data.field_b_gauss), axis=1)))
         c = np.r_[chain.upper_triangle(A0 * max(size, 1e-3)), self._present.offset]
         p = self.parameters
@@ -544,10 +552,11 @@ class Estimator:
         return Window(p, c, belief, first, noise.first_guess(data, p))
 
     def _search(self, window: Window, *, exactly: bool = False, looks: int = 1) -> None:
-        """Other starts compete with the present answer, until they agree on good data.
+        """Let other starts compete with the present answer, until they agree on good data.
 
-        With `exactly` the answer is then iterated to the end over all. A first look at many epochs
-        cannot know what is held and how loud the residuals are, so that it is given more looks.
+        With `exactly` the answer then iterates over all epochs to convergence. The first search
+        over many epochs knows neither the held directions nor the residual level, so it may be
+        repeated.
         """
         looks = _FIRST_LOOKS if window.never_moved else looks
         found = search(self.parameters, window, self._present_bias, window.data)
@@ -570,11 +579,11 @@ class Estimator:
             self._search(window, exactly=exactly, looks=looks - 1)
 
     def _examine(self, window: Window) -> tuple[Window, bool]:
-        """See whether the gyro's angles are the field's, and take out a lag, and what is wrong with
-        the gyro, where the epochs ask for it; the window then, and whether they did.
+        """Check the gyro's scale, and correct a lag and a gyro error if the epochs support it;
+        returns the window and whether anything was corrected.
 
-        What is wrong with a gyro is taken out only if the data are then explained: a field that
-        differs by place asks for it too, and is not.
+        A gyro error is corrected only if the data are then explained: a field that differs by place
+        looks like one, but is not explained by it.
         """
         changed = self._correct_until_settled(window)
         if self.parameters.imperfections:
@@ -591,8 +600,9 @@ class Estimator:
         return window, changed
 
     def _correction_explains(self, trial: Window, before: Window, required_nats: float) -> bool:
-        """Whether the data are explained once that is taken out; and, where the gyro was not likely
-        to be wrong before, likely to be."""
+        """Whether the data are explained by a correction; a gyro error that was improbable before
+        must also become probable.
+        """
         largest = np.max(possible_instruments(*self.parameters.kinds).sigmas, axis=0)
         limit = _MOST_OF_KIND * largest[GYRO_AMONG_IMPERFECTIONS]
         within = bool(np.all(np.abs(trial.correction.gyro_parameters) < limit))
@@ -605,7 +615,7 @@ class Estimator:
         posterior = self._instrument_posterior(trial)
         if posterior is None:
             return False
-        # what it left over passed for noise of the gyro, which is less likely by this
+        # the residuals of the error inflated the gyro's noise, which is less probable by this
         log_noise_ratio = np.log(before.usual.gyro_rad_s / trial.usual.gyro_rad_s)
         gain = (
             posterior.log_odds_against_smallest(GYRO_AMONG_IMPERFECTIONS)[1]
@@ -614,10 +624,10 @@ class Estimator:
         return bool(gain > REQUIRED_NATS)
 
     def _correct_until_settled(self, window: Window, *, gyro_nats: float | None = None) -> bool:
-        """Take out what is asked for until no more is; whether anything was.
+        """Correct what the epochs support until nothing remains; whether anything was corrected.
 
-        gyro_told: nats by which what is wrong with it must be told to be taken out too, None: it is
-        not; then the noise that it passed for has to settle as well.
+        gyro_nats: log odds from which a gyro error is corrected too, None for never. The noise that
+        it inflated then has to settle as well.
         """
         gyro = gyro_nats is not None
         least, changed, noise_settled = (
@@ -663,7 +673,9 @@ class Estimator:
             return None
 
     def _instrument_posterior(self, window: Window) -> InstrumentPosterior | None:
-        """What is known of the instrument and the place; None where they are not to be asked."""
+        """Posterior of the instrument and the place; None if they are not considered or not
+        determined.
+        """
         if not self.parameters.imperfections:
             return None
         before = window.folded_information.at(window.graph.c, window.correction)
@@ -685,7 +697,9 @@ class Estimator:
             return None
 
     def _add_gyro_correction(self, window: Window, required_nats: float) -> InstrumentCorrection:
-        """What is to be taken out, with what else the gyro's axes and scales are asked for."""
+        """The correction, with a further one of the gyro's axes and scales if the data
+        support it.
+        """
         posterior = self._instrument_posterior(window)
         if posterior is None:
             return window.correction
@@ -713,9 +727,9 @@ class Estimator:
         return bool(np.all(sigma < _KNOWN_SIGMA * size))
 
     def estimate(self) -> Estimate | None:
-        """The present answer, None before the first epoch or where nothing at all is determined.
+        """The present estimate; None before the first epoch or if nothing is determined.
 
-        An epoch that is under way counts as far as it is, if it is long enough to be one.
+        A pending epoch counts as far as it goes, if it is long enough to be one.
         """
         if self._new or (self._window and self._builder.pending >= MIN_EPOCH_STEPS):
             self._linearise_locked()
@@ -724,19 +738,21 @@ class Estimator:
 
     @staticmethod
     def _lag_covariance(window: Window) -> Array:
-        """What doubt about the lag, by all data so far, adds to the covariance (12, 12)."""
+        """Addition to the covariance (12, 12) by the uncertainty of the lag, from all
+        data so far.
+        """
         known = window.lag_uncertainty() if window.correction.lag_s != 0.0 else None
         return np.zeros((12, 12)) if known is None else np.outer(known.spread, known.spread)
 
     def _imperfection_widening(self, window: Window) -> Widening:
-        """What an instrument that is not perfect does to the answer."""
+        """Effect of the instrument's imperfections on the answer."""
         posterior = self._instrument_posterior(window)
         return Widening.zero() if posterior is None else widening_by_imperfections(posterior)
 
     def _residual_component(self, window: Window) -> ResidualComponent | None:
-        """What the epochs of the window leave that is locked to attitude, rate or time.
+        """The component of the residuals in the window that follows attitude, rate or time.
 
-        What an answer leaves that is not the best yet is its own.
+        Residuals of an answer that is not settled are due to the answer itself.
         """
         if not self._is_residual_tested(window):
             return None
@@ -755,7 +771,7 @@ class Estimator:
             return None
 
     def _linearise_locked(self) -> None:
-        """Ask the epochs what is locked, each once: what is made for one answer keeps it."""
+        """Linearise the locked columns, once per epoch: a copy for one estimate can reuse them."""
         if self._window is None or not self._is_residual_tested(self._window):
             return
         with suppress(np.linalg.LinAlgError):
@@ -802,7 +818,8 @@ class Estimator:
         except SingularError:
             return None
         observed = observability(covariance * graph.temper, self._whitening)
-        # An answer that moves, or that other starts do not reach, is no better known than that.
+        # An answer that still moves, or that other starts do not reach, is known no better than
+        # that.
         doubt = min(max(window.step_sigmas, self._agreement_sigmas), _MOST_SIGMAS)
         widening = self._imperfection_widening(window)
         explained, component = window.explained_covariance(), self._residual_component(window)

@@ -1,14 +1,14 @@
 """The window: epochs that can still be linearised again, and the graph that joins them.
 
-Two ways to move the estimate. `track` is a plain Gauss-Newton step after which only what it pays to
-linearise again is (`outdated`): the steady state, whose cost does not depend on how long the run
-has been. `optimise` linearises everything and takes a step only if the true cost falls
-(Levenberg-Marquardt): for searching, and whenever a tracking step would be large. `track` spends at
-most _WORK linearisations per epoch on average; what is left over waits. `search` lets other starts
-descend on a part of the window.
+There are two ways to move the estimate. `track` takes plain Gauss-Newton steps and then linearises
+only the epochs for which it pays (`epochs_to_relinearise`): the steady state, whose cost does not
+depend on the length of the run. `optimise` linearises everything and accepts a step only if the
+true cost falls (Levenberg-Marquardt): for searching, and whenever a tracking step would be large.
+`track` spends at most _WORK linearisations per epoch on average; the remaining ones wait. `search`
+lets other starts descend on a part of the window.
 
 Directions of the calibration that the data do not determine are held at the prior's mean, so that
-noise and model errors cannot make them wander (`Graph.hold_blind`).
+noise and model errors cannot make them drift (`Graph.hold_undetermined`).
 """
 
 from __future__ import annotations
@@ -68,24 +68,24 @@ from ahrsd.estimator.noise import DirectionCells, variance_inflation
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.samples import Array
 
-_WORK, _MOST_WORK = 18, 160  # linearisations that each new epoch allows, and that may be saved up
-_GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away towards nothing
-_HIGH_GYRO_NOISE = 1.2  # of the guess: more is something else than the noise of its differences
+_WORK, _MOST_WORK = 18, 160  # linearisations that each new epoch allows, and that may accumulate
+_GYRO_LEAST = 1 / 3  # of the guess by differences: below it the level runs away to zero
+_HIGH_GYRO_NOISE = 1.2  # of the guess: more is not noise of the readings
 _GUESSES = 64  # epochs whose first guess of the noise is remembered
-_NEW_REST_RAD = 0.02  # rad between two directions at rest
+_NEW_REST_RAD = 0.02  # between two directions at rest
 _SETTLED, _EXACT = 0.05, 0.1  # sigmas of a step after which iterating stops; `exactly`
-_LARGE, _CURVED = 1.0, 0.1  # sigmas: a larger tracking step that is so curved is taken with care
+_LARGE, _CURVED = 1.0, 0.1  # sigmas: a larger and more curved step goes to `optimise`
 _MAX_STEPS = 12
 _MAX_TRACKS = 6
 _FINISH_WORK = 20  # linearisations per epoch at the end of a recording
 _WIDER = 2.0  # at most this many times the first guess is the field's noise at a restart
 _RESTART_WORK = 5  # linearisations per epoch that a restart is worth
 _DAMPING, _DAMPING_FAR = 1e-3, 1e2
-_DAMPING_HELD = 1e12  # damping at which the calibration stays where it is
+_DAMPING_HELD = 1e12  # damping that holds the calibration
 _DAMPING_LIMITS = (1e-9, 1e6)
-_SHORT, _STRAIGHT = 5.0, 0.02  # sigmas of a step, and by how much it is curved, to be foreseen
-_CHANCE = 2.0  # sigmas of the misfit by chance from which it counts
-_LEAST_GAIN = 0.05  # of log likelihood: less is not worth another step
+_SHORT, _STRAIGHT = 5.0, 0.02  # sigmas and curvature of a step whose gain can be predicted
+_CHANCE = 2.0  # sigmas by which the misfit must exceed 1
+_LEAST_GAIN = 0.05  # nats: less is not worth another step
 
 
 class Window:
@@ -104,34 +104,28 @@ class Window:
         self.epochs: list[WindowEpoch] = []
         self.misfit = Misfit()
         self.folded = False
-        self.correction = (
-            InstrumentCorrection.identity()
-        )  # of the instrument; it is in the epochs' data
-        self.folded_since_correction = (
-            FoldedInformation()
-        )  # of what was folded since something was taken out
-        self.folded_information = FoldedInformation()  # of all that was folded
+        self.correction = InstrumentCorrection.identity()  # applied to the data of all epochs
+        self.folded_since_correction = FoldedInformation()  # information folded since then
+        self.folded_information = FoldedInformation()  # information folded in all
         self._folded_cells = DirectionCells()
         self._rest: Array | None = None
         self._work = 0
         self._waiting: list[
             tuple[chain.EpochData, bool]
-        ] = []  # not attached yet; with motion or not
+        ] = []  # not attached yet, and whether they have motion
         self._guesses: deque[chain.Noise] = deque([usual], maxlen=_GUESSES)
-        self._guess = usual  # the middle of them
+        self._guess = usual  # their median
         prior = bias_prior(0, c, first, parameters.prior_gyro_bias_rad_s)
         self.graph = Graph(c, belief, first, prior)
         self.found_misfit = 1.0
-        self._excess_misfit = 1.0  # the same, less what chance may make
+        self._excess_misfit = 1.0  # the same, less `_CHANCE` sigmas of chance
         self.step_sigmas = float(np.inf)
-        self.search_residual_ratio = (
-            1.0  # what searching found the model to leave over (`SearchResult.loud`)
-        )
+        self.search_residual_ratio = 1.0  # of `SearchResult`
         self._damping = _DAMPING
-        self._covariance = belief  # of c, when it was last weighed
+        self._covariance = belief  # of c, at the last `_weigh_prior`
 
     def copy(self) -> Window:
-        """A copy that goes its own way."""
+        """An independent copy."""
         other = copy(self)
         other.graph, other.epochs = self.graph.copy(), list(self.epochs)
         other._guesses, other.misfit = self._guesses.copy(), copy(self.misfit)
@@ -141,9 +135,9 @@ class Window:
     # -- growing and forgetting ------------------------------------------------------------------
 
     def queue(self, new: Sequence[chain.EpochData]) -> int:
-        """New epochs of single steps, linked to the one before unless `measures_first`.
+        """Take new epochs of single steps, linked to the one before unless `measures_first`.
 
-        They wait to be attached until the answer moves; returns how many have motion.
+        They are attached to the graph when the estimate moves. Returns how many have motion.
         """
         size = float(np.cbrt(np.linalg.det(chain.symmetric(self.graph.c[:6]))))
         guesses = [noise.first_guess(data, self.parameters) for data in new]
@@ -164,29 +158,31 @@ class Window:
         return float(np.hypot(self.parameters.bias_walk_rad_s_sqrt_s, self.correction.walk))
 
     def _apply_correction(self, data: chain.EpochData) -> chain.EpochData:
-        """Of an epoch as it was measured."""
+        """Correct an epoch as measured."""
         if not np.array_equal(self.correction.gyro, np.eye(3)):
             data = corrected(data, self.correction.gyro, 0.0)
         return data if self.correction.lag_s == 0.0 else delayed(data, self.correction.lag_s)
 
     @property
     def data(self) -> list[chain.EpochData]:
-        """Of all epochs, those that wait too."""
+        """Data of all epochs, including the queued ones."""
         return [epoch.data for epoch in self.epochs] + [data for data, _ in self._waiting]
 
     def attach_waiting(self) -> None:
-        """Attach what waits, at the present values."""
+        """Attach the queued epochs at the present values."""
         waiting, self._waiting = self._waiting, []
         if waiting:
             self.attach([data for data, _ in waiting], [moving for _, moving in waiting])
 
     def copy_noise_guesses(self, other: Window) -> None:
-        """First guesses of the noise and moments of the field, for a part of the other's data."""
+        """Take first noise guesses and moments of the field from a window with more of the same
+        data.
+        """
         self._guesses, self._guess = other._guesses.copy(), other._guess
         self.graph.moments = other.graph.moments
 
     def attach(self, new: Sequence[chain.EpochData], moving: Sequence[bool]) -> None:
-        """Epochs whose steps are grouped already, and whether they calibrate."""
+        """Attach epochs whose steps are grouped already; moving: whether they have motion."""
         walk = self._bias_walk()
         pieces = [
             begin_epoch(self.graph, d, walk, has_motion=m) for d, m in zip(new, moving, strict=True)
@@ -215,10 +211,10 @@ class Window:
                 self.graph.fold_oldest()
 
     def _fold_instrument(self, old: WindowEpoch) -> None:
-        """Keep what an epoch that leaves the window knows of the instrument."""
+        """Keep the information of an epoch on the instrument before it leaves the window."""
         if not old.has_motion:
             return
-        if old.instrument is None:  # the others will be asked soon; together it is cheaper
+        if old.instrument is None:  # all together: the others are needed soon
             linearise_instrument([old, *self.epochs])
         if old.instrument is not None:
             sigma_bias = self.parameters.prior_gyro_bias_rad_s
@@ -232,7 +228,9 @@ class Window:
     def _linearise(
         self, places: Sequence[LinearisationPlan], outlier_sigma: float | None = None
     ) -> list[WindowEpoch]:
-        """Epochs at the present values; with `outlier_sigma` at weights of their own."""
+        """Linearise epochs at the present values; with `outlier_sigma`, weights follow their
+        residuals.
+        """
         self._work -= len(places)
         graph, chains = self.graph, []
         for at in places:
@@ -255,9 +253,9 @@ class Window:
         return out
 
     def _rest_direction(self, u: Array) -> Array:
-        """Direction at rest: that of the last rest unless it is clearly another.
+        """Direction of the field at rest: the one of the last rest unless it clearly differs.
 
-        Differences that are only noise would seem to say something of the bias along the field.
+        Otherwise differences by noise would look like information on the bias along the field.
         """
         mean = u.mean(axis=0)
         mean /= np.linalg.norm(mean)
@@ -278,7 +276,7 @@ class Window:
             self.epochs[k] = new
 
     def _moved_directions(self, which: Sequence[int]) -> list[Array]:
-        """Directions of these epochs where the present values put them."""
+        """Directions of these epochs at the present values."""
         graph, epochs = self.graph, [self.epochs[k] for k in which]
         if not epochs:
             return []
@@ -289,7 +287,7 @@ class Window:
         ]
 
     def relinearise(self, which: Sequence[int]) -> None:
-        """Linearise epochs again at the present values, with fresh noise and outlier weights."""
+        """Linearise epochs at the present values, with new noise levels and outlier weights."""
         epochs, p = [self.epochs[k] for k in which], self.parameters
         places = [
             LinearisationPlan(e.piece, u, noise.shrunk(e.residuals, self.usual, p))
@@ -301,7 +299,7 @@ class Window:
         self.usual = noise.at_least(found_noise, _GYRO_LEAST * self._guess.gyro_rad_s)
 
     def _fitted_gyro_freedom(self) -> float:
-        """Degrees of freedom of the gyro's noise that its matrix and its walking bias took away."""
+        """Degrees of freedom of the gyro's residuals that its matrix and its walking bias used."""
         used = (
             0.0
             if np.array_equal(self.correction.gyro, np.eye(3))
@@ -314,10 +312,11 @@ class Window:
         return used
 
     def correct_instrument(self, correction: InstrumentCorrection) -> None:
-        """Take this out of every epoch of the window, and of those to come.
+        """Apply a correction to the epochs of the window, and to all later ones.
 
-        The directions turn back by as much as a lag grows, so that they fit the fields as before.
-        What a gyro that is wrong left over passed for noise of the field: that is guessed anew.
+        The directions are turned back by the additional lag, so that they fit the fields as before.
+        The residuals of a wrong gyro inflated the noise of the field, so that level starts again
+        from its guess.
         """
         if not self.correction.is_nonzero and self.folded:
             self.folded_since_correction = FoldedInformation.of_iron(self.graph, correction)
@@ -352,16 +351,16 @@ class Window:
 
     @property
     def never_moved(self) -> bool:
-        """Whether no step was ever possible: the answer is where it began."""
+        """Whether no step was possible yet: the answer is the starting point."""
         return not np.isfinite(self.step_sigmas)
 
     def epoch_contradicts(self, k: int) -> bool:
-        """Whether epoch k contradicts the calibration; ask before it is tracked."""
+        """Whether epoch k contradicts the calibration; call it before the epoch is tracked."""
         limit = self.parameters.outlier_sigma
         return contradicts(self.epochs[k], self.graph.c, self._covariance, self.usual, limit)
 
     def restart_with_last(self, count: int) -> Window:
-        """A window of the last `count` epochs that remembers nothing before but noise and bias."""
+        """A window of the last `count` epochs; it keeps only noise and bias of what was before."""
         graph = self.graph
         kept = self.epochs[-count:]
         first = replace(kept[0].data, measures_first=True)
@@ -381,7 +380,9 @@ class Window:
         return other
 
     def lag_uncertainty(self, epochs: Sequence[WindowEpoch] | None = None) -> Lag | None:
-        """How well the lag is known by these epochs, all at present, and the past; None: not."""
+        """Uncertainty of the lag by these epochs (None: all) and the folded ones; None if
+        unobservable.
+        """
         chosen = self.epochs if epochs is None else epochs
         try:
             return lag_uncertainty(
@@ -394,9 +395,9 @@ class Window:
             return None
 
     def restart_at(self, c: Array, bias: Array) -> None:
-        """Put the calibration at c, directions from the field alone, noise as first guessed.
+        """Set the calibration to c, directions from the field alone, and noise to its first guess.
 
-        The guess does not depend on c, so costs reached from different starts compare.
+        The guess does not depend on c, so the costs reached from different starts can be compared.
         """
         graph = self.graph
         self.usual = self._start_noise()
@@ -424,20 +425,20 @@ class Window:
         return chain.Noise(min(self.usual.mag_gauss, _WIDER * guess.mag_gauss), guess.gyro_rad_s)
 
     def snapshot(self) -> Snapshot:
-        """The whole state; cheap, because epochs, nodes and factors are replaced, never changed."""
+        """The whole state. It is cheap: epochs, nodes and factors are replaced, never changed."""
         graph = self.graph
         return Snapshot(
             self._damping, graph.c, dict(graph.nodes), list(self.epochs), list(graph.factors)
         )
 
     def restore(self, kept: Snapshot) -> None:
-        """Back to a snapshot of the same epochs."""
+        """Return to a snapshot of the same epochs."""
         self._damping = kept.damping
         self.graph.c, self.graph.nodes = kept.c, dict(kept.nodes)
         self.epochs, self.graph.factors = list(kept.epochs), list(kept.factors)
 
     def cost(self) -> float:
-        """Negative log likelihood of the window plus the prior, up to a constant."""
+        """Negative log posterior of the window, up to a constant."""
         graph = self.graph
         rises = Stack([graph.prior, *graph.factors], graph.c, graph.nodes).cost_increases()
         return sum(e.cost for e in self.epochs) + float(rises.sum()) + graph.anchor_cost()
@@ -447,9 +448,9 @@ class Window:
     ) -> float:
         """Levenberg-Marquardt over the whole window at fixed noise and weights; returns the cost.
 
-        Stops at the iteration limit, where damping alone finds no lower cost, or where c is
-        `enough`; the window is then at the best point found. A last step that is short and straight
-        is taken without looking: its cost is that foreseen. Never raises on hopeless data.
+        Stops at the iteration limit, if no damping lowers the cost, or if c is `enough`; the window
+        is then at the best point found. A last step that is short and straight is taken without
+        linearising again: its cost is the predicted one. Never raises on hopeless data.
         """
         c = self.graph.c
         present = all(np.array_equal(e.factor.point.c, c) for e in self.epochs if e.has_motion)
@@ -479,7 +480,7 @@ class Window:
         return cost
 
     def _predicted_gain(self) -> float | None:
-        """What an undamped step gains, if it is as short and straight as to be foreseen."""
+        """Gain of an undamped step if it is short and straight enough to predict it, else None."""
         graph = self.graph
         dc, information = graph.predict_step()
         if not sigmas(dc, information) < _SHORT:
@@ -488,10 +489,14 @@ class Window:
         return 0.5 * float(dc @ information @ dc) if curvatures.max() < _STRAIGHT else None
 
     def _cost_after_relinearising(self) -> float:
-        """Cost after a step, everything linearised there; infinite where M is not positive."""
+        """Cost after a step, with everything linearised there; infinite if M is not positive
+        definite.
+        """
         if np.linalg.eigvalsh(chain.symmetric(self.graph.c[:6]))[0] <= 0:
             return float(np.inf)
-        which = [k for k, e in enumerate(self.epochs) if e.has_motion]  # others do not depend on c
+        which = [
+            k for k, e in enumerate(self.epochs) if e.has_motion
+        ]  # the others do not depend on c
         epochs = [self.epochs[k] for k in which]
         places = zip(epochs, self._moved_directions(which), strict=True)
         self._replace(which, [LinearisationPlan(e.piece, u, e.used, e.weights) for e, u in places])
@@ -500,12 +505,12 @@ class Window:
     def track(
         self, new: int = 1, *, everything: bool = False, exactly: bool = False, here: bool = False
     ) -> None:
-        """Follow the newest epochs; with `everything`, all are linearised anew first.
+        """Follow the newest epochs; with `everything`, all are linearised again first.
 
-        here: all were linearised here just now, at directions from the field alone.
+        here: all epochs were just linearised, at directions from the field alone.
 
-        Ends where linearising again would hardly move the answer: by what the step was curved, or,
-        `exactly`, by what another pass over everything did.
+        Stops when another linearisation would hardly move the answer, judged by the curvature of
+        the step or, with `exactly`, by the step of another pass over all epochs.
         """
         self.attach_waiting()
         graph, everyone = self.graph, range(len(self.epochs))
@@ -545,9 +550,10 @@ class Window:
                 return
 
     def _smooth_directions(self) -> None:
-        """Put the directions where the chains want them at the present calibration.
+        """Move the directions to the optimum of the chains at the present calibration.
 
-        Those of the field alone are so noisy that a step of the calibration from there goes astray.
+        Directions from the field alone are so noisy that a step of the calibration from there goes
+        astray.
         """
         try:
             _, dy = self.graph.step(_DAMPING_HELD)
@@ -556,9 +562,10 @@ class Window:
         self.graph.move(np.zeros(9), dy)
 
     def _optimise_within_work(self) -> bool:
-        """A large step with care, as far as the work allowed goes; whether iterating may go on.
+        """Take a large step by `optimise`, as far as the allowed work goes; whether to go on
+        iterating.
 
-        The next epoch goes on from wherever this ends.
+        The next epoch continues from the result.
         """
         n = max(1, sum(e.has_motion for e in self.epochs))
         steps = min(_MAX_STEPS, self._work // n - 1)
@@ -568,9 +575,10 @@ class Window:
         return self._work >= 2 * n
 
     def _weigh_prior(self) -> Array:
-        """Prior against data, and what is held; returns the tempered information of c (9, 9).
+        """Set the weight of the prior and the held directions; returns the tempered information (9,
+        9) of c.
 
-        What is believed without data keeps its weight against data that disagree among themselves.
+        The prior keeps its weight relative to data that disagree among themselves.
         """
         graph, factors, scores = (
             self.graph,
@@ -581,7 +589,7 @@ class Window:
         self.found_misfit, chance = self.misfit.value(factors, scores, graph, graph.step())
         significant = (
             self.found_misfit > 1.0 + _CHANCE * chance
-        )  # else sigmas would only ever grow by it
+        )  # below, it could only widen the sigmas
         self._excess_misfit = max(1.0, self.found_misfit - _CHANCE * chance)
         graph.temper = max(
             1.0, self.found_misfit if significant else 1.0, self._attitude_inflation()
@@ -596,38 +604,39 @@ class Window:
         return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
     def _attitude_inflation(self, *, smooth: bool = False) -> float:
-        """By how much errors that repeat with the attitude shrink the information."""
+        """Factor by which errors that repeat with the attitude reduce the information."""
         cells = sum((e.cells for e in self.epochs if e.has_motion), self._folded_cells)
         noise = self.usual.mag_gauss, self._guess.mag_gauss
         return variance_inflation(cells, *noise, smooth=smooth)
 
     @property
     def residual_ratio(self) -> float:
-        """Mean square of what the model leaves over, over that of noise; 1: no more than chance."""
+        """Mean square residual over that of noise; 1 if there is no more than chance."""
         return max(self._excess_misfit, self._attitude_inflation())
 
     @property
     def gyro_freedom(self) -> float:
-        """Degrees of freedom of the gyro's noise."""
+        """Degrees of freedom of the gyro's residuals."""
         return sum(epoch.residuals.gyro_freedom for epoch in self.epochs)
 
     @property
     def has_unmodelled_residual(self) -> bool:
-        """Whether the model leaves over what is not noise, or calls it noise of the gyro."""
+        """Whether the residuals exceed noise, or the gyro's noise level is suspiciously high."""
         high_gyro_noise = self.usual.gyro_rad_s > _HIGH_GYRO_NOISE * self._guess.gyro_rad_s
         return high_gyro_noise or self.residual_ratio > 1.0
 
     def slow_residual(self) -> noise.SlowResidual | None:
-        """What is left over that lasts, by the epochs that are still here."""
+        """Slow part of the residual, from the epochs in the window."""
         return noise.slow_residual(self.graph.c, [(e.data, e.has_motion) for e in self.epochs])
 
     def covariance(self) -> Array:
-        """Of c and the newest gyro bias (12, 12), with all that the model leaves over in it.
+        """Covariance (12, 12) of c and the newest gyro bias, including all misfit.
 
-        What epochs disagree about is taken not to average out (`noise.unaveraged`).
+        Disagreement among epochs is taken not to average out (`noise.unaveraged`).
 
-        What repeats with the attitude is taken to be smooth, as a room's gradient is. The answer
-        itself is weighed as if it were not, which is nearer to what the data alone say.
+        Errors that repeat with the attitude are taken to be smooth in it, like the gradient of a
+        room. The weights inside the estimate do not assume this, which follows the data more
+        closely.
         """
         graph = self.graph.copy()
         graph.temper = max(graph.temper, self._attitude_inflation(smooth=True))
@@ -655,28 +664,29 @@ class Window:
 
 # -- Which epochs are worth linearising again ------------------------------------------------------
 #
-# Which epochs are worth linearising again, after the calibration moved away from where they were.
+# Which epochs to linearise again after the calibration moved away from their linearisation points.
 #
-# An epoch's factor is exact to second order, so a straight move costs nothing, however many sigmas
-# long. What counts is by how much the way there is curved (`graph.retract`), in sigmas: linearising
-# again moves the answer by about that. An epoch at rest knows nothing of the calibration. There the
-# gyro's bias counts: at another one its directions drift, which seems to be noise of the field.
+# The factor of an epoch is exact to second order, so a straight move costs nothing, however long.
+# What counts is the curvature of the path to the present calibration (`graph.retract`), in sigmas:
+# linearising again moves the answer by about that. An epoch at rest has no information on the
+# calibration. There the gyro bias counts: at another bias the directions drift, which looks like
+# noise of the field.
 
 _LEAST_CURVATURE = 0.02  # sigmas
 _NOISE_CHANGE, _NOISE_CHANGE_EXACT = (
     0.1,
     0.04,
-)  # of the gyro's level, that an epoch may have assumed else
+)  # relative change of the gyro's noise level since the linearisation
 
-_LEAST_DRIFT = 0.3  # of the field's noise: what a bias other than assumed makes of a rest
+_LEAST_DRIFT = 0.3  # of the field's noise: drift at rest by a changed bias
 
 
 def path_curvatures(
     epochs: Sequence[WindowEpoch], c: Array, moments: Moments, information: Array
 ) -> Array:
-    """How curved the way is to c from where each was linearised, in sigmas (E,); 0 at rest.
+    """Curvature of the path to c from each linearisation point, in sigmas (E,); 0 at rest.
 
-    Infinite where no valley leads there: nothing is known of such a way.
+    Infinite if the valley does not reach c: then the curvature is unknown.
     """
     known: dict[int, float] = {}
     for epoch in epochs:
@@ -690,9 +700,10 @@ def path_curvatures(
 def rest_drifts(
     epochs: Sequence[WindowEpoch], nodes: Mapping[int, Node], usual: chain.Noise
 ) -> Array:
-    """How far directions at rest drift over their epoch by another bias than it assumed, (E,).
+    """Drift (E,) of the directions over an epoch at rest by the change of the gyro bias since its
+    linearisation.
 
-    In units of the field's noise; 0 with motion.
+    In units of the field's noise; 0 for epochs with motion.
     """
     out = np.zeros(len(epochs))
     for k, epoch in enumerate(epochs):
@@ -713,7 +724,9 @@ def epochs_to_relinearise(
     *,
     exactly: bool,
 ) -> list[int]:
-    """Epochs that were left too far behind, or assumed another noise of the gyro than `usual`."""
+    """Epochs that are too far from their linearisation point or assumed another gyro noise than
+    `usual`.
+    """
     assumed = np.array([e.usual.gyro_rad_s for e in epochs])
     limit = _NOISE_CHANGE_EXACT if exactly else _NOISE_CHANGE
     other = np.abs(assumed / usual.gyro_rad_s - 1.0) > limit
@@ -727,33 +740,31 @@ def epochs_to_relinearise(
 #
 # Other starting points: do they lead to a better answer, and do they agree?
 #
-# The likelihood has more than one valley when motion is poor. So now and then several starts
-# descend on a part of the window (the epochs whose field varied most, all in one chain with cuts in
-# it; of an epoch of single steps every k-th field, rotations between them composed exactly): the
-# device's present calibration, a linear fit, a sphere, and the answer as it stands. The lowest
-# wins; it may be called sure only if two starts that know nothing of each other arrive there.
+# The likelihood has several optima when motion is poor. So from time to time several starts descend
+# on a part of the window: the epochs whose field varied most, joined to one chain with cuts. Of an
+# epoch of single steps every k-th field is used, with the rotations between them composed exactly.
+# The starts are the device's present calibration, a linear fit, a sphere, and the present answer.
+# The lowest cost wins. It counts as sure only if two independent starts arrive there.
 
 _SEARCH_EPOCHS = 6
 _SEARCH_ROWS = 128  # rows per epoch, at most twice that
 _DESCENT_STEPS = 8  # Levenberg-Marquardt steps per start
-_DESCENT_ROUNDS = 4  # times that those which do not agree yet go on
-_RIVAL_NATS = 8.0  # of log likelihood, by which another valley must be less likely
-_NEAR_SIGMAS = 0.1  # sigmas from the best so far at which a descent need not go on
-_SAME_SIGMAS = 1.0  # sigmas within which two answers are one
-_HIGH_RESIDUAL_RATIO = (
-    2.0  # residual variance over that of the fields' differences that the model left over
-)
+_DESCENT_ROUNDS = 4  # rounds in which starts that do not agree go on
+_RIVAL_NATS = 8.0  # nats by which any other optimum must be less likely
+_NEAR_SIGMAS = 0.1  # from the best so far, at which a descent stops
+_SAME_SIGMAS = 1.0  # within which two answers agree
+_HIGH_RESIDUAL_RATIO = 2.0  # residual variance over that of the fields' differences
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchResult:
     """Best calibration c (9,) and gyro bias (3,).
 
-    away:   sigmas between it and the answer as it stands
-    gain:   in log likelihood over where a descent from the answer as it stands leads
-    apart:  sigmas from it within which two starts that know nothing of each other ended
-    loud:   residual variance that even the best leaves over that of the fields' differences, at
-            which the starts descend; 1 where the model explains the data
+    away: sigmas between it and the present answer
+    gain: in log likelihood over the end of a descent from the present answer
+    apart: sigmas from it within which two independent starts ended
+    search_residual_ratio: residual variance of the best over that of the fields' differences, for
+        the thinned data; 1 if the model explains the data
     """
 
     c: Array
@@ -765,16 +776,17 @@ class SearchResult:
 
     @property
     def agreed(self) -> bool:
-        """Two starts that know nothing of each other arrived at the best."""
+        """Whether two independent starts arrived at the best."""
         return self.apart < _SAME_SIGMAS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Descent:
-    """Where a descent is.
+    """State of a descent.
 
-    independent: it knows nothing of the others;  gain: of log likelihood in the last steps
-    mirrored: it began at a mirror image;  kept: from where it can go on
+    independent: whether its start does not depend on the other descents; gain: of log likelihood in
+    the last steps; mirrored: whether it began at a mirror image; kept: state from which it can go
+    on.
     """
 
     cost: float
@@ -789,7 +801,7 @@ class _Descent:
 
     @property
     def residual_ratio(self) -> float:
-        """Residual variance that it leaves, where that is more than chance; else 1."""
+        """Residual variance ratio if it exceeds chance, else 1."""
         return (
             self.search_residual_ratio if self.search_residual_ratio > _HIGH_RESIDUAL_RATIO else 1.0
         )
@@ -801,7 +813,7 @@ def search(
     present_bias: Array,
     data: Sequence[chain.EpochData],
 ) -> SearchResult:
-    """Descend from every start on a thinned copy of `data`; `window` itself is not touched."""
+    """Descend from every start on a thinned copy of `data`; `window` is not changed."""
     graph = window.graph
     present, information = graph.anchor
     belief = np.asarray(np.linalg.inv(information), dtype=np.float64)
@@ -849,8 +861,9 @@ def _best_descent(descents: Sequence[_Descent]) -> _Descent:
 
 
 def _agreement_sigmas(descents: Sequence[_Descent], graph: Graph) -> float:
-    """Sigmas from the best within which two independent ones are, or, where another valley is
-    nearly as likely, to the end of that."""
+    """Sigmas from the best to the second independent descent, or to another optimum that is nearly
+    as likely.
+    """
     best = _best_descent(descents)
     temper = graph.temper * best.residual_ratio
     distances = [(r, _valley_distance(r.c, best, graph.moments, temper)) for r in descents]
@@ -868,10 +881,10 @@ def _agreement_sigmas(descents: Sequence[_Descent], graph: Graph) -> float:
 def _continue_descents(
     thin: Window, descents: Sequence[_Descent], fields: Array, bias: Array
 ) -> list[_Descent]:
-    """Descents that were not at their ends or at the best go on; one that ended elsewhere begins
-    anew behind the plane of the fields.
+    """Continue the descents that have not arrived at an optimum or the best; one that ended
+    elsewhere starts again from the mirror image behind the plane of the fields.
 
-    Turns about one axis look nearly the same from both sides of the plane that they draw.
+    Turns about one axis look nearly the same from both sides of the plane that they span.
     """
     out, best = list(descents), _best_descent(descents)
     for k, one in enumerate(descents):
@@ -884,7 +897,7 @@ def _continue_descents(
             mirrored = _descend(
                 thin, chain.mirrored(one.c, fields), bias, best, independent=one.independent
             )
-            out[k] = replace(one, independent=False, mirrored=True)  # an end that stays one
+            out[k] = replace(one, independent=False, mirrored=True)  # it ended there
             out.append(replace(mirrored, mirrored=True))
     return out
 
@@ -896,7 +909,7 @@ def _is_positive_definite(c: Array) -> bool:
 def _descend(
     thin: Window, c: Array, bias: Array, best: _Descent | None, *, independent: bool = True
 ) -> _Descent:
-    """Downhill from c, until it is clear that this leads to the best so far."""
+    """Descend from c until it clearly leads to the best so far."""
     thin.restart_at(c, bias)
 
     def near(at: Array) -> bool:
@@ -910,7 +923,7 @@ def _descend(
 
 
 def _continue_descent(thin: Window, before: _Descent) -> _Descent:
-    """Further downhill from where it was."""
+    """Continue a descent."""
     thin.restore(before.kept)
     cost = thin.optimise(_DESCENT_STEPS)
     found = _record_descent(thin, cost, before.cost - cost, independent=before.independent)
@@ -941,7 +954,7 @@ def _record_descent(thin: Window, cost: float, gain: float, *, independent: bool
 
 
 def _valley_distance(c: Array, best: _Descent, moments: Moments, temper: float) -> float:
-    """In sigmas of the best, along the valley: straight across it a bend looks far."""
+    """Sigmas of the best, along the valley: straight across a bend the distance looks large."""
     if best.information is None:
         return float(np.inf)
     return sigmas(valley_step(best.c, c, moments), best.information / temper)
