@@ -124,17 +124,17 @@ class EpochData:
         """How many steps it holds."""
         return len(self) if self.averaging is None else int(self.averaging.count.sum())
 
-    def seen(self, directions: Array) -> Array:
+    def field_directions(self, directions: Array) -> Array:
         """What the field of each row is the image of: directions (n, 3) or tangents (n, 3, 2)."""
         if self.averaging is None:
             return directions
         if directions.ndim == 3:
             return np.asarray(self.averaging.turn @ directions)
-        return times(self.averaging.turn, directions)
+        return matrix_vector(self.averaging.turn, directions)
 
     def field_error(self, u: Array, x: Array) -> Array:
         """Field less its prediction at directions u (n, 3) and x = [M6, b]; gauss."""
-        return np.asarray(self.field_b_gauss - self.seen(u) @ symmetric(x[:6]) - x[6:9])
+        return np.asarray(self.field_b_gauss - self.field_directions(u) @ symmetric(x[:6]) - x[6:9])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,10 +205,10 @@ class Rows:
         return Rows(
             first,
             first + sizes - 1,
-            _columns([d.field_b_gauss for d in data]),
-            _columns([d.angle_b_rad for d in data]),
+            _row_last([d.field_b_gauss for d in data]),
+            _row_last([d.angle_b_rad for d in data]),
             dt,
-            _columns([c.u for c in chains]),
+            _row_last([c.u for c in chains]),
             np.repeat(np.array([c.bias for c in chains]).T, sizes, axis=1),
             linked / (gyro * spread),
             count,
@@ -219,7 +219,7 @@ class Rows:
         )
 
 
-def _columns(pieces: Sequence[Array]) -> Array:
+def _row_last(pieces: Sequence[Array]) -> Array:
     return np.ascontiguousarray(np.concatenate(pieces).T)
 
 
@@ -229,7 +229,7 @@ def robust_weights(residual: Array, limit_gauss: Array | float) -> Array:
     return np.asarray(np.minimum(1.0, limit_gauss**2 / size2))
 
 
-def times(J: Array, v: Array) -> Array:
+def matrix_vector(J: Array, v: Array) -> Array:
     """J_k v_k for stacks of matrices (n, i, j) and vectors (n, j)."""
     return np.asarray((J @ v[:, :, None])[:, :, 0])
 
@@ -241,7 +241,7 @@ class FieldPart:
     J: Array
     tangents: Array
     weights: Array
-    seen: Array  # (2, N) squared sizes of the columns of M P_k T_k
+    column_squares: Array  # (2, N) squared sizes of the columns of M P_k T_k
 
     @property
     def r(self) -> Array:
@@ -249,7 +249,7 @@ class FieldPart:
         return self.J[:, 11]
 
     @property
-    def own(self) -> Array:
+    def by_direction(self) -> Array:
         """d r/d d_k (3, 2, N)."""
         return self.J[:, :2]
 
@@ -275,7 +275,7 @@ class MotionPart:
         return self.J[:, 5]
 
     @property
-    def prev(self) -> Array:
+    def by_previous(self) -> Array:
         """d q/d d_(k-1) (2, 2, N)."""
         return self.J[:, :2]
 
@@ -285,13 +285,15 @@ class MotionPart:
         return self.J[:, 2:5]
 
 
-def parts(rows: Rows, x: Array, outlier_sigma: float | None = None) -> tuple[FieldPart, MotionPart]:
+def field_and_motion(
+    rows: Rows, x: Array, outlier_sigma: float | None = None
+) -> tuple[FieldPart, MotionPart]:
     """Residuals of field and motion with their derivatives; see `linearise_all`."""
     frame = so3.frames(rows.u)
-    return _field(rows, frame, x, outlier_sigma), _motion(rows, frame)
+    return _field_part(rows, frame, x, outlier_sigma), _motion_part(rows, frame)
 
 
-def _field(rows: Rows, frame: Array, x: Array, outlier_sigma: float | None) -> FieldPart:
+def _field_part(rows: Rows, frame: Array, x: Array, outlier_sigma: float | None) -> FieldPart:
     seen = frame if rows.turn is None else np.einsum("ijn,jkn->ikn", rows.turn, frame)
     image = (symmetric(x[:6]) @ seen.reshape(3, -1)).reshape(seen.shape)
     error = rows.field_b_gauss - image[:, 2] - x[6:9, None]
@@ -312,7 +314,7 @@ def _field(rows: Rows, frame: Array, x: Array, outlier_sigma: float | None) -> F
     return FieldPart(J, frame[:, :2], weights, np.sum(own * own, axis=0))
 
 
-def _motion(rows: Rows, frame: Array) -> MotionPart:
+def _motion_part(rows: Rows, frame: Array) -> MotionPart:
     dt = rows.dt_s
     R, Jl = so3.columns_exp_and_left_jacobian(rows.bias * dt - rows.angle_b_rad)
     turned = np.einsum("ijn,jkn->ikn", R[:, :, 1:], frame[:, :, :-1])
@@ -321,18 +323,18 @@ def _motion(rows: Rows, frame: Array) -> MotionPart:
     J = np.zeros((2, 6, frame.shape[2]))
     J[:, :2, 1:], J[:, 5, 1:] = moved[:, :2], moved[:, 2]
     (x, y, z), (p, q, r) = turned[:, 2] * dt[1:], across
-    beside = np.array([y * r - z * q, z * p - x * r, x * q - y * p])  # - across^T [R u dt]x
-    np.einsum("jin,jkn->ikn", beside, Jl[:, :, 1:], out=J[:, 2:5, 1:])
+    by_bias = np.array([y * r - z * q, z * p - x * r, x * q - y * p])  # - across^T [R u dt]x
+    np.einsum("jin,jkn->ikn", by_bias, Jl[:, :, 1:], out=J[:, 2:5, 1:])
     return MotionPart(J, rows.stiff)
 
 
-def interior(field: FieldPart, motion: MotionPart) -> tuple[Array, Array, Array]:
+def interior_blocks(field: FieldPart, motion: MotionPart) -> tuple[Array, Array, Array]:
     """Diagonal blocks (2, 2, N), blocks above them (2, 2, N - 1), and the border columns
     (2, 13, N): x (9), bias (3), gradient.
     """
     scale = motion.scale
-    own = np.einsum("rin,rjn->ijn", field.own, field.J)
-    prev = np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], motion.J[:, :, 1:])
+    own = np.einsum("rin,rjn->ijn", field.by_direction, field.J)
+    prev = np.einsum("rin,rjn->ijn", motion.by_previous[:, :, 1:], motion.J[:, :, 1:])
     diag = own[:, :2].copy()
     for i in range(2):
         diag[i, i] += scale**2
@@ -342,7 +344,7 @@ def interior(field: FieldPart, motion: MotionPart) -> tuple[Array, Array, Array]
     np.multiply(motion.J[:, 2:], -scale, out=border[:, 9:])
     border[:, 12] += own[:, 11]
     border[:, 9:, :-1] += prev[:, 2:]
-    return diag, -scale[1:] * motion.prev[:, :, 1:].transpose(1, 0, 2), border
+    return diag, -scale[1:] * motion.by_previous[:, :, 1:].transpose(1, 0, 2), border
 
 
 # -- The interior eliminated -----------------------------------------------------------------------
@@ -378,7 +380,9 @@ class Interior:
         return Interior(self.factor[:, rows].copy(order="F"), self.half[rows].copy(order="F"))
 
 
-def eliminated(diag: Array, upper: Array, border: Array, first: Index, last: Index) -> Interior:
+def eliminate_interior(
+    diag: Array, upper: Array, border: Array, first: Index, last: Index
+) -> Interior:
     """Of chains in one row: blocks (2, 2, N), those above them (2, 2, N - 1), border (2, 13, N).
 
     border: coupling to the 12 shared numbers, and the gradient; first, last: rows of each chain's
@@ -395,19 +399,19 @@ def eliminated(diag: Array, upper: Array, border: Array, first: Index, last: Ind
     diag, upper = diag.copy(), upper.copy()
     diag[:, :, first] = diag[:, :, last] = np.eye(2)[:, :, None]
     upper[:, :, first] = upper[:, :, last - 1] = 0.0
-    return Interior(*halfway(diag, upper, right))
+    return Interior(*factor_and_solve_lower(diag, upper, right))
 
 
-def halfway(diag: Array, upper: Array, right: Array) -> tuple[Array, Array]:
+def factor_and_solve_lower(diag: Array, upper: Array, right: Array) -> tuple[Array, Array]:
     """L, banded, of a symmetric block tridiagonal matrix, and L^-1 times right (columns, N, 2)."""
-    factor, info = dpbtrf(band(diag, upper), lower=1, overwrite_ab=1)
+    factor, info = dpbtrf(banded_storage(diag, upper), lower=1, overwrite_ab=1)
     if info != 0:
         raise np.linalg.LinAlgError(f"directions of an epoch are not determined (dpbtrf {info})")
     half, _ = dtbtrs(factor, right.reshape(len(right), -1).T, uplo="L", overwrite_b=1)
     return factor, half
 
 
-def band(diag: Array, upper: Array) -> Array:
+def banded_storage(diag: Array, upper: Array) -> Array:
     """Lower banded storage (4, 2n) of a symmetric block tridiagonal matrix with 2x2 blocks."""
     out = np.zeros((4, 2 * diag.shape[2]), order="F")
     out[0, 0::2], out[0, 1::2] = diag[0, 0], diag[1, 1]
@@ -443,7 +447,7 @@ class Quadratic:
     interior: Interior
     tangents: Array
     weights: Array
-    seen: Array
+    column_squares: Array
     sum_mag: float
     sum_gyro: float
     count_mag: float
@@ -478,14 +482,14 @@ def linearise_all(
     LinAlgError where the directions of one are not determined.
     """
     rows = Rows.of(chains)
-    field, motion = parts(rows, x, outlier_sigma)
-    blocks = interior(field, motion)
-    inside = eliminated(*blocks, rows.first, rows.last)
+    field, motion = field_and_motion(rows, x, outlier_sigma)
+    blocks = interior_blocks(field, motion)
+    interior = eliminate_interior(*blocks, rows.first, rows.last)
     ends = list(zip(rows.first.tolist(), rows.last.tolist(), strict=True))
-    insides = [inside.part(a, b) for a, b in ends]
-    sums = _sums(field, motion, blocks, rows)
-    sums -= np.array([part.half.T @ part.half for part in insides])
-    best = field.r + np.einsum("rin,ni->rn", field.own, inside.step(np.zeros(WIDTH)))
+    interiors = [interior.part(a, b) for a, b in ends]
+    sums = _epoch_sums(field, motion, blocks, rows)
+    sums -= np.array([part.half.T @ part.half for part in interiors])
+    best = field.r + np.einsum("rin,ni->rn", field.by_direction, interior.step(np.zeros(WIDTH)))
     sum_mag = np.add.reduceat(np.sum(best**2, axis=0), rows.first)
     count_mag = 3.0 * np.add.reduceat(field.weights * rows.measured, rows.first)
     count_gyro = 2.0 * np.add.reduceat((rows.stiff > 0.0).astype(np.float64), rows.first)
@@ -494,10 +498,10 @@ def linearise_all(
             H=sums[k, :WIDTH, :WIDTH].copy(),  # a view would keep all epochs' arrays alive
             g=sums[k, :WIDTH, WIDTH].copy(),
             cost=0.5 * float(sums[k, WIDTH, WIDTH]),
-            interior=insides[k],
+            interior=interiors[k],
             tangents=field.tangents[:, :, a : b + 1].copy(),
             weights=field.weights[a : b + 1].copy(),
-            seen=field.seen[:, a : b + 1].copy(),
+            column_squares=field.column_squares[:, a : b + 1].copy(),
             sum_mag=float(sum_mag[k]),
             sum_gyro=max(float(sums[k, WIDTH, WIDTH] - sum_mag[k]), 0.0),
             count_mag=float(count_mag[k]),
@@ -507,15 +511,15 @@ def linearise_all(
     ]
 
 
-def _sums(
+def _epoch_sums(
     field: FieldPart, motion: MotionPart, blocks: tuple[Array, Array, Array], rows: Rows
 ) -> Array:
     """Each epoch's Hessian, gradient and square sum (E, 17, 17), all directions as they are."""
     diag, _, border = blocks
     sums = np.zeros((len(rows.first), WIDTH + 1, WIDTH + 1))
     for k, (a, b) in enumerate(zip(rows.first, rows.last + 1, strict=True)):
-        sums[k][_FIELD] = squares(field.J[:, 2:, a:b])
-        sums[k][_MOTION] += squares(motion.J[:, 2:, a:b])
+        sums[k][_FIELD] = outer_sum(field.J[:, 2:, a:b])
+        sums[k][_MOTION] += outer_sum(motion.J[:, 2:, a:b])
     for where, ends in ((FIRST, rows.first), (LAST, rows.last)):
         sums[:, where, where] = diag[:, :, ends].transpose(2, 0, 1)
         sums[:, where, _COUPLED] = border[:, :, ends].transpose(2, 0, 1)
@@ -523,12 +527,12 @@ def _sums(
     return sums
 
 
-def squares(J: Array) -> Array:
+def outer_sum(J: Array) -> Array:
     """Sum of J_rn J_rn^T over residuals r and rows n, (i, i), of J (r, i, n)."""
     return np.asarray((J @ J.transpose(0, 2, 1)).sum(axis=0))
 
 
-def move(u: Array, quadratic: Quadratic, z: Array) -> Array:
+def move_directions(u: Array, quadratic: Quadratic, z: Array) -> Array:
     """Directions after the shared quantities and borders moved by z (WIDTH,): back-substitution."""
     step = np.empty((len(u), 2))
     step[0], step[-1] = z[FIRST], z[LAST]
@@ -560,15 +564,15 @@ def linear_start(epochs: Sequence[EpochData]) -> Array | None:
     gram = np.zeros((9, 9))
     rows = 0
     for data in epochs:
-        turned = _orientations(data)
+        orientations = _orientations_from_first(data)
         columns = symmetric_columns(data.field_b_gauss)
-        piece = np.zeros(len(data)) if data.linked is None else np.cumsum(data.linked == 0)
+        piece_index = np.zeros(len(data)) if data.linked is None else np.cumsum(data.linked == 0)
         for lag_s in _LAGS_S:
             lag = max(1, round(lag_s / float(np.median(data.dt_s[1:]))))
-            same = piece[lag:] == piece[:-lag]
-            R = np.swapaxes(turned[lag:], 1, 2) @ turned[:-lag]
-            phi = np.concatenate([columns[lag:] - R @ columns[:-lag], R - np.eye(3)], axis=2)
-            flat = phi[same].reshape(-1, 9)
+            same = piece_index[lag:] == piece_index[:-lag]
+            R = np.swapaxes(orientations[lag:], 1, 2) @ orientations[:-lag]
+            regressors = np.concatenate([columns[lag:] - R @ columns[:-lag], R - np.eye(3)], axis=2)
+            flat = regressors[same].reshape(-1, 9)
             gram += flat.T @ flat
             rows += int(np.count_nonzero(same))
     if rows == 0:
@@ -588,7 +592,7 @@ def sphere_start(field: Array) -> Array | None:
     return np.concatenate([upper_triangle(np.eye(3) * np.sqrt(r2)), solution[:3] + centre])
 
 
-def mirrored(c: Array, field: Array) -> Array:
+def mirror_hard_iron(c: Array, field: Array) -> Array:
     """c with its hard iron on the other side of the plane that lies best among fields (N, 3)."""
     centre = field.mean(axis=0)
     away = field - centre
@@ -598,7 +602,7 @@ def mirrored(c: Array, field: Array) -> Array:
     return out
 
 
-def _orientations(data: EpochData) -> Array:
+def _orientations_from_first(data: EpochData) -> Array:
     """R_0k of every step against the epoch's first, (n, 3, 3)."""
     return so3.products(so3.exp(np.vstack([np.zeros((1, 3)), data.angle_b_rad[1:]])))
 
@@ -606,12 +610,12 @@ def _orientations(data: EpochData) -> Array:
 def _linear_solution(gram: Array, rows: int, field: Array) -> Array | None:
     G11, G12, G22 = gram[:6, :6], gram[:6, 6:], gram[6:, 6:]
     ridge = 1e-9 * np.trace(G22) / 3 + 1e-12
-    back = np.linalg.solve(G22 + ridge * np.eye(3), G12.T)
-    reduced = G11 - G12 @ back
+    eliminate_d = np.linalg.solve(G22 + ridge * np.eye(3), G12.T)
+    reduced = G11 - G12 @ eliminate_d
     _, vectors = eigh((reduced + reduced.T) / 2, np.diag(2.0 * rows * _NOISE_GRAM))
     c6 = vectors[:, 0]
     C = symmetric(c6)
-    d = -back @ c6
+    d = -eliminate_d @ c6
     if np.trace(C) < 0:
         C, d = -C, -d
     eigenvalues = np.linalg.eigvalsh(C)

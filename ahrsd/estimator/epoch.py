@@ -14,8 +14,8 @@ from functools import partial
 import numpy as np
 
 from ahrsd.estimator import chain, locked, noise
-from ahrsd.estimator.chain import halfway
-from ahrsd.estimator.epoch_data import rates, spread
+from ahrsd.estimator.chain import factor_and_solve_lower
+from ahrsd.estimator.epoch_data import principal_deviation, row_rates
 from ahrsd.estimator.graph import (
     BORDERS,
     Y_A,
@@ -145,7 +145,7 @@ class WindowEpoch:
     def residuals(self) -> noise.Residuals:
         """Sums of squares of its residuals at the linearisation point."""
         if self._residuals is None:
-            self._residuals = noise.residuals(
+            self._residuals = noise.residual_sums(
                 self.quadratic, self.data, self.used, self.piece.typical
             )
         return self._residuals
@@ -924,11 +924,11 @@ def _quadratics(
     rows = chain.Rows.of(
         [chain.Chain(e.data, e.u, e.factor.point.a.bias, e.used, e.weights) for e in epochs]
     )
-    field, motion = chain.parts(rows, c)
+    field, motion = chain.field_and_motion(rows, c)
     turned = rows.angle_b_rad - rows.bias * rows.dt_s
     turn = _gyro_matrix_columns(motion.by_bias / rows.dt_s, turned)
-    seen = np.concatenate([e.data.seen(e.u) for e in epochs])
-    rate = np.concatenate([rates(e.data) for e in epochs])
+    seen = np.concatenate([e.data.field_directions(e.u) for e in epochs])
+    rate = np.concatenate([row_rates(e.data) for e in epochs])
     swept = chain.symmetric(c[:6]) @ np.cross(rate, seen).T
     late = field.by_x[0, 6] * swept  # by_x holds - sqrt(weight) / s_m in that place
     place = _place_columns(field, seen, np.concatenate([e.data.down_b for e in epochs]), c)
@@ -939,25 +939,27 @@ def _quadratics(
     size = split + of_motion.shape[1]
     J = np.concatenate([field.by_x, late[:, None], place, of_field, field.r[:, None]], axis=1)
     K = np.concatenate([motion.by_bias, turn, of_motion, motion.q[:, None]], axis=1)
-    diag, upper, border = chain.interior(field, motion)
+    diag, upper, border = chain.interior_blocks(field, motion)
     columns = np.zeros((2, size + 1, len(rate)))
     columns[:, :12], columns[:, size] = border[:, :12], border[:, 12]
     angles = np.r_[_ANGLE_COLUMNS, split:size]
     by_angle = K[:, 3:-1]
     columns[:, angles] = -motion.scale * by_angle
-    columns[:, angles, :-1] += np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], by_angle[:, :, 1:])
-    columns[:, LAG] = np.einsum("rn,rin->in", late, field.own)
-    columns[:, PLACE] = np.einsum("rjn,rin->ijn", place, field.own)
-    columns[:, _SIZE:split] = np.einsum("rjn,rin->ijn", of_field, field.own)
-    _, half = halfway(diag, upper, np.ascontiguousarray(columns.transpose(1, 2, 0)))
+    columns[:, angles, :-1] += np.einsum(
+        "rin,rjn->ijn", motion.by_previous[:, :, 1:], by_angle[:, :, 1:]
+    )
+    columns[:, LAG] = np.einsum("rn,rin->in", late, field.by_direction)
+    columns[:, PLACE] = np.einsum("rjn,rin->ijn", place, field.by_direction)
+    columns[:, _SIZE:split] = np.einsum("rjn,rin->ijn", of_field, field.by_direction)
+    _, half = factor_and_solve_lower(diag, upper, np.ascontiguousarray(columns.transpose(1, 2, 0)))
     fields = np.r_[_FIELD_COLUMNS, _SIZE:split, size]
     motions = np.r_[_MOTION_COLUMNS, split:size, size]
     H = np.zeros((len(epochs), size + 1, size + 1))
     for k, (a, b) in enumerate(zip(rows.first.tolist(), (rows.last + 1).tolist(), strict=True)):
         Y = half[2 * a : 2 * b]
         H[k] = -(Y.T @ Y)
-        H[k][np.ix_(fields, fields)] += chain.squares(J[:, :, a:b])
-        H[k][np.ix_(motions, motions)] += chain.squares(K[:, :, a:b])
+        H[k][np.ix_(fields, fields)] += chain.outer_sum(J[:, :, a:b])
+        H[k][np.ix_(motions, motions)] += chain.outer_sum(K[:, :, a:b])
     for epoch, own in zip(epochs, H, strict=True):
         own[_SCALES, size] -= _gyro_noise_gradient(epoch)
     return H
@@ -1085,11 +1087,11 @@ def _locked_columns(
         [
             locked.BY_DIRECTION * locked.on_each_axis(locked.harmonics(seen)),
             locked.FIELD_BY_RATE * locked.on_each_axis(rate),
-            locked.BY_CHANGE * locked.of_change(change),
+            locked.BY_CHANGE * locked.change_columns(change),
         ],
         axis=2,
     )
-    products = locked.BY_RATE_SQUARED * locked.squares(step_rate.T)
+    products = locked.BY_RATE_SQUARED * locked.rate_products(step_rate.T)
     by_motion = np.einsum("rin,nk->rkin", motion.by_bias, products)
     weight = field.by_x[0, 6]  # - sqrt(weight) / s_m
     return weight * by_field.transpose(1, 2, 0), by_motion.reshape(2, -1, len(seen))
@@ -1131,15 +1133,15 @@ def contradicts(
 
     The directions must still be where the epoch was linearised, at c.
     """
-    u = chain.move(epoch.u, epoch.quadratic, np.zeros(chain.WIDTH))
-    jacobian = chain.symmetric_columns(epoch.data.seen(u))
+    u = chain.move_directions(epoch.u, epoch.quadratic, np.zeros(chain.WIDTH))
+    jacobian = chain.symmetric_columns(epoch.data.field_directions(u))
     jacobian = np.concatenate([jacobian, np.broadcast_to(np.eye(3), (len(u), 3, 3))], axis=2)
     known = np.sum((jacobian @ covariance) * jacobian, axis=(1, 2))
     error = np.sum(epoch.data.field_error(u, c) ** 2, axis=1)
     beyond = error > limit_sigma**2 * (usual.mag_gauss**2 / epoch.data.count + known)
     if not epoch.has_motion or float(np.mean(beyond)) <= _MOST_ROWS:
         return False
-    if spread(u[beyond]) < _LEAST_SPREAD_RAD:
+    if principal_deviation(u[beyond]) < _LEAST_SPREAD_RAD:
         return False
     q = epoch.quadratic
     H, g = q.H[np.ix_(_IRON_AND_BORDERS, _IRON_AND_BORDERS)], q.g[_IRON_AND_BORDERS]

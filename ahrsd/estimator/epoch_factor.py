@@ -220,7 +220,7 @@ def _settled(epoch: Epoch, point: Point, start: Array | None) -> tuple[EpochSumm
         z = np.zeros(chain.WIDTH)
         if not joined:
             z[_BORDERS] = -np.linalg.solve(q.H[_BORDERS, _BORDERS], q.g[_BORDERS])
-        step = chain.move(u, q, z) - u
+        step = chain.move_directions(u, q, z) - u
         if float(np.max(np.abs(step))) < _SETTLED_RAD:
             return _summary(point, q, u, joined), u
         for _ in range(_MOST_HALVINGS):

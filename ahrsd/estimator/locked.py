@@ -45,13 +45,13 @@ def harmonics(field_b: Array) -> Array:
     )
 
 
-def squares(rate: Array) -> Array:
+def rate_products(rate: Array) -> Array:
     """(N, 6) products of the rates, less nothing: a mean is a bias, which the calibration has."""
     x, y, z = rate.T
     return np.column_stack([x * x, y * y, z * z, x * y, y * z, z * x])
 
 
-def of_change(change_b: Array) -> Array:
+def change_columns(change_b: Array) -> Array:
     """(N, 3, 8) a matrix on the field's change (N, 3), without what is alike on all axes: that is
     a delay."""
     matrix = np.concatenate([TRACELESS, so3.skew(np.eye(3))])
@@ -64,7 +64,7 @@ def on_each_axis(functions: Array) -> Array:
     return np.asarray(flat.reshape(len(functions), 3, -1))
 
 
-def courses(time_s: Array, modes: int) -> Array:
+def cosine_modes(time_s: Array, modes: int) -> Array:
     """(N, modes) cosines of mean square 1 over the times, of 1 half wave, 2 and so on."""
     since = (time_s - time_s.min()) / max(float(np.ptp(time_s)), 1e-9)
     return np.asarray(np.sqrt(2.0) * np.cos(np.pi * since[:, None] * np.arange(1, modes + 1)))

@@ -277,7 +277,7 @@ def find_residual_component(
     )
     rows = sum(epoch.data.steps for epoch in moving)
     time_s = np.array([float(epoch.data.time_s[[0, -1]].mean()) for epoch in moving])
-    modes = locked.COURSE * locked.courses(time_s, _MODES)
+    modes = locked.COURSE * locked.cosine_modes(time_s, _MODES)
     found = []
     for key in LOCKED:
         column = modes if key == "time" else np.ones((len(moving), 1))
@@ -336,16 +336,18 @@ class _ComponentScores:
         step = -vectors @ (score / values)
         others_step = -scale * solved(scale * (others_g + cross @ step))
         each = weights @ step.reshape(modes, -1)
-        residual_g = own_g + to_others @ others_step + chain.times(own_H, each)
+        residual_g = own_g + to_others @ others_step + chain.matrix_vector(own_H, each)
         roots = np.array([one.roots[key] for one in known])
         by_others = (roots @ to_others).reshape(-1, len(scale)) * scale
         fitted = float(np.sum(by_others.T * solved(by_others.T)))
         freedom = float(sum(one.freedom[key] for one in known)) - len(values) - fitted
         if freedom < len(values):
             return None
-        pooled_variance = float(np.sum(chain.times(roots, residual_g) ** 2)) / freedom
+        pooled_variance = float(np.sum(chain.matrix_vector(roots, residual_g) ** 2)) / freedom
         epoch_vectors = np.tensordot(weights, vectors.reshape(modes, len(at), -1), (1, 0))
-        squared_by_direction = chain.times(np.swapaxes(epoch_vectors, 1, 2), residual_g) ** 2
+        squared_by_direction = (
+            chain.matrix_vector(np.swapaxes(epoch_vectors, 1, 2), residual_g) ** 2
+        )
         direction_information = np.sum(epoch_vectors * (own_H @ epoch_vectors), axis=(0, 1))
         variance_by_direction = (
             squared_by_direction.sum(axis=0)

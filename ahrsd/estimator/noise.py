@@ -28,8 +28,8 @@ from ahrsd.samples import Array
 
 _MAD = 1.4826
 _GYRO_LIMIT = 1.5
-_FAR = 1.7  # beyond this ratio of the gyro's variance to the one assumed it is something else
-_LEAST_FREE = 0.2  # share of the freedom that is left at least, whatever was fitted
+_FAR_RATIO = 1.7  # beyond this ratio of the gyro's variance to the one assumed it is something else
+_LEAST_FREEDOM = 0.2  # share of the freedom that is left at least, whatever was fitted
 # Degrees of freedom by which an epoch's noise is drawn to the usual one. The gyro has so few per
 # epoch that its noise per epoch would be mostly chance, and weighting by chance is biased.
 _STRENGTH_MAG, _STRENGTH_GYRO = 100.0, 3000.0
@@ -48,7 +48,7 @@ class Residuals:
     gyro_freedom: float
 
 
-def from_differences(values: Array) -> float:
+def noise_of_differences(values: Array) -> float:
     """Standard deviation of white noise on (N, 3) rows by the median of second differences."""
     second = values[2:] - 2 * values[1:-1] + values[:-2]
     return float(_MAD * np.median(np.abs(second)) / np.sqrt(6.0))
@@ -57,7 +57,9 @@ def from_differences(values: Array) -> float:
 def first_guess(data: chain.EpochData, parameters: EstimatorParameters) -> chain.Noise:
     """Noise of an epoch before anything is known about its calibration."""
     rate = data.angle_b_rad[1:] / data.dt_s[1:, None]
-    return _floored(from_differences(data.field_b_gauss), from_differences(rate), parameters)
+    return _with_floors(
+        noise_of_differences(data.field_b_gauss), noise_of_differences(rate), parameters
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,21 +78,21 @@ class Typical:
         return Typical(float(np.median(own.count)), float(np.median(own.spread_s[1:])))
 
 
-def residuals(
+def residual_sums(
     q: chain.Quadratic, data: chain.EpochData, used: chain.Noise, typical: Typical
 ) -> Residuals:
     """What an epoch linearised with the noise levels `used` says about them."""
-    a = typical.count * q.seen / used.mag_gauss**2
+    a = typical.count * q.column_squares / used.mag_gauss**2
     b = 1.0 / (used.gyro_rad_s * typical.spread_s) ** 2
     hat = float(np.sum(1.0 / np.sqrt(1.0 + 4.0 * b / np.maximum(a, 1e-12))))
     hat -= float(data.measures_first)
     if data.linked is not None:
         hat -= float(np.count_nonzero(data.linked[1:] == 0))
     hat = max(hat, 1.0)
-    further = 2.0 / (1.0 + min(hat / max(q.count_gyro, 1.0), 1.0) ** 2)
+    exponent = 2.0 / (1.0 + min(hat / max(q.count_gyro, 1.0), 1.0) ** 2)
     found = q.sum_gyro / hat  # over the variance assumed
-    if 1.0 / _FAR < found < _FAR:
-        found **= further
+    if 1.0 / _FAR_RATIO < found < _FAR_RATIO:
+        found **= exponent
     return Residuals(
         q.sum_mag * used.mag_gauss**2,
         max(q.count_mag - hat, 1.0),
@@ -99,7 +101,7 @@ def residuals(
     )
 
 
-def pooled(
+def pool_noise(
     found: Sequence[Residuals],
     guess: chain.Noise,
     parameters: EstimatorParameters,
@@ -116,12 +118,12 @@ def pooled(
     mag = np.array([(r.mag_gauss2, r.mag_freedom) for r in found])
     gyro = np.array([(r.gyro_rad2_s2, r.gyro_freedom) for r in found])
     freedom = float(gyro[:, 1].sum())
-    gyro[:, 1] *= max(1.0 - fitted / freedom, _LEAST_FREE)
+    gyro[:, 1] *= max(1.0 - fitted / freedom, _LEAST_FREEDOM)
     limit = _GYRO_LIMIT * guess.gyro_rad_s
-    return _floored(_pooled(mag), min(_pooled(gyro), limit), parameters)
+    return _with_floors(_pooled_sigma(mag), min(_pooled_sigma(gyro), limit), parameters)
 
 
-def at_least(usual: chain.Noise, gyro_rad_s: float) -> chain.Noise:
+def with_gyro_floor(usual: chain.Noise, gyro_rad_s: float) -> chain.Noise:
     """The usual noise with a gyro that is not quieter than this.
 
     In steady motion an epoch tells so little of the gyro's noise (a few degrees of freedom) that
@@ -130,7 +132,7 @@ def at_least(usual: chain.Noise, gyro_rad_s: float) -> chain.Noise:
     return chain.Noise(usual.mag_gauss, max(usual.gyro_rad_s, gyro_rad_s))
 
 
-def median(guesses: Sequence[chain.Noise]) -> chain.Noise:
+def median_noise(guesses: Sequence[chain.Noise]) -> chain.Noise:
     """The middle of several first guesses."""
     return chain.Noise(
         float(np.median([g.mag_gauss for g in guesses])),
@@ -138,11 +140,13 @@ def median(guesses: Sequence[chain.Noise]) -> chain.Noise:
     )
 
 
-def shrunk(found: Residuals, usual: chain.Noise, parameters: EstimatorParameters) -> chain.Noise:
+def shrink_noise(
+    found: Residuals, usual: chain.Noise, parameters: EstimatorParameters
+) -> chain.Noise:
     """An epoch's own noise, drawn to the usual one: a disturbed epoch loses weight by itself."""
     mag = found.mag_gauss2 + _STRENGTH_MAG * usual.mag_gauss**2
     gyro = found.gyro_rad2_s2 + _STRENGTH_GYRO * usual.gyro_rad_s**2
-    return _floored(
+    return _with_floors(
         float(np.sqrt(mag / (found.mag_freedom + _STRENGTH_MAG))),
         min(
             float(np.sqrt(gyro / (found.gyro_freedom + _STRENGTH_GYRO))),
@@ -152,13 +156,13 @@ def shrunk(found: Residuals, usual: chain.Noise, parameters: EstimatorParameters
     )
 
 
-def _pooled(table: Array) -> float:
+def _pooled_sigma(table: Array) -> float:
     variance = table[:, 0] / table[:, 1]
     usual = variance <= 9 * np.median(variance)
     return float(np.sqrt(table[usual, 0].sum() / table[usual, 1].sum()))
 
 
-def _floored(mag: float, gyro: float, parameters: EstimatorParameters) -> chain.Noise:
+def _with_floors(mag: float, gyro: float, parameters: EstimatorParameters) -> chain.Noise:
     return chain.Noise(
         max(mag, parameters.mag_noise_floor_gauss), max(gyro, parameters.gyro_noise_floor_rad_s)
     )
@@ -176,8 +180,10 @@ def _floored(mag: float, gyro: float, parameters: EstimatorParameters) -> chain.
 # shrinks by n s_r^2 / (cells s^2).
 
 _BANDS, _SECTORS = 8, 12  # cells of equal area, about 22 deg across
-_WHITE = 1.5  # residual variance over that of the differences up to which there is nothing else
-_LEAST = 0.005  # of a band's cell: share of the samples that makes a cell count
+_WHITE_RATIO = (
+    1.5  # residual variance over that of the differences up to which there is nothing else
+)
+_LEAST_SHARE = 0.005  # of a band's cell: share of the samples that makes a cell count
 
 
 class DirectionCells:
@@ -222,7 +228,7 @@ class DirectionCells:
         return self._above(grid.sum(axis=(1, 3)))
 
     def _above(self, count: Array) -> int:
-        return int(np.count_nonzero(count > _LEAST * count.sum()))
+        return int(np.count_nonzero(count > _LEAST_SHARE * count.sum()))
 
 
 def variance_inflation(
@@ -232,7 +238,7 @@ def variance_inflation(
 
     smooth: what repeats is one unknown for each region of 45 deg of directions, not for each cell
     """
-    repeats = max(0.0, 1.0 - _WHITE * (white_gauss / residual_gauss) ** 2)
+    repeats = max(0.0, 1.0 - _WHITE_RATIO * (white_gauss / residual_gauss) ** 2)
     unknowns = cells.regions if smooth else cells.visited
     return max(1.0, repeats * cells.steps / max(unknowns, 1))
 
@@ -253,7 +259,7 @@ def variance_inflation(
 # epoch tells as much as before.
 
 
-def unaveraged(
+def covariance_with_common_errors(
     covariance: Array, epochs: Array, *, misfit: float, temper: float, folded: tuple[Array, float]
 ) -> Array:
     """covariance (n, n) where what epochs disagree about is the same in all of them.
@@ -264,23 +270,23 @@ def unaveraged(
     """
     if not misfit > 1.0:
         return covariance
-    root = _root(covariance)
-    old, count = folded
-    pieces = np.concatenate([epochs, old[None] / max(count, 1.0)])
+    root = _square_root(covariance)
+    folded_information, count = folded
+    pieces = np.concatenate([epochs, folded_information[None] / max(count, 1.0)])
     weights = np.r_[np.ones(len(epochs)), count]
     whitened = root.T @ pieces @ root / temper
     values, vectors = np.linalg.eigh((whitened + np.swapaxes(whitened, 1, 2)) / 2)
     values = np.clip(values, 0.0, None)
-    told = np.einsum("k,kij,kj,klj->il", weights, vectors, values, vectors)
-    alike = np.einsum("k,kij,kj,klj->il", weights, vectors, np.sqrt(values), vectors)
-    more = ((misfit - 1.0) * alike @ alike + told) / temper - told
-    more_values, more_vectors = np.linalg.eigh((more + more.T) / 2)
+    information = np.einsum("k,kij,kj,klj->il", weights, vectors, values, vectors)
+    coherent = np.einsum("k,kij,kj,klj->il", weights, vectors, np.sqrt(values), vectors)
+    additional = ((misfit - 1.0) * coherent @ coherent + information) / temper - information
+    more_values, more_vectors = np.linalg.eigh((additional + additional.T) / 2)
     wider = more_vectors * np.clip(more_values, 0.0, None) @ more_vectors.T
     found = covariance + root @ wider @ root.T
     return np.asarray((found + found.T) / 2)
 
 
-def _root(covariance: Array) -> Array:
+def _square_root(covariance: Array) -> Array:
     """R with R R^T = covariance, a positive definite matrix whose rows may have any units."""
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -295,12 +301,15 @@ def _root(covariance: Array) -> Array:
 # another one by then. Noise forgets sooner than a motion passes through directions, and goes on
 # while the sensor is at rest, where no place is passed by.
 
-_FORGOTTEN = float(np.exp(-1.0))  # of the correlation of what is slow
+_DECAYED = float(np.exp(-1.0))  # of the correlation of what is slow
 _APART, _APART_S = 4.0, 2.0  # times that, and seconds, after which a visit is another one
 _FEWEST_VISITS = 12  # further ones of the same directions, all together
-_REPEATS, _NEW = 0.6, 0.3  # correlation of visits above, below which they are alike, are not
+_REPEATING, _NOT_REPEATING = (
+    0.6,
+    0.3,
+)  # correlation of visits above, below which they are alike, are not
 _SLOW_SHARE = 0.2  # of the residuals' variance, that is slow: less is no matter
-_RESTED = 10.0  # times that it takes to forget, that a sensor must have been at rest to tell
+_LEAST_REST = 10.0  # times that it takes to forget, that a sensor must have been at rest to tell
 _GOES_ON, _STOPS = 0.5, 0.1  # of its variance, at rest
 
 
@@ -321,7 +330,7 @@ class SlowResidual:
     @property
     def words(self) -> str:
         """What it is, and what shrinks what it does; empty: it is not told from other causes."""
-        if self.repeats is None or self.repeats > _NEW or self.goes_on is False:
+        if self.repeats is None or self.repeats > _NOT_REPEATING or self.goes_on is False:
             return ""
         slow = (
             f"what is left over is slow ({1e3 * self.size_gauss:.1f} mG, another after "
@@ -345,15 +354,15 @@ def slow_residual(c: Array, epochs: Sequence[tuple[chain.EpochData, bool]]) -> S
     M = chain.symmetric(c[:6])
     size = float(np.cbrt(np.linalg.det(M)))
     parts = []
-    for data, turned in epochs:
+    for data, has_motion in epochs:
         h = np.linalg.solve(M, (data.field_b_gauss - c[6:9]).T).T
         length = np.linalg.norm(h, axis=1)
-        parts.append((data, turned, size * (length - 1.0), h / length[:, None]))
+        parts.append((data, has_motion, size * (length - 1.0), h / length[:, None]))
     moving = [part for part in parts if part[1]]
     if not moving:
         return None
     step_s = float(np.median(np.concatenate([part[0].dt_s[1:] for part in moving])))
-    slow, lag = _forgotten([part[2] for part in moving])
+    slow, lag = _slow_variance_and_time([part[2] for part in moving])
     total = float(np.mean(np.concatenate([part[2] for part in moving]) ** 2))
     if lag is None or slow < _SLOW_SHARE * total:
         return None
@@ -361,35 +370,35 @@ def slow_residual(c: Array, epochs: Sequence[tuple[chain.EpochData, bool]]) -> S
     rests = [part[2] for part in parts if not part[1]]
     rested_s = sum(float(np.sum(part[0].dt_s[1:])) for part in parts if not part[1])
     goes_on = None
-    if rested_s > _RESTED * forgets_s:
-        share = _slow_variance(rests) / slow
+    if rested_s > _LEAST_REST * forgets_s:
+        share = _rest_variance(rests) / slow
         goes_on = True if share > _GOES_ON else False if share < _STOPS else None
-    repeats = _visits(moving, max(_APART * forgets_s, _APART_S))
+    repeats = _revisit_correlation(moving, max(_APART * forgets_s, _APART_S))
     return SlowResidual(float(np.sqrt(slow)), forgets_s, repeats, goes_on)
 
 
-def _forgotten(residuals_gauss: Sequence[Array]) -> tuple[float, int | None]:
+def _slow_variance_and_time(residuals_gauss: Sequence[Array]) -> tuple[float, int | None]:
     """Variance of what is slow, and rows after which it is another one, None: not within a half."""
     longest = max(len(part) for part in residuals_gauss) // 2
-    slow = _covariance(residuals_gauss, 1)
+    slow = _lagged_covariance(residuals_gauss, 1)
     for lag in range(2, longest):
-        if _covariance(residuals_gauss, lag) < _FORGOTTEN * slow:
+        if _lagged_covariance(residuals_gauss, lag) < _DECAYED * slow:
             return slow, lag
     return slow, None
 
 
-def _covariance(parts: Sequence[Array], lag: int) -> float:
+def _lagged_covariance(parts: Sequence[Array], lag: int) -> float:
     long = [part for part in parts if len(part) > 2 * lag]
     products = [float(part[lag:] @ part[:-lag]) for part in long]
     return sum(products) / max(sum(len(part) - lag for part in long), 1)
 
 
-def _slow_variance(parts: Sequence[Array]) -> float:
+def _rest_variance(parts: Sequence[Array]) -> float:
     """At rest, where a constant is nobody's noise."""
-    return _covariance([part - part.mean() for part in parts if len(part) > 2], 1)
+    return _lagged_covariance([part - part.mean() for part in parts if len(part) > 2], 1)
 
 
-def _visits(
+def _revisit_correlation(
     parts: Sequence[tuple[chain.EpochData, bool, Array, Array]], apart_s: float
 ) -> float | None:
     """Correlation of what is left over in the same directions, at times that far apart."""
@@ -402,7 +411,7 @@ def _visits(
     mean = np.add.reduceat(left, begins) / count
     when, where = time_s[begins], cell[begins]
     product = square = 0.0
-    further = 0
+    revisits = 0
     for one in np.unique(where):
         own = np.flatnonzero(where == one)
         kept = [own[0]]
@@ -411,7 +420,7 @@ def _visits(
                 kept.append(k)
         values = mean[kept]
         if len(values) > 1:
-            further += len(values) - 1
+            revisits += len(values) - 1
             product += float((values.sum() ** 2 - values @ values) / (len(values) - 1))
             square += float(values @ values)
-    return product / square if further >= _FEWEST_VISITS and square > 0.0 else None
+    return product / square if revisits >= _FEWEST_VISITS and square > 0.0 else None

@@ -47,7 +47,7 @@ LEAST_ROWS = 64  # in a piece before a gap that is worth scoring
 #: columns of a block: those of `Estimate.gyro_covariance`, then a drift of the field in the world
 SOFT, IRON, GYRO, MATRIX = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 21)
 DRIFT, _LAG, _RESIDUAL = slice(21, 24), 27, 28
-_KNOWN, _OWN = 21, slice(24, 28)  # and a block's own field (3) and lag
+_CALIBRATION_COLUMNS, _OWN = 21, slice(24, 28)  # and a block's own field (3) and lag
 _ENTRIES = np.triu_indices(3)
 # 1-sigma that no calibration is believed to fall below: what moves by itself from minute to minute
 _FLOOR = np.r_[np.full(6, 1e-3), np.full(3, 5e-4), np.full(3, 2e-4)]
@@ -75,7 +75,7 @@ class ReferenceCalibration:
     def of(estimate: Estimate) -> ReferenceCalibration:
         """The estimate, in the order of its covariance."""
         A = estimate.soft_iron
-        covariance = np.zeros((_KNOWN, _KNOWN))
+        covariance = np.zeros((_CALIBRATION_COLUMNS, _CALIBRATION_COLUMNS))
         covariance[:12, :12] = estimate.covariance
         if estimate.gyro_covariance is not None:
             covariance = estimate.gyro_covariance.copy()
@@ -141,21 +141,21 @@ class Scorer:
         turn = np.diff(rows.angle_b_rad, axis=0, prepend=rows.angle_b_rad[:1])
         turn -= dt_s[:, None] * reference.gyro_bias_rad_s
         turn = turn @ reference.gyro_correction.T
-        R = carried(so3.exp(turn))
+        R = accumulate_rotations(so3.exp(turn))
         lever = R @ reference.correction
         y = (lever @ (rows.raw_b_gauss - reference.offset)[:, :, None])[:, :, 0]
         h = y.mean(axis=0)
         Z = np.zeros((n, 3, _RESIDUAL + 1))
         across = so3.skew(h)
-        Z[:, :, SOFT] = lever @ _soft(h @ R)
+        Z[:, :, SOFT] = lever @ _soft_iron_columns(h @ R)
         Z[:, :, IRON] = lever
-        gone = np.cumsum(R * dt_s[:, None, None], axis=0) @ reference.gyro_correction
-        Z[:, :, GYRO] = -across @ gone
-        ways = np.einsum("nij,kjl,nl->nik", R, GYRO_BASIS, turn, optimize=True)
-        Z[:, :, MATRIX] = across @ np.cumsum(ways, axis=0)
+        bias_integral = np.cumsum(R * dt_s[:, None, None], axis=0) @ reference.gyro_correction
+        Z[:, :, GYRO] = -across @ bias_integral
+        unit_matrices = np.einsum("nij,kjl,nl->nik", R, GYRO_BASIS, turn, optimize=True)
+        Z[:, :, MATRIX] = across @ np.cumsum(unit_matrices, axis=0)
         Z[:, [0, 1, 2], [21, 22, 23]] = np.linspace(-1.0, 1.0, n)[:, None]
         Z[:, [0, 1, 2], [24, 25, 26]] = 1.0
-        Z[:, :, _LAG] = np.cross(h, (R @ _rate(turn, dt_s)[:, :, None])[:, :, 0])
+        Z[:, :, _LAG] = np.cross(h, (R @ _rates_at_rows(turn, dt_s)[:, :, None])[:, :, 0])
         Z[:, :, _RESIDUAL] = y - h
         G = self._gram(Z, h, reference, float(dt_s[1:].mean()), rows.averaged)
         own = G[_OWN, _OWN] + np.diag([0.0, 0.0, 0.0, LAG_S**-2])
@@ -187,7 +187,7 @@ class Scorer:
         return self._root
 
 
-def carried(turns: Array) -> Array:
+def accumulate_rotations(turns: Array) -> Array:
     """R_k = turns_0 ... turns_k, (n, 3, 3), in log2(n) passes."""
     out, step = turns, 1
     while step < len(out):
@@ -196,7 +196,7 @@ def carried(turns: Array) -> Array:
     return out
 
 
-def _rate(turn: Array, dt_s: Array) -> Array:
+def _rates_at_rows(turn: Array, dt_s: Array) -> Array:
     """Rate (n, 3) at the rows' instants, of the turns between them."""
     rate = turn[1:] / dt_s[1:, None]
     out = np.concatenate([rate[:1], rate])
@@ -204,7 +204,7 @@ def _rate(turn: Array, dt_s: Array) -> Array:
     return out
 
 
-def _soft(field_b: Array) -> Array:
+def _soft_iron_columns(field_b: Array) -> Array:
     """d(A h)/d entries of the symmetric A, (n, 3, 6)."""
     out = np.zeros((len(field_b), 3, 6))
     for column, (i, j) in enumerate(zip(*_ENTRIES, strict=True)):
@@ -215,16 +215,18 @@ def _soft(field_b: Array) -> Array:
 
 RATE_HZ = 12.5  # of the thinned samples: larger follows faster motion and costs more
 KEPT = 16  # blocks
-_MOST = 100.0  # gauss or rad/s: more than any of these sensors reads
+_LARGEST_READING = 100.0  # gauss or rad/s: more than any of these sensors reads
 _RATE_ROWS = 9  # from which a piece's rate is measured, whatever blocks they came in
 _WINDOWS = (1, 2, 4, 8)  # informative blocks that are tested together; 1: for the usual size only
-_LEAST_USUAL, _MOST_USUAL = 4, 24  # blocks that say what is usual
-_LIMIT = 40.0  # T over what is usual; in a simulated week 17, with coloured noise 27
-_SHARE = 0.7  # of what each block could gain by a D of its own
-_CLEAR = 4.0  # sigmas from which a component counts
-_INFORMATIVE = 0.005  # gauss (rad/s): a block whose best-known direction is worse says nothing
-_BELIEF = {"hard iron": 0.5, "gyro bias": 0.1}  # 1-sigma of a step before anything is known
-_LEAST = {"hard iron": 0.005, "gyro bias": 0.002}  # smaller ones are nobody's business
+_LEAST_BASELINE, _LONGEST_BASELINE = 4, 24  # blocks that say what is usual
+_LEAST_GAIN_RATIO = 40.0  # T over what is usual; in a simulated week 17, with coloured noise 27
+_LEAST_GAIN_SHARE = 0.7  # of what each block could gain by a D of its own
+_SIGNIFICANT_SIGMAS = 4.0  # sigmas from which a component counts
+_INFORMATIVE_SIGMA = (
+    0.005  # gauss (rad/s): a block whose best-known direction is worse says nothing
+)
+_PRIOR_SIGMA = {"hard iron": 0.5, "gyro bias": 0.1}  # 1-sigma of a step before anything is known
+_LEAST_STEP = {"hard iron": 0.005, "gyro bias": 0.002}  # smaller ones are nobody's business
 _COLUMNS = {"hard iron": IRON, "gyro bias": GYRO}
 _SHOWN = {"hard iron": (1e3, "mG"), "gyro bias": (1e3, "mrad/s")}
 _WHY = {
@@ -284,13 +286,13 @@ class StepDetector:
         """Forget everything: what follows has another iron, or another calibration."""
         self._estimate = self._reference = self.found = None
         self._blocks: deque[ScoredBlock] = deque(maxlen=KEPT)
-        self._single: deque[float] = deque(maxlen=_MOST_USUAL + max(_WINDOWS))
-        self._intake = _Intake()
+        self._single_gains: deque[float] = deque(maxlen=_LONGEST_BASELINE + max(_WINDOWS))
+        self._builder = _BlockBuilder()
 
     @property
     def armed(self) -> bool:
         """Whether a step would be told."""
-        return self.found is None and self._usual() is not None
+        return self.found is None and self._baseline_gain() is not None
 
     def add(self, block: SampleBlock, estimate: Estimate | None) -> Step | None:
         """Take samples; the step, where they show one."""
@@ -300,62 +302,71 @@ class StepDetector:
             self._estimate = estimate
             if np.isfinite(estimate.covariance).all():
                 self._reference = ReferenceCalibration.of(estimate)
-        for rows in self._intake.add(block):
-            step = None if self._reference is None else self._judge(rows, self._reference)
+        for rows in self._builder.add(block):
+            step = None if self._reference is None else self._test_block(rows, self._reference)
             if step is not None:
                 self.found = step
                 return step
         return None
 
-    def _judge(self, rows: Thinned, reference: ReferenceCalibration) -> Step | None:
+    def _test_block(self, rows: Thinned, reference: ReferenceCalibration) -> Step | None:
         block = self._scorer.score(rows, reference)
         self._blocks.append(block)
         self.scored += 1
-        if not _informative(block):
+        if not _is_informative(block):
             return None
-        told = [b for b in self._blocks if _informative(b)]
-        usual = self._usual()
+        informative = [b for b in self._blocks if _is_informative(b)]
+        baseline = self._baseline_gain()
         step = None
         for count in _WINDOWS:
-            if count > len(told):
+            if count > len(informative):
                 break
-            newest = told[-count:]
-            gains = _gains(newest)
+            newest = informative[-count:]
+            gains = _step_gains(newest)
             if count == 1:
-                self._single.append(max(gain for gain, _, _ in gains.values()) / 3.0)
-            elif step is None and usual is not None:
-                step = self._decide(newest, gains, usual)
+                self._single_gains.append(max(gain for gain, _, _ in gains.values()) / 3.0)
+            elif step is None and baseline is not None:
+                step = self._decide(newest, gains, baseline)
         return step
 
-    def _usual(self) -> float | None:
+    def _baseline_gain(self) -> float | None:
         """What a block without a step gains, 1 if all is as modelled; the newest do not count."""
-        known = list(self._single)
-        older = known[: -min(max(_WINDOWS), max(2, len(known) - _LEAST_USUAL))]
-        return None if len(older) < _LEAST_USUAL else max(1.0, float(np.mean(older)))
+        known = list(self._single_gains)
+        older = known[: -min(max(_WINDOWS), max(2, len(known) - _LEAST_BASELINE))]
+        return None if len(older) < _LEAST_BASELINE else max(1.0, float(np.mean(older)))
 
     def _decide(
-        self, newest: list[ScoredBlock], gains: dict[str, tuple[float, Array, Array]], usual: float
+        self,
+        newest: list[ScoredBlock],
+        gains: dict[str, tuple[float, Array, Array]],
+        baseline: float,
     ) -> Step | None:
         what = max(gains, key=lambda name: gains[name][0])
         gain, size, information = gains[what]
-        if gain < _LIMIT * usual or _clear_size(size, information) < _LEAST[what]:
+        if (
+            gain < _LEAST_GAIN_RATIO * baseline
+            or _significant_size(size, information) < _LEAST_STEP[what]
+        ):
             return None
         if gain < sum(_drift_gain(block, newest[0].reference) for block in newest):
             return None
-        if any(_share(block, newest[0].reference, what, size) < _SHARE for block in newest):
+        if any(
+            _gain_share(block, newest[0].reference, what, size) < _LEAST_GAIN_SHARE
+            for block in newest
+        ):
             return None
         at_s = float(newest[0].time_s[0])
         if what == "hard iron":
             # it may have come within the first block: then only the others have all of it
-            _, late, of_late = _gains(newest[1:], newest[0].reference)[what]
-            explained = [float(np.max(_onset_gains(newest[0], D))) for D in (size, late)]
-            at_s = self._when(newest[0], late if explained[1] > explained[0] else size)
+            _, later_size, later_information = _step_gains(newest[1:], newest[0].reference)[what]
+            explained = [float(np.max(_onset_gains(newest[0], D))) for D in (size, later_size)]
+            at_s = self._onset_time(newest[0], later_size if explained[1] > explained[0] else size)
             if at_s > newest[0].time_s[0]:
-                size, information = late, of_late
-        sigma = np.sqrt(usual * np.diag(np.linalg.inv(information)))
+                size, information = later_size, later_information
+        sigma = np.sqrt(baseline * np.diag(np.linalg.inv(information)))
         return Step(what, at_s, float(newest[-1].time_s[-1]), size, sigma, len(newest))
 
-    def _when(self, first: ScoredBlock, size: Array) -> float:
+    def _onset_time(self, first: ScoredBlock, size: Array) -> float:
         """The time from which on the step explains most, from the first block backwards.
 
         While the vehicle stands only the jump itself shows.
@@ -372,7 +383,7 @@ class StepDetector:
         return at_s
 
 
-class _Intake:
+class _BlockBuilder:
     """Samples to thinned blocks; a gap, a clock that falls or a change of registers ends one."""
 
     def __init__(self) -> None:
@@ -383,7 +394,7 @@ class _Intake:
     def add(self, block: SampleBlock) -> list[Thinned]:
         if len(block) == 0:
             return []
-        out = self._close() if self._breaks(block) else []
+        out = self._close() if self._is_break(block) else []
         self._waiting.append(block)
         self._count += len(block)
         if not self._averaged and self._count >= _RATE_ROWS:
@@ -391,10 +402,10 @@ class _Intake:
             usual_s = max(1e-4, float(np.median(np.diff(first))))
             self._averaged = max(1, round(1.0 / (usual_s * RATE_HZ)))
         while self._averaged and self._count >= ROWS * self._averaged:
-            out += self._cut(ROWS)
+            out += self._take_rows(ROWS)
         return out
 
-    def _breaks(self, block: SampleBlock) -> bool:
+    def _is_break(self, block: SampleBlock) -> bool:
         if not self._waiting:
             return False
         last = self._waiting[-1]
@@ -402,11 +413,11 @@ class _Intake:
 
     def _close(self) -> list[Thinned]:
         rows = self._count // self._averaged if self._averaged else 0
-        out = self._cut(rows) if rows >= LEAST_ROWS else []
+        out = self._take_rows(rows) if rows >= LEAST_ROWS else []
         self._waiting, self._count, self._averaged = [], 0, 0
         return out
 
-    def _cut(self, rows: int) -> list[Thinned]:
+    def _take_rows(self, rows: int) -> list[Thinned]:
         """The first `rows` thinned rows; none where a number is not one that a sensor reads."""
         m, used = self._averaged, rows * self._averaged
         time_s = np.concatenate([b.time_s for b in self._waiting])
@@ -415,10 +426,10 @@ class _Intake:
         )
         last = self._waiting[-1]
         left = len(time_s) - used
-        self._waiting = [_tail(last, left)] if left else []
+        self._waiting = [_last_rows(last, left)] if left else []
         self._count = left
         dt_s = np.diff(time_s[:used], prepend=time_s[:1])
-        if not ((np.abs(table) < _MOST).all() and (dt_s[1:] > 0).all()):
+        if not ((np.abs(table) < _LARGEST_READING).all() and (dt_s[1:] > 0).all()):
             return []
         table = table[:used]
         angle = np.cumsum(table[:, 3:] * dt_s[:, None], axis=0)
@@ -427,7 +438,7 @@ class _Intake:
         return [Thinned(mean[:, 0], mean[:, 1:4], mean[:, 4:], m)]
 
 
-def _tail(block: SampleBlock, rows: int) -> SampleBlock:
+def _last_rows(block: SampleBlock, rows: int) -> SampleBlock:
     return replace(
         block,
         time_s=block.time_s[-rows:],
@@ -438,64 +449,71 @@ def _tail(block: SampleBlock, rows: int) -> SampleBlock:
     )
 
 
-def _informative(block: ScoredBlock) -> bool:
+def _is_informative(block: ScoredBlock) -> bool:
     """Whether the block alone knows the hard iron in some direction."""
-    return bool(np.linalg.eigvalsh(block.information[IRON, IRON])[-1] > _INFORMATIVE**-2)
+    return bool(np.linalg.eigvalsh(block.information[IRON, IRON])[-1] > _INFORMATIVE_SIGMA**-2)
 
 
-def _believed(blocks: list[ScoredBlock], reference: ReferenceCalibration) -> tuple[Array, Array]:
+def _gradient_given_reference(
+    blocks: list[ScoredBlock], reference: ReferenceCalibration
+) -> tuple[Array, Array]:
     """Information (21, 21) and score (21,) of what departs from it, less its own error."""
-    known = slice(0, _KNOWN)
-    total = sum((b.information[known, known] for b in blocks), np.zeros((_KNOWN, _KNOWN)))
-    score = np.zeros(_KNOWN)
+    known = slice(0, _CALIBRATION_COLUMNS)
+    total = sum(
+        (b.information[known, known] for b in blocks),
+        np.zeros((_CALIBRATION_COLUMNS, _CALIBRATION_COLUMNS)),
+    )
+    score = np.zeros(_CALIBRATION_COLUMNS)
     for b in blocks:
         moved = b.reference.theta - reference.theta
         score += b.score[known] + b.information[known, known] @ moved
     K = total @ reference.root
-    inner = np.eye(_KNOWN) + reference.root.T @ K
+    inner = np.eye(_CALIBRATION_COLUMNS) + reference.root.T @ K
     solved = np.linalg.solve(inner, np.column_stack([K.T, reference.root.T @ score]))
-    return total - K @ solved[:, known], score - K @ solved[:, _KNOWN]
+    return total - K @ solved[:, known], score - K @ solved[:, _CALIBRATION_COLUMNS]
 
 
-def _gains(
+def _step_gains(
     blocks: list[ScoredBlock], reference: ReferenceCalibration | None = None
 ) -> dict[str, tuple[float, Array, Array]]:
     """By what steps: T, the step (3,), its information (3, 3), against the first's reference."""
-    information, score = _believed(blocks, reference or blocks[0].reference)
-    return {what: _gain(information, score, what) for what in _COLUMNS}
+    information, score = _gradient_given_reference(blocks, reference or blocks[0].reference)
+    return {what: _step_gain(information, score, what) for what in _COLUMNS}
 
 
-def _gain(information: Array, score: Array, what: str) -> tuple[float, Array, Array]:
+def _step_gain(information: Array, score: Array, what: str) -> tuple[float, Array, Array]:
     columns = _COLUMNS[what]
-    J = information[columns, columns] + np.eye(3) / _BELIEF[what] ** 2
+    J = information[columns, columns] + np.eye(3) / _PRIOR_SIGMA[what] ** 2
     size = np.asarray(np.linalg.solve(J, score[columns]), float)
     return float(score[columns] @ size), size, J
 
 
-def _share(block: ScoredBlock, reference: ReferenceCalibration, what: str, size: Array) -> float:
+def _gain_share(
+    block: ScoredBlock, reference: ReferenceCalibration, what: str, size: Array
+) -> float:
     """Of the gain that a step of its own gives the block, what this step gives."""
-    information, score = _believed([block], reference)
-    most, _, J = _gain(information, score, what)
+    information, score = _gradient_given_reference([block], reference)
+    most, _, J = _step_gain(information, score, what)
     return float(2 * size @ score[_COLUMNS[what]] - size @ J @ size) / max(most, 1e-12)
 
 
 def _drift_gain(block: ScoredBlock, reference: ReferenceCalibration) -> float:
     """T of a field that changes in the world during the block."""
-    known = slice(0, _KNOWN)
+    known = slice(0, _CALIBRATION_COLUMNS)
     score = block.score + block.information[:, known] @ (block.reference.theta - reference.theta)
     G, K = block.information, block.information[:, known] @ reference.root
-    inner = np.eye(_KNOWN) + reference.root.T @ K[known]
+    inner = np.eye(_CALIBRATION_COLUMNS) + reference.root.T @ K[known]
     solved = np.linalg.solve(inner, np.column_stack([K.T, reference.root.T @ score[known]]))
     J = (G - K @ solved[:, : len(G)])[DRIFT, DRIFT] + np.eye(3) * 1e-6
     s = (score - K @ solved[:, len(G)])[DRIFT]
     return float(s @ np.linalg.solve(J, s))
 
 
-def _clear_size(size: Array, information: Array) -> float:
+def _significant_size(size: Array, information: Array) -> float:
     """Length of the step along the directions in which it is clear."""
     values, vectors = np.linalg.eigh(information)
     along = vectors.T @ size
-    return float(np.linalg.norm(along[np.abs(along) * np.sqrt(values) > _CLEAR]))
+    return float(np.linalg.norm(along[np.abs(along) * np.sqrt(values) > _SIGNIFICANT_SIGMAS]))
 
 
 def _onset_gains(block: ScoredBlock, size: Array) -> Array:

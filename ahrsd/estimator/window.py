@@ -39,15 +39,15 @@ from ahrsd.estimator.epoch import (
     reusable_locked,
 )
 from ahrsd.estimator.epoch_data import (
-    corrected,
-    delayed,
     group_size,
-    grouped,
-    joined,
-    rates,
-    spread,
-    thinned,
-    turned,
+    group_steps,
+    has_motion,
+    join_epochs,
+    principal_deviation,
+    row_rates,
+    thin_rows,
+    with_gyro_matrix,
+    with_lag,
 )
 from ahrsd.estimator.graph import (
     UNDETERMINED_RATIO,
@@ -142,14 +142,14 @@ class Window:
         size = float(np.cbrt(np.linalg.det(chain.symmetric(self.graph.c[:6]))))
         guesses = [noise.first_guess(data, self.parameters) for data in new]
         bias = self.graph.nodes[self.graph.last].bias
-        moving = [turned(data, bias) for data in new]
+        moving = [has_motion(data, bias) for data in new]
         for data, moves in zip(new, moving, strict=True):
             if moves:
                 self.graph.moments.add(data.field_b_gauss)
         self._guesses.extend(guesses)
-        self._guess = noise.median(self._guesses)
+        self._guess = noise.median_noise(self._guesses)
         sizes = [group_size(d, guess, size) for d, guess in zip(new, guesses, strict=True)]
-        coarse = grouped(new, sizes)
+        coarse = group_steps(new, sizes)
         coarse = [self._apply_correction(data) for data in coarse]
         self._waiting += zip(coarse, moving, strict=True)
         return sum(moving)
@@ -160,8 +160,8 @@ class Window:
     def _apply_correction(self, data: chain.EpochData) -> chain.EpochData:
         """Correct an epoch as measured."""
         if not np.array_equal(self.correction.gyro, np.eye(3)):
-            data = corrected(data, self.correction.gyro, 0.0)
-        return data if self.correction.lag_s == 0.0 else delayed(data, self.correction.lag_s)
+            data = with_gyro_matrix(data, self.correction.gyro, 0.0)
+        return data if self.correction.lag_s == 0.0 else with_lag(data, self.correction.lag_s)
 
     @property
     def data(self) -> list[chain.EpochData]:
@@ -282,7 +282,7 @@ class Window:
             return []
         z = Stack([e.factor for e in epochs], graph.c, graph.nodes).z
         return [
-            chain.move(e.u, e.quadratic, chain_step(own, calibrates=e.has_motion))
+            chain.move_directions(e.u, e.quadratic, chain_step(own, calibrates=e.has_motion))
             for e, own in zip(epochs, z, strict=True)
         ]
 
@@ -290,13 +290,15 @@ class Window:
         """Linearise epochs at the present values, with new noise levels and outlier weights."""
         epochs, p = [self.epochs[k] for k in which], self.parameters
         places = [
-            LinearisationPlan(e.piece, u, noise.shrunk(e.residuals, self.usual, p))
+            LinearisationPlan(e.piece, u, noise.shrink_noise(e.residuals, self.usual, p))
             for e, u in zip(epochs, self._moved_directions(which), strict=True)
         ]
         self._replace(which, places, outlier_sigma=p.outlier_sigma)
         found = [e.residuals for e in self.epochs]
-        found_noise = noise.pooled(found, self._guess, self.parameters, self._fitted_gyro_freedom())
-        self.usual = noise.at_least(found_noise, _GYRO_LEAST * self._guess.gyro_rad_s)
+        found_noise = noise.pool_noise(
+            found, self._guess, self.parameters, self._fitted_gyro_freedom()
+        )
+        self.usual = noise.with_gyro_floor(found_noise, _GYRO_LEAST * self._guess.gyro_rad_s)
 
     def _fitted_gyro_freedom(self) -> float:
         """Degrees of freedom of the gyro's residuals that its matrix and its walking bias used."""
@@ -332,15 +334,15 @@ class Window:
         walk = self._bias_walk()
         places = []
         for epoch, u in zip(self.epochs, self._moved_directions(everyone), strict=True):
-            back = so3.exp(-more_lag_s * rates(epoch.data))
+            back = so3.exp(-more_lag_s * row_rates(epoch.data))
             u = (back @ u[:, :, None])[:, :, 0]
             if epoch.a == graph.first:
                 graph.rotate_first(back[0])
             elif epoch.data.measures_first:
                 graph.nodes[epoch.a] = Node.at(graph.nodes[epoch.a].bias, u[0])
             graph.nodes[epoch.a + 1] = Node.at(graph.nodes[epoch.a + 1].bias, u[-1])
-            data = epoch.data if lag_only else corrected(epoch.data, gyro, lag_s)
-            data = delayed(data, more_lag_s) if more_lag_s != 0.0 else data
+            data = epoch.data if lag_only else with_gyro_matrix(epoch.data, gyro, lag_s)
+            data = with_lag(data, more_lag_s) if more_lag_s != 0.0 else data
             information = 1.0 / (walk**2 * float(np.sum(data.dt_s[1:])))
             piece = replace(epoch.piece, data=data, walk=information)
             used = epoch.used if lag_only else self.usual
@@ -632,7 +634,7 @@ class Window:
     def covariance(self) -> Array:
         """Covariance (12, 12) of c and the newest gyro bias, including all misfit.
 
-        Disagreement among epochs is taken not to average out (`noise.unaveraged`).
+        Disagreement among epochs is taken not to average out (`noise.covariance_with_common_errors`).
 
         Errors that repeat with the attitude are taken to be smooth in it, like the gradient of a
         room. The weights inside the estimate do not assume this, which follows the data more
@@ -647,7 +649,7 @@ class Window:
             folded_information = np.linalg.inv(untempered) - epochs.sum(axis=0)
             folded_information[:9, :9] -= graph.temper * graph.anchor[1]
             folded = folded_information, self.misfit.epochs
-        return noise.unaveraged(
+        return noise.covariance_with_common_errors(
             untempered * graph.temper,
             epochs,
             misfit=self._excess_misfit,
@@ -818,7 +820,9 @@ def search(
     present, information = graph.anchor
     belief = np.asarray(np.linalg.inv(information), dtype=np.float64)
     chosen = sorted(
-        sorted(range(len(data)), key=lambda k: -spread(data[k].field_b_gauss))[:_SEARCH_EPOCHS]
+        sorted(range(len(data)), key=lambda k: -principal_deviation(data[k].field_b_gauss))[
+            :_SEARCH_EPOCHS
+        ]
     )
     first = Node.at(present_bias, np.array([1.0, 0.0, 0.0]))
     thin = Window(parameters, present, belief, first, window.usual)
@@ -827,7 +831,8 @@ def search(
     if window.search_residual_ratio > 1.0:
         thin.graph.hold = graph.hold
     thin.attach(
-        [joined([thinned(data[k], max(1, len(data[k]) // _SEARCH_ROWS)) for k in chosen])], [True]
+        [join_epochs([thin_rows(data[k], max(1, len(data[k]) // _SEARCH_ROWS)) for k in chosen])],
+        [True],
     )
     whole = [data[k] for k in chosen]
     fields = np.vstack([d.field_b_gauss for d in whole])
@@ -895,7 +900,7 @@ def _continue_descents(
             out[k] = _continue_descent(thin, one)
         elif not arrived and not one.mirrored:
             mirrored = _descend(
-                thin, chain.mirrored(one.c, fields), bias, best, independent=one.independent
+                thin, chain.mirror_hard_iron(one.c, fields), bias, best, independent=one.independent
             )
             out[k] = replace(one, independent=False, mirrored=True)  # it ended there
             out.append(replace(mirrored, mirrored=True))

@@ -10,7 +10,7 @@ Sources: [R] 2.1-2.4 and 4.4, [L]; docs/guide/evaluate.md has the definitions.
 from ahrsd.calibration_json import StoredCalibration, parse_calibration, parse_calibrations
 from ahrsd.evaluation.heading import Fixes, HeadingReference
 from ahrsd.evaluation.judging import Evaluation, judge
-from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, tracked
+from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, build_track
 
 __all__ = [
     "Evaluation",
@@ -19,8 +19,8 @@ __all__ = [
     "Fixes",
     "HeadingReference",
     "StoredCalibration",
+    "build_track",
     "judge",
     "parse_calibration",
     "parse_calibrations",
-    "tracked",
 ]

@@ -35,7 +35,7 @@ _UNBROKEN = 1.6  # times the usual distance of fixes; more is a gap that is not 
 _LEAST_FIXES = 10
 _LEAST_FORCE_M_S2 = 1.0  # of the mean in the world, below which it is no gravity
 _LEAST_INSTANTS = 10
-_OPINION = "its own filter's opinion, not the truth"
+_DEVICE_DETAIL = "its own filter's opinion, not the truth"
 QUATERNION = ("ref_qw", "ref_qx", "ref_qy", "ref_qz")
 POSITION = ("position_north_m", "position_east_m")
 
@@ -117,7 +117,7 @@ def fixes_of_track(track: EvaluationTrack) -> Fixes | None:
     return Fixes(time_s[first], north, east, "position")
 
 
-def course(fixes: Fixes, least_speed_m_s: float) -> HeadingReference:
+def course_reference(fixes: Fixes, least_speed_m_s: float) -> HeadingReference:
     """Course over ground where it is faster than that.  EvaluationError where it hardly ever is."""
     time_s, velocity, half_width_s = fixes.velocity()
     fast = np.abs(velocity) > least_speed_m_s
@@ -133,7 +133,7 @@ def course(fixes: Fixes, least_speed_m_s: float) -> HeadingReference:
     )
 
 
-def optical(track: EvaluationTrack) -> HeadingReference | None:
+def optical_reference(track: EvaluationTrack) -> HeadingReference | None:
     """The attitude columns ref_q*, sensor to world, scalar first; None without.
 
     Which way is up in that world is measured: the mean specific force, or its z axis without one.
@@ -169,11 +169,11 @@ def device_heading(track: EvaluationTrack) -> HeadingReference | None:
         return None
     known = np.isfinite(attitude[0])
     return HeadingReference(
-        "the device's yaw", False, track.time_s[known], attitude[0][known], detail=_OPINION
+        "the device's yaw", False, track.time_s[known], attitude[0][known], detail=_DEVICE_DETAIL
     )
 
 
-def column(track: EvaluationTrack, name: str) -> HeadingReference:
+def column_reference(track: EvaluationTrack, name: str) -> HeadingReference:
     """A heading column in deg or rad, by its name's end.  EvaluationError where there is none."""
     if name not in track.covariates:
         others = ", ".join(sorted(track.covariates)) or "none"
@@ -185,7 +185,7 @@ def column(track: EvaluationTrack, name: str) -> HeadingReference:
     if np.count_nonzero(known) < _LEAST_INSTANTS:
         raise EvaluationError(f"column {name} holds {np.count_nonzero(known)} numbers only")
     device = name in ("vn_yaw_deg", "yaw_rad")
-    detail = _OPINION if device else ""
+    detail = _DEVICE_DETAIL if device else ""
     return HeadingReference(
         f"column {name}", not device, track.time_s[known], values[known], detail=detail
     )
@@ -196,7 +196,7 @@ def column(track: EvaluationTrack, name: str) -> HeadingReference:
 
 FOLDS = 5
 _LEVEL_ENOUGH = 0.3  # horizontal part of the x axis below which there is no heading
-_LEAST = 10
+_LEAST_OVERLAP = 10
 _BLOCK_S, _LEAST_BLOCKS = 20.0, 5  # errors further apart are taken to be independent
 _DRAWS = 2000
 
@@ -221,7 +221,7 @@ class HeadingFigures:
     error_deg: Array
 
 
-def compare(
+def heading_figures(
     time_s: Array,
     field_b: Array,
     up_b: Array,
@@ -239,11 +239,11 @@ def compare(
         if reference.up_b is None:  # else the error is that of the field's azimuth, whatever x does
             level = np.linalg.norm(up_b[:, 1:], axis=1) / np.linalg.norm(up_b, axis=1)
             usable &= level > _LEVEL_ENOUGH
-    found, seen = _mean_at(time_s[usable], heading[usable], reference)
-    if np.count_nonzero(seen) < _LEAST:
+    found, seen = _mean_heading_at(time_s[usable], heading[usable], reference)
+    if np.count_nonzero(seen) < _LEAST_OVERLAP:
         raise EvaluationError(
-            f"{reference.name}: {np.count_nonzero(seen)} instants within the recording, {_LEAST} "
-            "are needed; are both on the same clock?"
+            f"{reference.name}: {np.count_nonzero(seen)} instants within the recording, "
+            f"{_LEAST_OVERLAP} are needed; are both on the same clock?"
         )
     raw = found[seen] - reference.heading_rad[seen]
     offset = float(np.angle(np.mean(np.exp(1j * raw))))
@@ -281,7 +281,7 @@ def rms_difference(one: HeadingFigures, other: HeadingFigures) -> tuple[float, f
     return float(low), float(high)
 
 
-def _mean_at(
+def _mean_heading_at(
     time_s: Array, heading_rad: Array, reference: HeadingReference
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Circular mean heading (M,) around each instant, and which of them have samples there."""
@@ -351,7 +351,7 @@ def velocity_of(track: EvaluationTrack, fixes: Fixes) -> Velocity:
     return Velocity(f"speed of {fixes.source}", None, speed)
 
 
-def within(track: EvaluationTrack, fixes: Fixes) -> Fixes | None:
+def fixes_within(track: EvaluationTrack, fixes: Fixes) -> Fixes | None:
     """The fixes during the recording, from the first one; None where they are too few."""
     inside = (fixes.time_s >= track.time_s[0]) & (fixes.time_s <= track.time_s[-1])
     if np.count_nonzero(inside) < _LEAST_FIXES:
@@ -360,7 +360,7 @@ def within(track: EvaluationTrack, fixes: Fixes) -> Fixes | None:
     return Fixes(fixes.time_s[inside], north - north[0], east - east[0], fixes.source)
 
 
-def distance_m(track: EvaluationTrack, velocity: Velocity, fixes: Fixes) -> float | None:
+def distance_travelled(track: EvaluationTrack, velocity: Velocity, fixes: Fixes) -> float | None:
     """Way travelled between the first and the last fix; None where it is next to nothing."""
     speed = velocity.speed_m_s
     if velocity.v_b_m_s is not None:
@@ -371,7 +371,7 @@ def distance_m(track: EvaluationTrack, velocity: Velocity, fixes: Fixes) -> floa
     return way if way >= _LEAST_M else None
 
 
-def reckon(
+def reckoning_figures(
     track: EvaluationTrack,
     field_b: Array,
     up_b: Array,

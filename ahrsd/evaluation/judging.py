@@ -20,12 +20,12 @@ from ahrsd.evaluation.heading import (
     HeadingFigures,
     HeadingReference,
     ReckoningFigures,
-    compare,
-    distance_m,
-    reckon,
+    distance_travelled,
+    fixes_within,
+    heading_figures,
+    reckoning_figures,
     rms_difference,
     velocity_of,
-    within,
 )
 from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, Tilt, up_directions
 from ahrsd.printable import counted
@@ -121,7 +121,7 @@ class Evaluation:
     @property
     def held_out(self) -> bool:
         """Whether the calibration was made from another recording, by its name."""
-        return _stem(self.recording) != _stem(self.calibration.recording)
+        return _recording_stem(self.recording) != _recording_stem(self.calibration.recording)
 
     @property
     def better(self) -> bool:
@@ -150,23 +150,27 @@ def judge(
     references: in order of belief; one that the recording hardly overlaps ends in a warning.
     Raises EvaluationError where a tilt was asked for that the recording does not have.
     """
-    said: list[str] = list(calibration.remarks)
+    warnings: list[str] = list(calibration.remarks)
     after_b = calibration.correction.apply(track.raw_b_gauss)
     fields = Pair(track.before_b_gauss, after_b)
     total = None if world is None else world.total_gauss
-    field = _both(fields, lambda b: field_figures(b, total))
-    up_b, up_source = _up(track, tilt_source, references, said)
+    field = _before_and_after(fields, lambda b: field_figures(b, total))
+    up_b, up_source = _choose_up(track, tilt_source, references, warnings)
     declination = 0.0 if world is None else world.declination_rad
     headings = []
     for reference in references:
         up = up_b if reference.up_b is None else reference.up_b
         if up is None:
             continue
-        look = partial(compare, track.time_s, up_b=up, reference=reference)
+        compare_with_reference = partial(
+            heading_figures, track.time_s, up_b=up, reference=reference
+        )
         try:
-            figures = _both(fields, partial(look, declination_rad=declination))
+            figures = _before_and_after(
+                fields, partial(compare_with_reference, declination_rad=declination)
+            )
         except EvaluationError as error:
-            said.append(str(error))
+            warnings.append(str(error))
             continue
         source = up_source if reference.up_b is None else "reference"
         headings.append(
@@ -174,22 +178,22 @@ def judge(
         )
     reckoned = None
     if fixes is not None and up_b is not None:
-        reckoned = _reckoned(track, fields, up_b, fixes, said)
+        reckoned = _dead_reckoning(track, fields, up_b, fixes, warnings)
     found = Evaluation(
-        recording, calibration, track, field, tuple(headings), reckoned, world, tuple(said)
+        recording, calibration, track, field, tuple(headings), reckoned, world, tuple(warnings)
     )
     return _with_caveats(found)
 
 
-def _both(fields: Pair[Array], figures: Callable[[Array], T]) -> Pair[T]:
+def _before_and_after(fields: Pair[Array], figures: Callable[[Array], T]) -> Pair[T]:
     return Pair(figures(fields.before), figures(fields.after))
 
 
-def _up(
+def _choose_up(
     track: EvaluationTrack,
     source: Tilt,
     references: Sequence[HeadingReference],
-    said: list[str],
+    warnings: list[str],
 ) -> tuple[Array | None, str]:
     try:
         up_b, found = up_directions(track, source)
@@ -197,56 +201,58 @@ def _up(
         if source != "auto":
             raise
         if any(reference.up_b is None for reference in references) or not references:
-            said.append(f"no heading of its own: {error}")
+            warnings.append(f"no heading of its own: {error}")
         return None, ""
     if found == "device" and source == "auto":
-        said.append("no acceleration in the recording: roll and pitch are the device's own")
+        warnings.append("no acceleration in the recording: roll and pitch are the device's own")
     return up_b, found
 
 
-def _reckoned(
-    track: EvaluationTrack, fields: Pair[Array], up_b: Array, fixes: Fixes, said: list[str]
+def _dead_reckoning(
+    track: EvaluationTrack, fields: Pair[Array], up_b: Array, fixes: Fixes, warnings: list[str]
 ) -> Reckoned | None:
-    inside = within(track, fixes)
+    inside = fixes_within(track, fixes)
     if inside is None:
-        said.append(f"{fixes.source}: too few fixes within the recording for dead reckoning")
+        warnings.append(f"{fixes.source}: too few fixes within the recording for dead reckoning")
         return None
     velocity = velocity_of(track, fixes)
-    way_m = distance_m(track, velocity, inside)
+    way_m = distance_travelled(track, velocity, inside)
     if way_m is None:
-        said.append("hardly any way was travelled: no dead reckoning")
+        warnings.append("hardly any way was travelled: no dead reckoning")
         return None
     gaps = track.time_s[list(track.starts[1:])] - track.time_s[[k - 1 for k in track.starts[1:]]]
     if np.any(gaps > _LONG_GAP_S):
-        said.append(
+        warnings.append(
             f"in the dead reckoning, as straight lines: "
             f"{counted(int(np.count_nonzero(gaps > _LONG_GAP_S)), 'gap')} of more than "
             f"{_LONG_GAP_S:g} s"
         )
-    figures = _both(fields, lambda b: reckon(track, b, up_b, velocity, inside, way_m))
+    figures = _before_and_after(
+        fields, lambda b: reckoning_figures(track, b, up_b, velocity, inside, way_m)
+    )
     return Reckoned(velocity.source, fixes.source, way_m, inside, figures)
 
 
 def _with_caveats(found: Evaluation) -> Evaluation:
-    said = list(found.warnings)
+    warnings = list(found.warnings)
     if not found.held_out:
-        said.append(
+        warnings.append(
             f"by its name the calibration was made from this very recording ({found.recording}): "
             "its figures are not held out and flatter it"
         )
     if found.world is None:
-        said.append(
+        warnings.append(
             "position and date are not both known (--position, --date): |H| is the mean of the "
             "corrected field, and the declination is part of the constant that is removed"
         )
     if not found.headings:
-        said.append("there is no heading to compare with: only the field is judged")
+        warnings.append("there is no heading to compare with: only the field is judged")
     elif not any(judged.truth for judged in found.headings):
-        said.append("the only heading to compare with is the device's own, which is no truth")
-    return replace(found, warnings=tuple(dict.fromkeys(said)))
+        warnings.append("the only heading to compare with is the device's own, which is no truth")
+    return replace(found, warnings=tuple(dict.fromkeys(warnings)))
 
 
-def _stem(name: str) -> str:
+def _recording_stem(name: str) -> str:
     """A recording's name without what says how it is stored."""
     return name.split(".", 1)[0]
 
@@ -356,24 +362,24 @@ def evaluation_lines(found: Evaluation) -> list[str]:
         lines += [
             f"heading against {judged.reference}: {len(after.error_deg)} instants; "
             + "; ".join(text for text in (judged.detail, f"tilt: {judged.tilt}") if text),
-            _line("RMS error [deg]", before.rms_deg, after.rms_deg),
-            _line("worst error [deg]", before.worst_deg, after.worst_deg),
-            _line("RMS per fifth of the time: least [deg]", *_ends(before, after, min)),
-            _line("RMS per fifth of the time: most [deg]", *_ends(before, after, max)),
-            _line("constant removed [deg]", before.offset_deg, after.offset_deg),
+            _two_columns("RMS error [deg]", before.rms_deg, after.rms_deg),
+            _two_columns("worst error [deg]", before.worst_deg, after.worst_deg),
+            _two_columns("RMS per fifth of the time: least [deg]", *_ends(before, after, min)),
+            _two_columns("RMS per fifth of the time: most [deg]", *_ends(before, after, max)),
+            _two_columns("constant removed [deg]", before.offset_deg, after.offset_deg),
         ]
     about = "its own mean" if found.world is None else f"{found.world.model}"
     one, other = found.field.before, found.field.after
     lines += [
         "field, held out" if found.held_out else "field",
-        _line("spread, std over mean [%]", 100 * one.spread, 100 * other.spread),
-        _line("mean [mG]", 1e3 * one.mean_gauss, 1e3 * other.mean_gauss),
-        _line(
+        _two_columns("spread, std over mean [%]", 100 * one.spread, 100 * other.spread),
+        _two_columns("mean [mG]", 1e3 * one.mean_gauss, 1e3 * other.mean_gauss),
+        _two_columns(
             f"constraint error about {about}, RMS [mG]",
             1e3 * one.constraint_rms_gauss,
             1e3 * other.constraint_rms_gauss,
         ),
-        _line(
+        _two_columns(
             "constraint error, worst [mG]",
             1e3 * one.constraint_worst_gauss,
             1e3 * other.constraint_worst_gauss,
@@ -399,12 +405,12 @@ def comparison_lines(found: Sequence[Evaluation], without: Mapping[str, str]) ->
     lines += [
         f"{'method':20}{'heading [deg]':>14}{'worst [deg]':>13}{'XY error [%]':>14}"
         f"{'spread [%]':>12}  heading RMS less that of {first.calibration.method}, 95 %",
-        _row("(before)", *_figures(first, "before")),
+        _row("(before)", *_comparison_figures(first, "before")),
     ]
-    by_heading = sorted(found, key=lambda one: _figures(one, "after")[0])
+    by_heading = sorted(found, key=lambda one: _comparison_figures(one, "after")[0])
     for one in by_heading if first.headings else found:
-        row = _row(one.calibration.method, *_figures(one, "after"))
-        apart = _apart(one, first)
+        row = _row(one.calibration.method, *_comparison_figures(one, "after"))
+        apart = _rms_interval(one, first)
         between = "" if apart is None else f"  {apart[0]:+.2f} to {apart[1]:+.2f}"
         lines.append(row + between + ("" if one.calibration.converged else "  not converged"))
     lines += [f"{name:20}no answer: {why}" for name, why in without.items()]
@@ -419,20 +425,20 @@ def comparison_json(found: Sequence[Evaluation], without: Mapping[str, str]) -> 
         "recording": found[0].recording,
         "evaluations": [evaluation_json(one) for one in found],
         "heading_rms_difference_deg": {
-            one.calibration.method: _apart(one, found[0]) for one in found[1:]
+            one.calibration.method: _rms_interval(one, found[0]) for one in found[1:]
         },
         "without": dict(without),
     }
 
 
-def _apart(one: Evaluation, first: Evaluation) -> tuple[float, float] | None:
+def _rms_interval(one: Evaluation, first: Evaluation) -> tuple[float, float] | None:
     """95 % interval of how much larger its heading RMS is than that of the first, deg."""
     if one is first or not first.headings:
         return None
     return rms_difference(one.headings[0].figures.after, first.headings[0].figures.after)
 
 
-def _figures(found: Evaluation, which: Literal["before", "after"]) -> tuple[float, ...]:
+def _comparison_figures(found: Evaluation, which: Literal["before", "after"]) -> tuple[float, ...]:
     """Heading RMS and worst (deg), dead reckoning (%), spread (%); NaN where there is none."""
     nan = float("nan")
     heading = getattr(found.headings[0].figures, which) if found.headings else None
@@ -456,9 +462,11 @@ def _reckoned_lines(reckoned: Reckoned) -> list[str]:
     return [
         f"dead reckoning by {reckoned.velocity} over {reckoned.distance_m:.0f} m, "
         f"against {reckoned.reference}",
-        _line("XY error, RMS [% of distance]", before.rms_percent, after.rms_percent),
-        _line("XY error at the end [% of distance]", before.final_percent, after.final_percent),
-        _line("XY error, worst [m]", before.worst_m, after.worst_m),
+        _two_columns("XY error, RMS [% of distance]", before.rms_percent, after.rms_percent),
+        _two_columns(
+            "XY error at the end [% of distance]", before.final_percent, after.final_percent
+        ),
+        _two_columns("XY error, worst [m]", before.worst_m, after.worst_m),
     ]
 
 
@@ -468,5 +476,5 @@ def _ends(
     return which(before.fold_rms_deg), which(after.fold_rms_deg)
 
 
-def _line(label: str, before: float, after: float) -> str:
+def _two_columns(label: str, before: float, after: float) -> str:
     return f"  {label:42}{before:10.2f}{after:10.2f}"

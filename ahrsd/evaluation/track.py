@@ -68,7 +68,7 @@ class EvaluationTrack:
         return None
 
 
-def tracked(pieces: Sequence[tuple[SampleBlock, Affine]]) -> EvaluationTrack:
+def build_track(pieces: Sequence[tuple[SampleBlock, Affine]]) -> EvaluationTrack:
     """Blocks in order, each with the correction of its time.  EvaluationError if too few."""
     kept = [(block, present) for block, present in pieces if len(block)]
     blocks = [block for block, _ in kept]
@@ -119,13 +119,13 @@ def up_directions(track: EvaluationTrack, tilt: Tilt) -> tuple[Array, str]:
     if tilt == "auto":
         tilt = "gravity" if track.has_accel else "device"
     if tilt == "device":
-        return _of_device(track), tilt
+        return _device_up(track), tilt
     if not track.has_accel:
         raise EvaluationError(f"--tilt {tilt}: not every sample has an acceleration; try device")
-    return (_gravity(track) if tilt == "gravity" else track.accel_b_m_s2), tilt
+    return (_gravity_up(track) if tilt == "gravity" else track.accel_b_m_s2), tilt
 
 
-def _of_device(track: EvaluationTrack) -> Array:
+def _device_up(track: EvaluationTrack) -> Array:
     """Up is -z_n: its sensor components by pitch and roll (3-2-1)."""
     attitude = track.device_attitude()
     if attitude is None:
@@ -138,18 +138,18 @@ def _of_device(track: EvaluationTrack) -> Array:
     )
 
 
-def _gravity(track: EvaluationTrack) -> Array:
+def _gravity_up(track: EvaluationTrack) -> Array:
     out = np.empty((len(track), 3))
     for a, b in zip(track.starts, track.ends(), strict=True):
         dt_s = np.diff(track.time_s[a:b], prepend=track.time_s[a])
         R_0b = so3.products(so3.exp(track.gyro_b_rad_s[a:b] * dt_s[:, None]))
         force_0 = np.einsum("kij,kj->ki", R_0b, track.accel_b_m_s2[a:b])
         step_s = float(np.median(dt_s[1:])) if b - a > 1 else 1.0
-        out[a:b] = np.einsum("kji,kj->ki", R_0b, _both_ways(force_0, step_s / _MEMORY_S))
+        out[a:b] = np.einsum("kji,kj->ki", R_0b, _two_sided_mean(force_0, step_s / _MEMORY_S))
     return out
 
 
-def _both_ways(values: Array, share: float) -> Array:
+def _two_sided_mean(values: Array, share: float) -> Array:
     """Exponential means (N, 3) from the past and from the future, added; each counts its own."""
     keep = np.exp(-share)
     weight = lfilter([1.0], [1.0, -keep], np.ones(len(values)))

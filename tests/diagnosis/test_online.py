@@ -23,7 +23,7 @@ from ahrsd.estimator.step_detector import (
     Step,
     StepDetector,
     Thinned,
-    carried,
+    accumulate_rotations,
 )
 from ahrsd.events import Judged, Noted
 from ahrsd.evidence.values import BasisFacts, HealthFacts
@@ -342,7 +342,7 @@ def test_a_block_says_what_the_model_says():
 def test_rotations_are_carried_along():
     turns = np.linalg.qr(np.random.default_rng(0).standard_normal((37, 3, 3)))[0]
     expected = np.eye(3)
-    for turn, one in zip(turns, carried(turns), strict=True):
+    for turn, one in zip(turns, accumulate_rotations(turns), strict=True):
         expected = expected @ turn
         assert np.allclose(one, expected, atol=1e-12)
 

@@ -15,7 +15,7 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.components.component import Component, Fixed, Sized
 from ahrsd.diagnosis.inference.components.gaussian_process import course
 from ahrsd.diagnosis.model import Columns, Context
-from ahrsd.estimator.locked import harmonics, of_change, on_each_axis, squares
+from ahrsd.estimator.locked import change_columns, harmonics, on_each_axis, rate_products
 from ahrsd.samples import Array
 
 #: a gyro's matrix, and of its coefficients the turns: rates have turn x rate more
@@ -31,7 +31,7 @@ def ordinary_remainder(context: Context) -> list[Component]:
         _sized(context, "by_direction", "sensor", harmonics(context.field_b)),
         by_change(context),
         _sized(context, "field_by_rate", "sensor", context.rowwise_rate_b_rad_s),
-        _sized(context, "by_rate_squared", "gyro", squares(context.rowwise_rate_b_rad_s)),
+        _sized(context, "by_rate_squared", "gyro", rate_products(context.rowwise_rate_b_rad_s)),
         gyro_matrix(context),
     ]
     if context.force_b_m_s2 is not None and np.isfinite(context.force_b_m_s2).all():
@@ -73,7 +73,7 @@ def still_spells(time_s: Array, gyro_rad_s: Array) -> list[tuple[float, float]]:
 
 def by_change(context: Context) -> Component:
     """A matrix on the field's change, without what is alike on all axes: that is the delay."""
-    columns = of_change(context.field_dot_b)
+    columns = change_columns(context.field_dot_b)
     law = ordinary(priors.ORDINARY["by_change"], np.ones(columns.shape[2]))
     return Component("by_change", "sensor", Columns(mag=columns), law)
 
