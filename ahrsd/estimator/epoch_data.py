@@ -1,14 +1,14 @@
-"""From blocks of samples to steps and to the data of epochs, and what is done with those.
+"""From blocks of samples to steps and epochs, and the preparation of their data.
 
-Any split into blocks gives the same. The rate is measured on the first _RATE_ROWS samples after a
-start or a gap, whatever blocks they came in; from it follows how many samples make a step, and
-likewise whether the magnetometer's readings are held over several samples (`HeldReadings`). Pieces
-between short gaps share an epoch: nothing links the steps on the two sides of a gap, but the gyro's
-bias is the same.
+Any split of the samples into blocks gives the same result. The rate is measured on the first
+_RATE_ROWS samples after a start or a gap. It determines how many samples make a step. The same
+samples show whether the magnetometer's readings are held over several samples (`HeldReadings`).
+Pieces between short gaps share an epoch: nothing links the steps on the two sides of a gap, but the
+gyro bias is the same.
 
-Before the data of an epoch are linearised: did it turn the sensor? Its fields are shifted by the
-magnetometer's lag, its steps grouped where several may share a state; for a search it is thinned,
-and joined to others.
+Before the data of an epoch are linearised: a test for motion, a shift of the fields by the
+magnetometer's lag, and grouping of steps that can share a state. For a search, epochs are thinned
+and joined.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from ahrsd.samples import Array, SampleBlock
 
 # -- Samples averaged into steps -------------------------------------------------------------------
 #
-# Averaging of fast streams into steps, exactly where it can be.
+# Averaging of fast streams into steps, exact where possible.
 #
-# A step's field is the mean of an odd number n of consecutive samples and belongs to the middle
-# one; the rotation between two steps is the product of all sample rotations between their middle
-# samples. Averaging shortens the field by (w T)^2 / 24 for a rate w over the averaging time T: 0.04
-# % at 4 rad/s and 25 ms.
+# The field of a step is the mean of an odd number n of consecutive samples and belongs to the
+# middle one. The rotation between two steps is the product of all sample rotations between their
+# middle samples. Averaging shortens the field by (w T)^2 / 24 for a rate w over the averaging time
+# T: 0.04 % at 4 rad/s and 25 ms.
 
 
 # -- From samples to epochs ------------------------------------------------------------------------
@@ -43,9 +43,9 @@ from ahrsd.samples import Array, SampleBlock
 class Steps:
     """N consecutive steps; the rotation of row k leads from step k-1 to step k.
 
-    time_s (N,), field_b_gauss (N, 3), angle_b_rad (N, 3) rotation vector of the step,
-    dt_s (N,), accel_b_m_s2 (N, 3), linked (N,): 0 for a step that nothing leads to, the first of a
-    piece, whose rotation and time are nan, else 1.
+    time_s (N,), field_b_gauss (N, 3), angle_b_rad (N, 3) rotation vector of the step, dt_s (N,),
+    accel_b_m_s2 (N, 3), linked (N,): 0 for the first step of a piece, whose rotation and time are
+    nan, else 1.
     """
 
     time_s: Array
@@ -66,7 +66,7 @@ def samples_per_step(rate_hz: float, step_rate_hz: float) -> int:
 
 
 class StepAverager:
-    """Samples in, steps out. The state is at most n samples, so any split gives the same steps."""
+    """Samples in, steps out. It keeps at most n samples, so any split gives the same steps."""
 
     def __init__(self, averaged: int) -> None:
         self.averaged = averaged
@@ -81,7 +81,7 @@ class StepAverager:
         if self._rows:
             rows = np.vstack([*self._rows, rows])
         n, half = self.averaged, self.averaged // 2
-        # The second half of the last step's samples is kept: its rotations lead to the next step.
+        # The second half of the last step's samples is kept: their rotations lead to the next step.
         lead = half if self._linked else 0
         count = max(0, (len(rows) - lead) // n)
         used = lead + count * n
@@ -119,7 +119,7 @@ def _average_rows(rows: Array, lead: int, n: int, count: int, linked: bool) -> S
 
 
 def join_steps(parts: Sequence[Steps]) -> Steps:
-    """Consecutive steps in one record."""
+    """Concatenate consecutive steps."""
     if len(parts) == 1:
         return parts[0]
     return Steps(
@@ -133,7 +133,7 @@ def join_steps(parts: Sequence[Steps]) -> Steps:
 
 
 def split_steps(steps: Steps, at: int) -> tuple[Steps, Steps]:
-    """The first `at` steps and the rest."""
+    """The first `at` steps and the remaining ones."""
     return _select_steps(steps, slice(0, at)), _select_steps(steps, slice(at, None))
 
 
@@ -155,26 +155,26 @@ def _no_steps() -> Steps:
 
 # -- Readings that are held over several samples ---------------------------------------------------
 #
-# A magnetometer that is read more slowly than the gyro: each reading counts once.
+# A magnetometer that is sampled more slowly than the gyro: each reading counts once.
 #
-# Loggers write the newest reading of each sensor into every row, so that a 10 Hz magnetometer in
-# 100 Hz rows repeats each reading ten times.  Taken as ten measurements they turn with the sensor
-# and look like a field that comes and goes.  Rows are therefore merged from one new reading to the
-# next: the gyro's rotations are composed, the reading and the force are those of the row in which
-# it came.
+# Loggers write the newest reading of each sensor into every row, so a 10 Hz magnetometer in 100 Hz
+# rows repeats each reading ten times. If these were ten measurements, the repeated field would seem
+# to turn with the sensor. So the rows from one new reading to the next are merged: the gyro's
+# rotations are composed; reading and specific force are those of the row with the new reading.
 
 TIME, STEP, FIELD, GYRO = 0, 1, slice(2, 5), slice(5, 8)  # columns of the rows, accel behind them
-_RUNS = 8  # of equal readings, by which a slow magnetometer is told
-_MOST_ROWS = 512  # after which nobody waits for them
-_REPEATED = 0.4  # share of the rows
-_LONGEST_RUNS = 5  # usual runs, after which a reading counts again: it is stuck, or nothing turns
+_RUNS = 8  # of equal readings that identify a slow magnetometer
+_MOST_ROWS = 512  # limit of the wait for these runs
+_REPEATED = 0.4  # share of the rows that repeat a reading
+_LONGEST_RUNS = 5  # in typical runs: a reading that is held for longer counts again
 
 
 def rows_per_reading(rows: Array, fewest: int) -> int | None:
-    """How many rows a reading is held for, 1 where each has its own; None: too few rows to tell.
+    """Number of rows for which a reading is held, 1 if each row has its own; None: too few rows to
+    decide.
 
-    rows (N, 11): of one piece from its beginning; fewest: that are needed in any case. The answer
-    depends on the first rows only, so that it is the same however they are split.
+    rows (N, 11): of one piece from its beginning; fewest: number of rows needed in any case. The
+    result depends on the first rows only, so it is the same for any split.
     """
     if len(rows) < fewest:
         return None
@@ -194,7 +194,7 @@ def rows_per_reading(rows: Array, fewest: int) -> int | None:
 
 
 class HeldReadings:
-    """Rows in, one row for each new reading out; the state is the rows since the last one."""
+    """Rows in, one row per new reading out; it keeps the rows since the last one."""
 
     def __init__(self, length: int) -> None:
         self.length = length
@@ -202,11 +202,11 @@ class HeldReadings:
         self._has_reading = False
 
     def copy(self) -> HeldReadings:
-        """A copy that goes its own way."""
+        """An independent copy."""
         return copy(self)
 
     def merge_rows(self, rows: Array) -> Array:
-        """(M, 11) rows with a new reading of the next (N, 11), which follow without a gap."""
+        """(M, 11) rows with a new reading from the next (N, 11), which follow without a gap."""
         if len(self._rows):
             rows = np.vstack([self._rows, rows])
         new = np.concatenate([[False], np.any(rows[1:, FIELD] != rows[:-1, FIELD], axis=1)])
@@ -220,7 +220,7 @@ class HeldReadings:
         return np.array(out).reshape(-1, rows.shape[1])
 
     def _limit_distance(self, at: list[int], count: int) -> list[int]:
-        """The rows with new readings, and some of those between that are very far apart."""
+        """The rows with new readings, and rows in between where these are too far apart."""
         most = _LONGEST_RUNS * self.length
         out: list[int] = []
         last = 0
@@ -232,7 +232,7 @@ class HeldReadings:
         return out
 
     def _merge(self, rows: Array) -> Array:
-        """One row for those up to a new reading; nothing leads to the first one of a piece."""
+        """One row for the rows up to a new reading; the first of a piece has no time step."""
         row: Array = rows[-1].copy()
         if not self._has_reading:
             self._has_reading = True
@@ -247,14 +247,14 @@ class HeldReadings:
 # -- Epochs ----------------------------------------------------------------------------------------
 
 _RATE_ROWS = 33
-_LONGEST_GAP_S = 60.0  # after a longer one the gyro's bias may have moved
-_SPARE_STEPS = 2  # steps by which the count of what waits may be wrong
+_LONGEST_GAP_S = 60.0  # after a longer one the gyro bias may have changed
+_SPARE_STEPS = 2  # steps by which the estimated count of waiting steps may be wrong
 
 
 def check_samples(block: SampleBlock) -> None:
     """Raises ValueError naming the first row that is not a finite sample with a positive step.
 
-    Only the first row of a block after a gap may lack its step.
+    Only the first row of a block after a gap may have no step.
     """
     table = (
         ("time_s", block.time_s),
@@ -275,7 +275,7 @@ def check_samples(block: SampleBlock) -> None:
 
 
 class EpochBuilder:
-    """Blocks in, epochs out; also counts what went in."""
+    """Blocks in, epochs out; counts samples and duration."""
 
     def __init__(self, parameters: EstimatorParameters) -> None:
         self._parameters = parameters
@@ -283,8 +283,8 @@ class EpochBuilder:
         self.samples = 0
         self._averager: StepAverager | None = None
         self._held_readings: HeldReadings | None = None
-        self._rows: list[Array] = []  # samples of a piece whose rate is not known yet
-        self._waiting: list[Array] = []  # samples that are not steps yet
+        self._rows: list[Array] = []  # samples of a piece of unknown rate
+        self._waiting: list[Array] = []  # samples that are not averaged yet
         self._waiting_count = 0
         self._pending: list[Steps] = []
         self._pending_count = 0
@@ -295,11 +295,11 @@ class EpochBuilder:
 
     @property
     def duration_s(self) -> float:
-        """Time covered, gaps left out."""
+        """Time covered, without gaps."""
         return self._earlier_s + (0.0 if self._from_s is None else self._to_s - self._from_s)
 
     def add(self, block: SampleBlock) -> list[chain.EpochData]:
-        """Take samples that follow the last ones without a gap; return completed epochs."""
+        """Take samples that follow the last ones without a gap; returns completed epochs."""
         if len(block) == 0:
             return []
         self.samples += len(block)
@@ -328,16 +328,16 @@ class EpochBuilder:
         return closed + self._complete_epochs()
 
     def _average_waiting(self) -> None:
-        """Make steps of what waits; small blocks wait, because each would cost as much as one."""
+        """Average the waiting samples; they wait because each call has a fixed cost."""
         if self._waiting:
             self._add_steps(np.vstack(self._waiting))
             self._waiting.clear()
             self._waiting_count = 0
 
     def _measure_rate(self, dt_s: Array, length: int) -> list[chain.EpochData]:
-        """Measure the rate; steps of another length do not share an epoch.
+        """Measure the rate; steps of different lengths do not share an epoch.
 
-        length: samples for which a reading is held
+        length: number of samples for which a reading is held.
         """
         self._held_readings = HeldReadings(length) if length > 1 else None
         rate_hz = 1.0 / (length * float(np.median(dt_s)))
@@ -355,10 +355,12 @@ class EpochBuilder:
             self._pending_count += len(steps)
 
     def gap(self, next_s: float) -> list[chain.EpochData]:
-        """The next sample, at `next_s`, does not follow the last one; epochs that end here."""
+        """The next sample, at `next_s`, does not follow the last one; returns the epochs that end
+        here.
+        """
         self._average_waiting()
         if self._averager is None and self._pending_count and self._is_unmeasured_short:
-            rows = np.vstack(self._rows)  # too short to tell its rate: as the one before
+            rows = np.vstack(self._rows)  # too short for its rate: as in the piece before
             self._add_steps(
                 rows
                 if self._held_readings is None
@@ -376,7 +378,9 @@ class EpochBuilder:
         return 0 < sum(map(len, self._rows)) < _RATE_ROWS
 
     def _close_unmeasured(self) -> list[chain.EpochData]:
-        """A piece that ends before it is known how long readings are held: as in the one before."""
+        """Close a piece that ends before the held length is known: it is taken as in the piece
+        before.
+        """
         if self._averager is not None or not self._rows or self._is_unmeasured_short:
             return []
         rows = np.vstack(self._rows)
@@ -450,9 +454,8 @@ class EpochBuilder:
 def _down_directions(accel: Array, angle: Array) -> Array:
     """Unit vectors towards the earth (n, 3) from specific force, which points up at rest.
 
-    The force is averaged over the epoch in one frame, that of its middle, to which the gyro's
-    angles (n, 3) turn it: what a vehicle does to get round a bend averages out there, and so does a
-    gyro's bias to first order.
+    The force is averaged over the epoch in the frame of its middle, to which the gyro's angles (n,
+    3) rotate it. So accelerations of the vehicle average out, and a gyro bias does to first order.
     """
     if not np.isfinite(accel).all():
         return np.full_like(accel, np.nan)
@@ -462,7 +465,7 @@ def _down_directions(accel: Array, angle: Array) -> Array:
 
 
 def with_border(data: chain.EpochData, before: chain.EpochData) -> chain.EpochData:
-    """Put the previous epoch's last step in front, as the shared border."""
+    """Prepend the last step of the previous epoch, as the shared border."""
     return chain.EpochData(
         np.vstack([before.field_b_gauss[-1:], data.field_b_gauss]),
         np.vstack([np.zeros((1, 3)), data.angle_b_rad]),
@@ -476,30 +479,30 @@ def with_border(data: chain.EpochData, before: chain.EpochData) -> chain.EpochDa
 
 # -- Whether an epoch turned the sensor ------------------------------------------------------------
 #
-# Whether an epoch turned the sensor: one that did not says nothing about the iron.
+# Whether the sensor turned during an epoch: without motion it has no information on the iron.
 #
-# A field that changes while the sensor rests (a lift, a magnet, drift) would be taken for a strange
-# calibration. So both sensors must have seen a rotation. How much of a steady rate is the gyro's
-# bias is not known well: where the field swept far, any turn that the gyro saw will do.
+# A field that changes while the sensor is at rest (a lift, a magnet, drift) would look like a
+# different calibration. So both sensors must have seen a rotation. How much of a steady rate is the
+# gyro bias is not well known: if the field swept far, any turn seen by the gyro suffices.
 
 # -- Before they are linearised --------------------------------------------------------------------
 
 
-_LEAST_SWEEP = 0.10  # spread of the field over its size: a turn, if the gyro saw any
-_LEAST_PATH = 0.3  # spread of the integrated rate, less the bias as known, over that: it saw any
-_LEAST_SWEEP_UNSTEADY = 0.004  # the same, if the gyro saw the turn
-_TURNED_RAD = 0.002  # spread of the integrated rate less its mean
+_LEAST_SWEEP = 0.10  # spread of the field over its size: a turn, if the gyro saw one
+_LEAST_PATH = 0.3  # spread of the integrated rate less the known bias, over that of the field
+_LEAST_SWEEP_UNSTEADY = 0.004  # spread of the field, if the gyro saw an unsteady turn
+_TURNED_RAD = 0.002  # spread of the integrated rate less its mean: an unsteady turn
 _SMOOTHED_STEPS = 16  # steps
 
 
 def principal_deviation(field: Array) -> float:
-    """Standard deviation of (N, 3) along the direction in which it varied most."""
+    """Standard deviation of (N, 3) along the direction of largest variance."""
     away = field - field.mean(axis=0)
     return float(np.sqrt(np.linalg.eigvalsh(away.T @ away)[-1] / (len(field) - 1)))
 
 
 def has_motion(data: chain.EpochData, bias_rad_s: Array) -> bool:
-    """True where the epoch is worth a factor on the calibration; bias (3,) of the gyro as known."""
+    """Whether the epoch has information on the calibration; bias (3,): known bias of the gyro."""
     count = len(data) // _SMOOTHED_STEPS
     field = (
         data.field_b_gauss[: count * _SMOOTHED_STEPS]
@@ -519,16 +522,16 @@ def has_motion(data: chain.EpochData, bias_rad_s: Array) -> bool:
 
 # -- A lag of the magnetometer ---------------------------------------------------------------------
 #
-# A magnetometer that is late against the gyro: a reading at t is of the direction at t - tau.
+# A lag of the magnetometer against the gyro: a reading at t has the direction at t - tau.
 #
-# Filters, buses and interrupts make it so in every real system, and a lag of tau at a rate w looks
-# like a field that is turned by w tau. It is taken out where the field is seen: the row measured
-# M Exp(w tau) u + b. The gyro's readings stay as they are, so nothing is smoothed and no noise is
-# mixed. For tau of a few steps at most: w is the mean rate of the row's steps.
+# Every real system has one, by filters, buses and interrupts. A lag of tau at a rate w looks like a
+# field that is turned by w tau. It is corrected in the prediction of the field: the row measured M
+# Exp(w tau) u + b. The gyro's readings stay as they are, so nothing is smoothed and no noise is
+# mixed. This holds for tau of a few steps at most: w is the mean rate of the row's steps.
 
 
 def row_rates(data: chain.EpochData) -> Array:
-    """Rate (n, 3) in rad/s at each row: mean of the steps to it and from it, as far as linked."""
+    """Rate (n, 3) in rad/s at each row: mean of the steps before and after it, if linked."""
     if data.averaging is not None:
         return data.averaging.rate_b_rad_s
     linked = np.ones(len(data)) if data.linked is None else data.linked.copy()
@@ -542,7 +545,7 @@ def row_rates(data: chain.EpochData) -> Array:
 
 
 def with_lag(data: chain.EpochData, lag_s: float) -> chain.EpochData:
-    """The same epoch with its fields taken to be `lag_s` later than before."""
+    """The same epoch with its fields taken to be late by a further `lag_s`."""
     rate = row_rates(data)
     turn = so3.exp(lag_s * rate)
     averaging = data.averaging
@@ -556,8 +559,8 @@ def with_lag(data: chain.EpochData, lag_s: float) -> chain.EpochData:
 def with_gyro_matrix(data: chain.EpochData, gyro: Array, lag_s: float) -> chain.EpochData:
     """The same epoch with the gyro's angles multiplied by a matrix (3, 3).
 
-    lag_s: by which its fields are taken to be late already. Inside a group the angles are so small
-    that only the way of the lag is another.
+    lag_s: lag of its fields that is already applied. Inside a group the angles are so small that
+    only the rotation by the lag changes.
     """
     angle, averaging = data.angle_b_rad @ gyro.T, data.averaging
     if averaging is not None:
@@ -569,32 +572,31 @@ def with_gyro_matrix(data: chain.EpochData, gyro: Array, lag_s: float) -> chain.
 
 # -- Steps in groups -------------------------------------------------------------------------------
 #
-# Several steps in one state of the chain: the same information at a fraction of the cost.
+# Several steps in one state of the chain: nearly the same information at a fraction of the cost.
 #
-# Where the gyro carries the direction over a few steps much better than the magnetometer sees it,
-# the steps of a group need no states of their own: their fields, turned by the gyro into the
-# group's middle, are averaged. The mean of M u_j + b over the group is M P u + b exactly, with P
-# the mean of the rotations from the middle to each step, so a turning sensor loses nothing either.
-# Groups never span a gap; the first and the last row of an epoch stay by themselves, because its
-# neighbours share them.
+# If the gyro propagates the direction over a few steps much better than the magnetometer measures
+# it, the steps of a group need no states of their own: their fields are averaged. The mean of M u_j
+# + b over the group is M P u + b exactly, with P the mean of the rotations from the middle to each
+# step, so rotation inside the group loses nothing. Groups never span a gap; the first and the last
+# row of an epoch stay single, because the neighbouring epochs share them.
 #
-# What is lost is the gyro's noise inside a group (its variance adds _LOST of the field's) and the
-# field's differences inside it, which matter only if the sensor turned much (_TURN_RAD).
+# The loss is the gyro's noise inside a group (it adds _LOST_INFORMATION of the field's variance)
+# and the differences of the fields inside it, which matter only at large rotations (_TURN_RAD).
 
 _LARGEST_GROUP = 7
 _TURN_RAD, _FAST_SHARE = (
     0.3,
     0.95,
-)  # of rotation in a group; share of the steps that may not turn faster
+)  # rotation in a group, which this share of the steps respects
 _LOST_INFORMATION = 0.03
-_FEWEST_ROWS = 3  # rows that are never grouped
+_FEWEST_ROWS = 3  # shorter epochs are not grouped
 
 
 def group_size(data: chain.EpochData, noise: chain.Noise, size_gauss: float) -> int:
-    """How many steps may share a state: odd, 1 where the gyro is poor or the turn fast.
+    """Number of steps that can share a state: odd, 1 if the gyro is poor or the rotation fast.
 
-    noise: a guess, per step; size_gauss: of the field. The mean of k fields has the variance
-    s_m^2 / k, and the gyro's noise adds k / 12 (size s_g dt)^2.
+    noise: a guess, per step; size_gauss: of the field. The mean of k fields has the variance s_m^2
+    / k, and the gyro's noise adds k / 12 (size s_g dt)^2.
     """
     dt = float(np.median(data.dt_s[1:]))
     ratio = noise.mag_gauss / (size_gauss * noise.gyro_rad_s * dt)
@@ -606,7 +608,7 @@ def group_size(data: chain.EpochData, noise: chain.Noise, size_gauss: float) -> 
 
 
 def group_steps(epochs: Sequence[chain.EpochData], sizes: Sequence[int]) -> list[chain.EpochData]:
-    """Epochs of single steps with as many of them in a state, odd numbers; all at once."""
+    """Epochs of single steps with `sizes` (odd) steps in each state; all at once."""
     out = list(epochs)
     which = [k for k, size in enumerate(sizes) if size > 1 and len(epochs[k]) > _FEWEST_ROWS]
     if which:
@@ -661,7 +663,7 @@ def _group_epochs(epochs: Sequence[chain.EpochData], sizes: Sequence[int]) -> li
 
 
 def _group_starts(linked: Array, size: int) -> Index:
-    """First row of each group of an epoch; its first and last row are groups by themselves."""
+    """First row of each group of an epoch; its first and last row are groups of one."""
     n = len(linked)
     cuts = [1, *(2 + np.flatnonzero(linked[2 : n - 1] == 0)), n - 1]
     return np.concatenate([[0], *(np.arange(a, b, size) for a, b in pairwise(cuts)), [n - 1]])
@@ -670,8 +672,8 @@ def _group_starts(linked: Array, size: int) -> Index:
 def _rotations_between(
     step_s: Array, turn: Array, linked: Array, rows: Index
 ) -> tuple[Array, Array, Array, Array]:
-    """To each state from the one before: rotation vector, time, root of the sum of squared steps
-    of time, 1 if linked else 0; of the first state only the shapes.
+    """For each state from the one before: rotation vector, time, root of the sum of squared time
+    steps, 1 if linked else 0; of the first state only the shapes are valid.
     """
     before = np.r_[rows[0], rows[:-1]]
     total = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
@@ -688,7 +690,9 @@ def _rotations_between(
 
 
 def _mean_rotations(turn: Array, rows: Index, start: Index, length: Index) -> Array:
-    """Mean over each group of the rotations from its middle's sensor frame to its steps'."""
+    """Mean over each group of the rotations from the sensor frame of its middle to those of its
+    steps.
+    """
     P = np.broadcast_to(np.eye(3), (len(rows), 3, 3)).copy()
     end = start + length
     ahead = behind = np.broadcast_to(np.eye(3), P.shape)
@@ -705,7 +709,7 @@ def _mean_rotations(turn: Array, rows: Index, start: Index, length: Index) -> Ar
 
 
 def thin_rows(data: chain.EpochData, k: int) -> chain.EpochData:
-    """Every k-th row of an epoch, by itself."""
+    """Every k-th row of an epoch, on its own."""
     if k == 1:
         return data
     count = (len(data) - 1) // k
@@ -734,7 +738,7 @@ def thin_rows(data: chain.EpochData, k: int) -> chain.EpochData:
 
 
 def join_epochs(parts: Sequence[chain.EpochData]) -> chain.EpochData:
-    """Epochs as one chain that is cut between them; each measures its first field."""
+    """Epochs as one chain with cuts between them; each measures its first field."""
     ones = [np.ones(len(p)) for p in parts]
     linked = [
         np.r_[0.0, (o if p.linked is None else p.linked)[1:]]

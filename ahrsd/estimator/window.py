@@ -634,7 +634,7 @@ class Window:
     def covariance(self) -> Array:
         """Covariance (12, 12) of c and the newest gyro bias, including all misfit.
 
-        Disagreement among epochs is taken not to average out (`noise.covariance_with_common_errors`).
+        Disagreement among epochs does not average out (`noise.covariance_with_common_errors`).
 
         Errors that repeat with the attitude are taken to be smooth in it, like the gradient of a
         room. The weights inside the estimate do not assume this, which follows the data more
