@@ -405,12 +405,12 @@ class EpochBuilder:
 
     @property
     def pending(self) -> int:
-        """Steps of the epoch that is not complete yet."""
+        """Number of steps of the incomplete epoch."""
         self._average_waiting()
         return self._pending_count
 
     def copy(self) -> EpochBuilder:
-        """A copy that goes its own way, for closing the epoch early."""
+        """An independent copy, with which to close the epoch early."""
         self._average_waiting()
         other = copy(self)
         other._pending, other._rows = list(self._pending), list(self._rows)
@@ -419,7 +419,7 @@ class EpochBuilder:
         return other
 
     def interrupt(self) -> chain.EpochData | None:
-        """What is pending as a short epoch, if it is worth one; the next one starts anew."""
+        """The pending steps as a short epoch, if there are enough; the next one starts anew."""
         self._average_waiting()
         data = self._close_pending()
         self._start_piece()

@@ -1,8 +1,8 @@
-"""What a calibration is worth on a recording: before and after, judged by what can be known.
+"""Accuracy of a calibration on a recording, before and after, against independent references.
 
-`track` is the recording as arrays, with which way is up; `heading` compares with references, and
-dead reckoning with fixes; `judging` has the figures of the field and all of them together, as JSON
-and as a table. The calibration is read by `calibration_json`.
+`track` is the recording as arrays, with the vertical; `heading` compares headings with references,
+and dead reckoning with fixes; `judging` has the figures of the field and collects all of them, as
+JSON and as a table. The calibration is read by `calibration_json`.
 
 Sources: [R] 2.1-2.4 and 4.4, [L]; docs/guide/evaluate.md has the definitions.
 """

@@ -1,6 +1,5 @@
-"""All figures of a calibration on a recording, before and after, and what may not be believed.
-
-Then the same as JSON and as lines for a person.
+"""All figures of a calibration on a recording, before and after, with warnings; as JSON and as
+lines of text.
 """
 
 from __future__ import annotations
@@ -34,10 +33,10 @@ from ahrsd.world_field import WorldField
 
 # -- Size of the field -----------------------------------------------------------------------------
 #
-# Size of the corrected field: its spread, and the error of the norm constraint.
+# Norm of the corrected field: its spread, and the error of the norm constraint.
 #
-# Spread is [R] 4.4, std |h| / mean |h|. [L]'s constraint is |h_k| = |H_k|; where the world's field
-# is not known the mean of |h| stands for |H|, and the error is then about that.
+# Spread is [R] 4.4, std |h| / mean |h|. The constraint of [L] is |h_k| = |H_k|. If the world's
+# field is not known, the mean of |h| replaces |H|, and the error is relative to that.
 
 
 # -- Figures ---------------------------------------------------------------------------------------
@@ -45,7 +44,7 @@ from ahrsd.world_field import WorldField
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldFigures:
-    """Of one calibration. constraint_*: of |h| - |H|, |H| the mean of |h| unless it was given."""
+    """Of one calibration. constraint_*: of |h| - |H|, where |H| is the mean of |h| unless given."""
 
     mean_gauss: float
     spread: float
@@ -107,7 +106,7 @@ class Reckoned:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """What a calibration is worth on a recording."""
+    """The figures of a calibration on a recording."""
 
     recording: str
     calibration: StoredCalibration
@@ -125,9 +124,9 @@ class Evaluation:
 
     @property
     def better(self) -> bool:
-        """Whether it is no worse than the device's present values, by the best witness there is.
+        """Whether it is no worse than the device's present values, by the best criterion available.
 
-        That is the first heading reference that is true, else the spread of the field.
+        That is the first heading reference that is true, otherwise the spread of the field.
         """
         for judged in self.headings:
             if judged.truth:
@@ -145,10 +144,10 @@ def judge(
     world: WorldField | None = None,
     tilt_source: Tilt = "auto",
 ) -> Evaluation:
-    """Judge `calibration` on a recording.
+    """Evaluate `calibration` on a recording.
 
-    references: in order of belief; one that the recording hardly overlaps ends in a warning.
-    Raises EvaluationError where a tilt was asked for that the recording does not have.
+    references: in order of reliability; one that the recording hardly overlaps gives a warning.
+    Raises EvaluationError if the recording does not have the requested tilt.
     """
     warnings: list[str] = list(calibration.remarks)
     after_b = calibration.correction.apply(track.raw_b_gauss)
@@ -253,7 +252,7 @@ def _with_caveats(found: Evaluation) -> Evaluation:
 
 
 def _recording_stem(name: str) -> str:
-    """A recording's name without what says how it is stored."""
+    """The name of a recording without the suffixes of its storage."""
     return name.split(".", 1)[0]
 
 
@@ -391,7 +390,9 @@ def evaluation_lines(found: Evaluation) -> list[str]:
 
 
 def comparison_lines(found: Sequence[Evaluation], without: Mapping[str, str]) -> list[str]:
-    """One row per calibration, least heading error first; without: method to why it has none."""
+    """One row per calibration, least heading error first; without: reason by method without an
+    answer.
+    """
     first = found[0]
     duration_s = first.track.time_s[-1] - first.track.time_s[0]
     lines = [f"{first.recording}: {counted(len(first.track), 'sample')}, {duration_s:.0f} s"]
@@ -432,14 +433,14 @@ def comparison_json(found: Sequence[Evaluation], without: Mapping[str, str]) -> 
 
 
 def _rms_interval(one: Evaluation, first: Evaluation) -> tuple[float, float] | None:
-    """95 % interval of how much larger its heading RMS is than that of the first, deg."""
+    """95 % interval of its heading RMS less that of the first, deg."""
     if one is first or not first.headings:
         return None
     return rms_difference(one.headings[0].figures.after, first.headings[0].figures.after)
 
 
 def _comparison_figures(found: Evaluation, which: Literal["before", "after"]) -> tuple[float, ...]:
-    """Heading RMS and worst (deg), dead reckoning (%), spread (%); NaN where there is none."""
+    """Heading RMS and worst (deg), dead reckoning (%), spread (%); NaN if there is none."""
     nan = float("nan")
     heading = getattr(found.headings[0].figures, which) if found.headings else None
     reckoned = None if found.reckoned is None else getattr(found.reckoned.figures, which)
