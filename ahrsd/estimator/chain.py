@@ -323,9 +323,9 @@ def _motion_part(rows: Rows, frame: Array) -> MotionPart:
     R, Jl = so3.columns_exp_and_left_jacobian(rows.bias * dt - rows.angle_b_rad)
     turned = np.einsum("ijn,jkn->ikn", R[:, :, 1:], frame[:, :, :-1])
     across = frame[:, :2, 1:] * rows.stiff[1:]
-    moved = np.einsum("jin,jkn->ikn", across, turned)
+    derivatives = np.einsum("jin,jkn->ikn", across, turned)
     J = np.zeros((2, 6, frame.shape[2]))
-    J[:, :2, 1:], J[:, 5, 1:] = moved[:, :2], moved[:, 2]
+    J[:, :2, 1:], J[:, 5, 1:] = derivatives[:, :2], derivatives[:, 2]
     (x, y, z), (p, q, r) = turned[:, 2] * dt[1:], across
     by_bias = np.array([y * r - z * q, z * p - x * r, x * q - y * p])  # - across^T [R u dt]x
     np.einsum("jin,jkn->ikn", by_bias, Jl[:, :, 1:], out=J[:, 2:5, 1:])

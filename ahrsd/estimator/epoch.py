@@ -498,8 +498,8 @@ def rest_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationS
     for k, epoch in enumerate(resting):
         factor = epoch.factor
         H[k, _BIAS, _BIAS] = factor.H[_BIAS, _BIAS]
-        moved = graph.nodes[epoch.a].bias - factor.point.a.bias
-        g[k, _BIAS] = factor.g[_BIAS] + factor.H[_BIAS, _BIAS] @ moved
+        bias_change = graph.nodes[epoch.a].bias - factor.point.a.bias
+        g[k, _BIAS] = factor.g[_BIAS] + factor.H[_BIAS, _BIAS] @ bias_change
     return H, g
 
 
@@ -571,8 +571,9 @@ def _instrument_point(c: Array, correction: InstrumentCorrection) -> Array:
 
 
 def linearise_instrument(epochs: Sequence[WindowEpoch]) -> None:
-    """Compute `WindowEpoch.instrument` of the epochs with motion that lack it. Epochs that were
-    linearised at the same calibration are handled together.
+    """Compute `WindowEpoch.instrument` of the epochs with motion that lack it.
+
+    Epochs that were linearised at the same calibration are handled together.
     """
     missing = [epoch for epoch in epochs if epoch.has_motion and epoch.instrument is None]
     for point in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in missing}.values():
@@ -584,8 +585,7 @@ def linearise_instrument(epochs: Sequence[WindowEpoch]) -> None:
 def lag_uncertainty(
     epochs: Sequence[WindowEpoch], graph: Graph, past: FoldedInformation, sigma_bias: float
 ) -> Lag:
-    """Sigma of the lag that is removed from the field, from all data. LinAlgError if it is
-    unobservable.
+    """Sigma of the lag that is removed from the field, from all data; LinAlgError if unobservable.
 
     The iron is estimated at that lag. The errors of the iron at the true lag are not correlated
     with the error of the lag, so the two contributions add up.
@@ -667,18 +667,19 @@ class ImperfectionLikelihood:
         before: tuple[Array, Array],
         correction: InstrumentCorrection,
     ) -> ImperfectionLikelihood:
-        """From the epochs (times_s (N,)) and those folded before. LinAlgError if the motion does
-        not determine the answer.
+        """From epochs at times_s (N,) and the folded ones.
+
+        LinAlgError if the motion does not determine the answer.
         """
         epochs = add_bias_drift(epochs, times_s)
         H, g = epochs[0].sum(axis=0), epochs[1].sum(axis=0)
         H[:_SIZE, :_SIZE] += before[0]
         g[:_SIZE] += before[1]
-        own_H, own_g = prior_quadratic(graph, sigma_bias)
-        covariance = _inverse(H[_CALIBRATION, _CALIBRATION] + own_H[_CALIBRATION, _CALIBRATION])
+        prior_H, prior_g = prior_quadratic(graph, sigma_bias)
+        covariance = _inverse(H[_CALIBRATION, _CALIBRATION] + prior_H[_CALIBRATION, _CALIBRATION])
         response, gradient = (
             -covariance @ H[_CALIBRATION, _IMPERFECT],
-            g[_CALIBRATION] + own_g[_CALIBRATION],
+            g[_CALIBRATION] + prior_g[_CALIBRATION],
         )
         information = H[_IMPERFECT, _IMPERFECT] + H[_IMPERFECT, _CALIBRATION] @ response
         corrected = np.zeros(len(information))
@@ -695,14 +696,19 @@ class ImperfectionLikelihood:
         )
 
     def posterior(self, sigmas: Array, temper: float) -> tuple[Array, Array]:
-        """Covariance (..., 19, 19) over the temper, and mean (..., 19) beyond what is corrected
-        already, for instruments with prior sigmas (..., 19).
+        """Covariance (..., 19, 19) over the temper, and mean (..., 19) beyond the present
+        correction.
+
+        sigmas (..., 19): prior sigmas.
         """
-        pull = temper / sigmas**2
-        spread = _inverses(self.information + pull[..., None] * np.eye(pull.shape[-1]))
-        return spread, -(spread @ (self.imperfection_gradient + pull * self.corrected)[..., None])[
-            ..., 0
-        ]
+        prior_information = temper / sigmas**2
+        covariance = _inverses(
+            self.information + prior_information[..., None] * np.eye(prior_information.shape[-1])
+        )
+        return covariance, -(
+            covariance
+            @ (self.imperfection_gradient + prior_information * self.corrected)[..., None]
+        )[..., 0]
 
     def temper(self, sigmas: Array, most: float) -> float:
         """Misfit of the epochs after the maximum a posteriori step, between 1 and `most`."""
@@ -711,8 +717,8 @@ class ImperfectionLikelihood:
         return min(most, max(1.0, self.misfit_after(step)))
 
     def log_evidence(self, sigmas: Array, mean: Array, temper: float) -> Array:
-        """Log evidence for prior sigmas (..., 19), up to a constant. mean: the posterior mean for
-        them.
+        """Log evidence (...) for prior sigmas (..., 19) with their posterior mean, up to a
+        constant.
         """
         outer = sigmas[..., :, None] * sigmas[..., None, :]
         log_determinant = np.linalg.slogdet(
@@ -730,30 +736,30 @@ class ImperfectionLikelihood:
 class InstrumentPosterior:
     """All possible instruments at all places, with their evidence.
 
-    sigmas (K, 19): prior sigmas; log_prior (K,); log_evidence (K,); spread (K, 19, 19) and means
-    (K, 19): posterior covariance and mean of the imperfections of each, beyond what is corrected
-    already
+    sigmas (K, 19): prior sigmas; log_prior (K,); log_evidence (K,); covariances (K, 19, 19) and
+    means (K, 19): posterior of the imperfections of each, beyond the present correction
     """
 
     likelihood: ImperfectionLikelihood
     sigmas: Array
     log_prior: Array
     log_evidence: Array
-    spread: Array
+    covariances: Array
     means: Array
 
     @staticmethod
     def of(likelihood: ImperfectionLikelihood, graph: Graph, kinds: Kinds) -> InstrumentPosterior:
-        """The temper is the misfit after the imperfections are fitted: disagreement that they
-        explain is no noise.
+        """The posterior at the temper that remains after the imperfections are fitted.
+
+        Disagreement that they explain is no noise.
         """
-        may_be = possible_instruments(*kinds)
-        sigmas = may_be.sigmas
+        instruments = possible_instruments(*kinds)
+        sigmas = instruments.sigmas
         temper = likelihood.temper(sigmas.max(axis=0), graph.temper)
-        spread, means = likelihood.posterior(sigmas, temper)
+        covariances, means = likelihood.posterior(sigmas, temper)
         log_evidence = likelihood.log_evidence(sigmas, means, temper)
         return InstrumentPosterior(
-            likelihood, sigmas, may_be.log_prior, log_evidence, temper * spread, means
+            likelihood, sigmas, instruments.log_prior, log_evidence, temper * covariances, means
         )
 
     def probabilities(self) -> Array:
@@ -829,7 +835,7 @@ def widening_by_imperfections(posterior: InstrumentPosterior) -> Widening:
         posterior.means,
         posterior.probabilities(),
     )
-    mean = np.tensordot(probabilities, posterior.spread, 1) + (probabilities * means.T) @ means
+    mean = np.tensordot(probabilities, posterior.covariances, 1) + (probabilities * means.T) @ means
     added = response @ mean @ response.T
     each = [response[:, i] @ mean[np.ix_(i, i)] @ response[:, i].T for i in _IMPERFECTION_ROWS]
     return Widening(
@@ -863,7 +869,7 @@ def required_gyro_correction(posterior: InstrumentPosterior, required_nats: floa
     if found is None:
         return None
     step = posterior.means[found][GYRO_AMONG_IMPERFECTIONS]
-    known = posterior.spread[found][np.ix_(GYRO_AMONG_IMPERFECTIONS, GYRO_AMONG_IMPERFECTIONS)]
+    known = posterior.covariances[found][np.ix_(GYRO_AMONG_IMPERFECTIONS, GYRO_AMONG_IMPERFECTIONS)]
     worth = float(np.sqrt(step @ np.linalg.solve(known, step) / len(step)))
     return step if worth > _WORTH_SIGMAS else None
 
@@ -1022,7 +1028,7 @@ def _gyro_matrix_columns(by_angle: Array, angle: Array) -> Array:
     return np.array([*turn, -(x * p + y * q + z * r), *shape]).transpose(1, 0, 2)
 
 
-# -- What is locked to attitude, rate and time -----------------------------------------------------
+# -- Residuals that follow attitude, rate or time --------------------------------------------------
 #
 # What real instruments and places leave in the residuals besides (`locked`): harmonics of the
 # field's direction on each axis of the sensor; terms in the rate, and in the field's change with a
@@ -1061,15 +1067,15 @@ def reusable_locked(old: WindowEpoch, new: WindowEpoch) -> LockedInformation | N
     known = old.locked
     if known is None or old.data is not new.data:
         return None
-    c, moved = new.factor.point.c, new.factor.point.c - known.information.c
-    far = float(np.linalg.norm(moved)) > _SAME_CALIBRATION * float(
+    c, change = new.factor.point.c, new.factor.point.c - known.information.c
+    has_moved = float(np.linalg.norm(change)) > _SAME_CALIBRATION * float(
         np.cbrt(np.linalg.det(chain.symmetric(c[:6])))
     )
-    other = max(
+    noise_change = max(
         abs(new.used.mag_gauss / known.noise.mag_gauss - 1.0),
         abs(new.used.gyro_rad_s / known.noise.gyro_rad_s - 1.0),
     )
-    return None if far or other > _SAME_NOISE else known
+    return None if has_moved or noise_change > _SAME_NOISE else known
 
 
 def _locked_columns(

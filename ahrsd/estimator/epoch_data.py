@@ -288,7 +288,7 @@ class EpochBuilder:
         self._waiting_count = 0
         self._pending: list[Steps] = []
         self._pending_count = 0
-        self._fresh = True
+        self._measures_first = True
         self._earlier_s = 0.0
         self._from_s: float | None = None
         self._to_s = 0.0
@@ -322,7 +322,7 @@ class EpochBuilder:
             rows = self._held_readings.merge_rows(rows)
         self._waiting.append(rows)
         self._waiting_count += len(rows)
-        enough = self._parameters.epoch_steps + int(self._fresh)
+        enough = self._parameters.epoch_steps + int(self._measures_first)
         if self._pending_count + self._waiting_count // self.averaged + _SPARE_STEPS >= enough:
             self._average_waiting()
         return closed + self._complete_epochs()
@@ -399,8 +399,10 @@ class EpochBuilder:
 
     def _complete_epochs(self) -> list[chain.EpochData]:
         closed = []
-        while self._pending_count >= self._parameters.epoch_steps + int(self._fresh):
-            closed.append(self._take_epoch(self._parameters.epoch_steps + int(self._fresh)))
+        while self._pending_count >= self._parameters.epoch_steps + int(self._measures_first):
+            closed.append(
+                self._take_epoch(self._parameters.epoch_steps + int(self._measures_first))
+            )
         return closed
 
     @property
@@ -430,14 +432,14 @@ class EpochBuilder:
         data = self._take_epoch(self._pending_count) if enough else None
         self._pending.clear()
         self._pending_count = 0
-        self._fresh = True
+        self._measures_first = True
         return data
 
     def _take_epoch(self, count: int) -> chain.EpochData:
-        steps, rest = split_steps(join_steps(self._pending), count)
-        self._pending = [rest] if len(rest) else []
-        self._pending_count = len(rest)
-        fresh, self._fresh = self._fresh, False
+        steps, remaining = split_steps(join_steps(self._pending), count)
+        self._pending = [remaining] if len(remaining) else []
+        self._pending_count = len(remaining)
+        fresh, self._measures_first = self._measures_first, False
         cut = steps.linked == 0
         angle = np.where(cut[:, None], 0.0, steps.angle_b_rad)
         return chain.EpochData(

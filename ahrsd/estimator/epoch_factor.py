@@ -43,12 +43,12 @@ from ahrsd.samples import Array
 __all__ = ["Epoch", "EpochKeys", "EpochSummary", "Noise", "Point", "epoch_factor", "summarise"]
 
 _LEAST_ROWS = 4
-_SETTLED_RAD = 1e-9
+_CONVERGED_RAD = 1e-9
 _MOST_STEPS, _MOST_HALVINGS = 60, 20
 _ROUNDING = 1e-12  # relative increase of a cost that is rounding
 _SHARED = 12  # calibration and gyro bias
 _BORDERS = slice(12, 16)
-_BLIND = 1e-14  # of the largest scaled eigenvalue: undetermined
+_UNDETERMINED = 1e-14  # of the largest scaled eigenvalue: undetermined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,8 +82,8 @@ class Epoch:
         ):
             if values.shape != (count, 3):
                 raise ValueError(f"{name} has shape {values.shape}, not ({count}, 3)")
-            _all_rows(name, np.isfinite(values[used:].sum(axis=1)), used)
-        _all_rows("dt_s", (dt_s[1:] > 0) & (dt_s[1:] < np.inf), 1)
+            _require_rows(name, np.isfinite(values[used:].sum(axis=1)), used)
+        _require_rows("dt_s", (dt_s[1:] > 0) & (dt_s[1:] < np.inf), 1)
         if not (0 < noise.mag_gauss < np.inf and 0 < noise.gyro_rad_s < np.inf):
             raise ValueError(f"{noise}: noise must be a positive number")
         steps = np.r_[dt_s[1], dt_s[1:]]
@@ -99,7 +99,7 @@ class Epoch:
         return Epoch(data, noise)
 
 
-def _all_rows(name: str, good: NDArray[np.bool], first: int) -> None:
+def _require_rows(name: str, good: NDArray[np.bool], first: int) -> None:
     if not good.all():
         raise ValueError(f"{name} of row {first + int(np.argmin(good))} cannot be used")
 
@@ -187,13 +187,13 @@ class EpochSummary:
         """
         scale = np.sqrt(np.diag(self.information).clip(min=1e-300))
         values, vectors = np.linalg.eigh(self.information / np.outer(scale, scale))
-        root = np.sqrt(np.where(values > _BLIND * values[-1], values, 0.0))
+        root = np.sqrt(np.where(values > _UNDETERMINED * values[-1], values, 0.0))
         J = root[:, None] * (vectors.T * scale)
         seen = root > 0
         r = np.zeros(len(root))
         r[seen] = (vectors.T @ (self.gradient / scale))[seen] / root[seen]
-        rest = np.sqrt(max(0.0, 2.0 * self.cost - float(r @ r)))
-        return np.r_[r, rest], np.vstack([J, np.zeros(len(root))])
+        remaining = np.sqrt(max(0.0, 2.0 * self.cost - float(r @ r)))
+        return np.r_[r, remaining], np.vstack([J, np.zeros(len(root))])
 
 
 def summarise(epoch: Epoch, point: Point, start: Array | None = None) -> EpochSummary:
@@ -203,10 +203,12 @@ def summarise(epoch: Epoch, point: Point, start: Array | None = None) -> EpochSu
     start (n, 3): initial directions, otherwise those of the readings. ValueError if M is not
     positive definite or the directions do not converge.
     """
-    return _settled(epoch, point, start)[0]
+    return _solve_directions(epoch, point, start)[0]
 
 
-def _settled(epoch: Epoch, point: Point, start: Array | None) -> tuple[EpochSummary, Array]:
+def _solve_directions(
+    epoch: Epoch, point: Point, start: Array | None
+) -> tuple[EpochSummary, Array]:
     """Gauss-Newton over the directions; a step is halved until the cost falls."""
     c, bias, data = point.calibration, point.gyro_bias_rad_s, epoch.data
     M = chain.symmetric(c[:6])
@@ -224,16 +226,16 @@ def _settled(epoch: Epoch, point: Point, start: Array | None) -> tuple[EpochSumm
         if not joined:
             z[_BORDERS] = -np.linalg.solve(q.H[_BORDERS, _BORDERS], q.g[_BORDERS])
         step = chain.move_directions(u, q, z) - u
-        if float(np.max(np.abs(step))) < _SETTLED_RAD:
+        if float(np.max(np.abs(step))) < _CONVERGED_RAD:
             return _summary(point, q, u, joined), u
         for _ in range(_MOST_HALVINGS):
-            moved = u + step
-            moved /= np.linalg.norm(moved, axis=1, keepdims=True)
-            new = _cost(epoch, moved, c, turns)
+            candidate = u + step
+            candidate /= np.linalg.norm(candidate, axis=1, keepdims=True)
+            new = _cost(epoch, candidate, c, turns)
             if new <= cost * (1.0 + _ROUNDING):
                 break
             step = step / 2
-        u, cost = moved, new
+        u, cost = candidate, new
     raise ValueError("the directions of an epoch do not settle: far from any solution")
 
 
@@ -270,19 +272,21 @@ def epoch_factor(epoch: Epoch, keys: EpochKeys) -> gtsam.CustomFactor:
     """
     widths = (9, 3, 2, 2)[: len(keys.listed)]
     cuts = np.cumsum(widths)[:-1]
-    held: list[Array] = []  # the last directions found, where the next search starts
+    last_directions: list[Array] = []  # the last directions found, where the next search starts
 
     def error(
         _factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: MutableSequence[Array] | None
     ) -> Array:
         try:
-            summary, u = _settled(epoch, Point.of(values, keys), held[0] if held else None)
+            summary, u = _solve_directions(
+                epoch, Point.of(values, keys), last_directions[0] if last_directions else None
+            )
         except ValueError:
-            held.clear()
+            last_directions.clear()
             if jacobians is not None:
                 raise
             return np.full(sum(widths) + 1, np.inf)
-        held[:] = [u]
+        last_directions[:] = [u]
         r, J = summary.rows()
         if jacobians is not None:
             for k, part in enumerate(np.split(J, cuts, axis=1)):

@@ -283,14 +283,14 @@ def valley_step(c: Array, to: Array, moments: Moments) -> Array:
     M = chain.symmetric(c[:6])
     C = np.asarray(np.linalg.inv(M), dtype=np.float64)
     other = np.asarray(np.linalg.inv(chain.symmetric(to[:6])), dtype=np.float64)
-    d, beyond = C @ c[6:], other @ to[6:]
-    own, theirs = moments.mean_square(C, d), moments.mean_square(other, beyond)
-    both = (moments.mean_square(C + other, d + beyond) - own - theirs) / 2
-    inside = both**2 + (1.0 + own) * (1.0 - theirs)
-    if both <= 0.0 or inside <= 0.0:
+    d, other_d = C @ c[6:], other @ to[6:]
+    own_square, other_square = moments.mean_square(C, d), moments.mean_square(other, other_d)
+    cross = (moments.mean_square(C + other, d + other_d) - own_square - other_square) / 2
+    discriminant = cross**2 + (1.0 + own_square) * (1.0 - other_square)
+    if cross <= 0.0 or discriminant <= 0.0:
         return np.asarray(to - c)
-    scale = (1.0 + own) / (both + np.sqrt(inside))
-    dC, dd = np.asarray(scale * other - C), np.asarray(scale * beyond - d)
+    scale = (1.0 + own_square) / (cross + np.sqrt(discriminant))
+    dC, dd = np.asarray(scale * other - C), np.asarray(scale * other_d - d)
     return np.concatenate([chain.upper_triangle(-M @ dC @ M), M @ (dd - dC @ c[6:])])
 
 
@@ -462,13 +462,13 @@ class Graph:
         g[C] += pull @ (self.c - self.anchor[0])
         if not np.isfinite(g).all():
             raise SingularError("the calibration is not finite")
-        solved = -_inverse(H) @ g
+        solution = -_inverse(H) @ g
         given = gtsam.VectorValues()
-        given.insert(_C, solved[C])
-        given.insert(_node_key(self.last), solved[Y_A] / _UNITS[Y_A])
+        given.insert(_C, solution[C])
+        given.insert(_node_key(self.last), solution[Y_A] / _UNITS[Y_A])
         delta = net.optimize(given)
         dy = {j: np.array(delta.at(_node_key(j))) * _UNITS[Y_A] for j in self.nodes}
-        return np.asarray(solved[C], dtype=np.float64), dy
+        return np.asarray(solution[C], dtype=np.float64), dy
 
     def predict_step(self) -> tuple[Array, Array]:
         """The undamped step dc (9,), and the information (9, 9) of c.
@@ -525,8 +525,8 @@ class Graph:
         used: list[object] = [self.c, *factors, *self.nodes.values()]
         cached = self._cached
         if cached is None or len(cached[0]) != len(used) or any(map(is_not, cached[0], used)):
-            net, rest = _eliminate(self._linear_graph(factors), self._older_nodes())
-            cached = self._cached = (used, (net, *_information_of(rest)))
+            net, remaining = _eliminate(self._linear_graph(factors), self._older_nodes())
+            cached = self._cached = (used, (net, *_information_of(remaining)))
         return cached[1]
 
     def _linear_graph(self, factors: list[Factor]) -> gtsam.GaussianFactorGraph:
@@ -566,15 +566,15 @@ def _eliminate(
 ) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
     """The variables of `ordering` as conditionals, and the remaining graph without them."""
     try:
-        net, rest = linear.eliminatePartialSequential(ordering)
+        net, remaining = linear.eliminatePartialSequential(ordering)
     except RuntimeError as error:
         raise _singular_error(error) from error
-    return net, rest
+    return net, remaining
 
 
-def _information_of(rest: gtsam.GaussianFactorGraph) -> tuple[Array, Array]:
+def _information_of(remaining: gtsam.GaussianFactorGraph) -> tuple[Array, Array]:
     """H and gradient (SIZE) on [c, one node] of the graph that an elimination left."""
-    hessian = gtsam.HessianFactor(rest)
+    hessian = gtsam.HessianFactor(remaining)
     augmented = np.array(hessian.augmentedInformation())
     keys: list[int] = list(hessian.keys())
     rows = np.concatenate([np.arange(9) if k == _C else np.arange(9, 9 + NODE) for k in keys])

@@ -1,6 +1,4 @@
-"""Checks of a settled window against the model: an iron that changed, turned axes, and residuals
-that follow attitude, rate or time.
-"""
+"""Checks of a settled window against the model: changed iron, turned axes, structured residuals."""
 
 from __future__ import annotations
 
@@ -170,7 +168,7 @@ def estimate_misalignment(
     return Misalignment(theta, spread, chi2, found.misfit, full)
 
 
-# -- What is left over, locked to attitude, rate or time -------------------------------------------
+# -- Residuals that follow attitude, rate or time --------------------------------------------------
 #
 # A score test for each component of `locked`, the columns that `diagnose` uses for the ordinary
 # residuals of real recordings. It is made in the directions that the motion determines, given iron,
@@ -230,16 +228,20 @@ class ResidualComponent:
         )
 
 
-def widen_covariance(covariance: Array, plain: Array, left: ResidualComponent | None) -> Array:
-    """The covariance (12, 12), which exceeds `plain` by the misfit, widened to include at least the
-    error by `left`.
+def widen_covariance(
+    covariance: Array, explained: Array, component: ResidualComponent | None
+) -> Array:
+    """The answer's covariance (12, 12), widened so that it includes the error by `component`.
+
+    explained (12, 12): the covariance if the model explained the data. What misfit adds to it
+    already counts as part of that error.
     """
-    if left is None:
+    if component is None:
         return covariance
     scale = np.sqrt(np.diag(covariance))
     size = np.outer(scale, scale)
-    more = (left.added - (covariance - plain)) / size
-    values, vectors = np.linalg.eigh((more + more.T) / 2)
+    additional = (component.added - (covariance - explained)) / size
+    values, vectors = np.linalg.eigh((additional + additional.T) / 2)
     return np.asarray(covariance + size * ((vectors * np.clip(values, 0.0, None)) @ vectors.T))
 
 
@@ -250,8 +252,9 @@ def find_residual_component(
     correction: InstrumentCorrection,
     noise_gauss: float,
 ) -> ResidualComponent | None:
-    """The most probable component in the epochs that `linearise_locked` linearised. None if no
-    component has positive log odds, or if there are too few epochs.
+    """The most probable component in the epochs that `linearise_locked` linearised.
+
+    None if no component has positive log odds, or if there are too few epochs.
 
     prior_sigmas: of the gyro bias (rad/s), and (16,) of the instrument's imperfections and the
     place, each the largest one that is possible; noise_gauss: of one reading. LinAlgError: the

@@ -296,7 +296,7 @@ def _square_root(covariance: Array) -> Array:
     return np.asarray(scale[:, None] * (vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
 
 
-# -- What is left over: of the attitude, or of the time --------------------------------------------
+# -- Slow residuals: by attitude, or by time -------------------------------------------------------
 #
 # Slow noise of the magnetometer, a field that differs with place or attitude, and a changing iron
 # all leave residuals that are correlated in time. The norm of the field separates some of them
@@ -367,19 +367,19 @@ def slow_residual(c: Array, epochs: Sequence[tuple[chain.EpochData, bool]]) -> S
     if not moving:
         return None
     step_s = float(np.median(np.concatenate([part[0].dt_s[1:] for part in moving])))
-    slow, lag = _slow_variance_and_time([part[2] for part in moving])
+    slow_variance, lag = _slow_variance_and_time([part[2] for part in moving])
     total = float(np.mean(np.concatenate([part[2] for part in moving]) ** 2))
-    if lag is None or slow < _SLOW_SHARE * total:
+    if lag is None or slow_variance < _SLOW_SHARE * total:
         return None
     forgets_s = lag * step_s
     rests = [part[2] for part in parts if not part[1]]
     rested_s = sum(float(np.sum(part[0].dt_s[1:])) for part in parts if not part[1])
     goes_on = None
     if rested_s > _LEAST_REST * forgets_s:
-        share = _rest_variance(rests) / slow
+        share = _rest_variance(rests) / slow_variance
         goes_on = True if share > _GOES_ON else False if share < _STOPS else None
     repeats = _revisit_correlation(moving, max(_APART * forgets_s, _APART_S))
-    return SlowResidual(float(np.sqrt(slow)), forgets_s, repeats, goes_on)
+    return SlowResidual(float(np.sqrt(slow_variance)), forgets_s, repeats, goes_on)
 
 
 def _slow_variance_and_time(residuals_gauss: Sequence[Array]) -> tuple[float, int | None]:
@@ -410,19 +410,19 @@ def _revisit_correlation(
 ) -> float | None:
     """Correlation of the residuals at visits of the same directions, at least apart_s apart."""
     time_s = np.concatenate([data.time_s for data, *_ in parts])
-    left = np.concatenate([part[2] for part in parts])
+    residual = np.concatenate([part[2] for part in parts])
     cell = DirectionCells.cell_indices(np.concatenate([part[3] for part in parts]))
     edges = np.flatnonzero(np.diff(cell) != 0) + 1
     begins = np.r_[0, edges]
     count = np.diff(np.r_[begins, len(cell)])
-    mean = np.add.reduceat(left, begins) / count
+    mean = np.add.reduceat(residual, begins) / count
     when, where = time_s[begins], cell[begins]
     product = square = 0.0
     revisits = 0
     for one in np.unique(where):
-        own = np.flatnonzero(where == one)
-        kept = [own[0]]
-        for k in own[1:]:
+        visits = np.flatnonzero(where == one)
+        kept = [visits[0]]
+        for k in visits[1:]:
             if when[k] - when[kept[-1]] > apart_s:
                 kept.append(k)
         values = mean[kept]

@@ -144,22 +144,22 @@ _SAME_SIGMA_RATIO = 1.5  # of two sigmas that count as equal
 _SECONDS, _ROWS = 60.0, 20.0  # duration of a manoeuvre, and readings at each of its attitudes
 
 
-def motion_and_misfit(plain: Array, answer: Array, W: Array) -> dict[str, Array]:
+def motion_and_misfit(explained: Array, answer: Array, W: Array) -> dict[str, Array]:
     """Split of the answer's covariance (12, 12) of [M, b, w_b] between motion and misfit.
 
-    plain (12, 12): the covariance if the model explained the data; W whitens the prior. In
+    explained (12, 12): the covariance if the model explained the data; W whitens the prior. In
     directions that stay undetermined, the effect of misfit counts as motion: the data have too
     little information there to outweigh the misfit, and another place would change nothing.
     """
     scaled = W @ answer @ W.T
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
-    blind = vectors[:, values > UNDETERMINED_RATIO**2]
-    at_blind = np.linalg.solve(W, blind @ blind.T @ W)
-    others = np.eye(len(W)) - at_blind
-    more = answer - plain
+    undetermined = vectors[:, values > UNDETERMINED_RATIO**2]
+    onto_undetermined = np.linalg.solve(W, undetermined @ undetermined.T @ W)
+    onto_determined = np.eye(len(W)) - onto_undetermined
+    additional = answer - explained
     return {
-        "motion": plain + at_blind @ more @ at_blind.T,
-        "misfit": others @ more @ others.T,
+        "motion": explained + onto_undetermined @ additional @ onto_undetermined.T,
+        "misfit": onto_determined @ additional @ onto_determined.T,
     }
 
 

@@ -439,9 +439,9 @@ class _BlockBuilder:
             [np.column_stack([b.raw_b_gauss, b.gyro_b_rad_s]) for b in self._waiting]
         )
         last = self._waiting[-1]
-        left = len(time_s) - used
-        self._waiting = [_last_rows(last, left)] if left else []
-        self._count = left
+        remaining = len(time_s) - used
+        self._waiting = [_last_rows(last, remaining)] if remaining else []
+        self._count = remaining
         dt_s = np.diff(time_s[:used], prepend=time_s[:1])
         if not ((np.abs(table) < _LARGEST_READING).all() and (dt_s[1:] > 0).all()):
             return []
@@ -481,8 +481,8 @@ def _gradient_given_reference(
     )
     score = np.zeros(_CALIBRATION_COLUMNS)
     for b in blocks:
-        moved = b.reference.theta - reference.theta
-        score += b.score[known] + b.information[known, known] @ moved
+        theta_change = b.reference.theta - reference.theta
+        score += b.score[known] + b.information[known, known] @ theta_change
     K = total @ reference.root
     inner = np.eye(_CALIBRATION_COLUMNS) + reference.root.T @ K
     solved = np.linalg.solve(inner, np.column_stack([K.T, reference.root.T @ score]))
@@ -536,9 +536,9 @@ def _significant_size(size: Array, information: Array) -> float:
 
 def _onset_gains(block: ScoredBlock, size: Array) -> Array:
     """(n,) gains in this block of a step that begins in row k, with the block's field fitted."""
-    moved = block.lever @ size
+    effect = block.lever @ size
     residual = block.residual
-    cross = np.cumsum(np.sum(moved * residual, axis=1)[::-1])[::-1]
-    square = np.cumsum(np.sum(moved**2, axis=1)[::-1])[::-1]
-    mean = np.cumsum(moved[::-1], axis=0)[::-1]
-    return np.asarray(2 * cross - square + np.sum(mean**2, axis=1) / len(moved))
+    cross = np.cumsum(np.sum(effect * residual, axis=1)[::-1])[::-1]
+    square = np.cumsum(np.sum(effect**2, axis=1)[::-1])[::-1]
+    mean = np.cumsum(effect[::-1], axis=0)[::-1]
+    return np.asarray(2 * cross - square + np.sum(mean**2, axis=1) / len(effect))

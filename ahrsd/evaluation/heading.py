@@ -158,8 +158,8 @@ def optical_reference(track: EvaluationTrack) -> HeadingReference | None:
         if (size := float(np.linalg.norm(force_w))) > _LEAST_FORCE_M_S2:
             up_w = force_w / size
     x_w = R_wb[:, :, 0]
-    side = np.array([1.0, 0.0, 0.0]) if abs(up_w[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    ahead = side - up_w * (side @ up_w)
+    helper = np.array([1.0, 0.0, 0.0]) if abs(up_w[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    ahead = helper - up_w * (helper @ up_w)
     ahead /= np.linalg.norm(ahead)
     right = np.cross(-up_w, ahead)
     up_b = np.full((len(track), 3), np.nan)
@@ -245,13 +245,13 @@ def heading_figures(
         if reference.up_b is None:  # else the error is that of the field's azimuth, whatever x does
             level = np.linalg.norm(up_b[:, 1:], axis=1) / np.linalg.norm(up_b, axis=1)
             usable &= level > _LEVEL_ENOUGH
-    found, seen = _mean_heading_at(time_s[usable], heading[usable], reference)
-    if np.count_nonzero(seen) < _LEAST_OVERLAP:
+    headings, has_samples = _mean_heading_at(time_s[usable], heading[usable], reference)
+    if np.count_nonzero(has_samples) < _LEAST_OVERLAP:
         raise EvaluationError(
-            f"{reference.name}: {np.count_nonzero(seen)} instants within the recording, "
+            f"{reference.name}: {np.count_nonzero(has_samples)} instants within the recording, "
             f"{_LEAST_OVERLAP} are needed; are both on the same clock?"
         )
-    raw = found[seen] - reference.heading_rad[seen]
+    raw = headings[has_samples] - reference.heading_rad[has_samples]
     offset = float(np.angle(np.mean(np.exp(1j * raw))))
     error_deg = np.degrees(wrapped(raw - offset))
     folds = tuple(_rms(part) for part in np.array_split(error_deg, FOLDS))
@@ -261,8 +261,8 @@ def heading_figures(
         offset_deg=float(np.degrees(offset)),
         fold_rms_deg=folds,
         fold_spread_deg=float(np.std(folds)),
-        time_s=reference.time_s[seen],
-        reference_deg=np.mod(np.degrees(reference.heading_rad[seen]), 360.0),
+        time_s=reference.time_s[has_samples],
+        reference_deg=np.mod(np.degrees(reference.heading_rad[has_samples]), 360.0),
         error_deg=error_deg,
     )
 
@@ -391,19 +391,19 @@ def reckoning_figures(
         v = np.nan_to_num(_level_velocity(field_b, up_b, velocity))
     dt_s = np.diff(track.time_s)
     path = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * dt_s)])
-    found = np.interp(fixes.time_s, track.time_s, path)
-    found -= found[0]
+    position = np.interp(fixes.time_s, track.time_s, path)
+    position -= position[0]
     true = fixes.north_m + 1j * fixes.east_m
-    offset = np.angle(np.sum(np.diff(found) * np.conj(np.diff(true))))
-    found = found * np.exp(-1j * offset)
-    error = np.abs(found - true)
+    offset = np.angle(np.sum(np.diff(position) * np.conj(np.diff(true))))
+    position = position * np.exp(-1j * offset)
+    error = np.abs(position - true)
     return ReckoningFigures(
         rms_percent=100.0 * float(np.sqrt(np.mean(error**2))) / way_m,
         final_percent=100.0 * float(error[-1]) / way_m,
         worst_m=float(np.max(error)),
         offset_deg=float(np.degrees(offset)),
-        north_m=np.real(found),
-        east_m=np.imag(found),
+        north_m=np.real(position),
+        east_m=np.imag(position),
     )
 
 

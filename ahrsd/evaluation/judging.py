@@ -443,11 +443,11 @@ def _comparison_figures(found: Evaluation, which: Literal["before", "after"]) ->
     """Heading RMS and worst (deg), dead reckoning (%), spread (%); NaN if there is none."""
     nan = float("nan")
     heading = getattr(found.headings[0].figures, which) if found.headings else None
-    reckoned = None if found.reckoned is None else getattr(found.reckoned.figures, which)
+    dead_reckoning = None if found.reckoned is None else getattr(found.reckoned.figures, which)
     return (
         nan if heading is None else heading.rms_deg,
         nan if heading is None else heading.worst_deg,
-        nan if reckoned is None else reckoned.rms_percent,
+        nan if dead_reckoning is None else dead_reckoning.rms_percent,
         100 * getattr(found.field, which).spread,
     )
 

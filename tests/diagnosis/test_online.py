@@ -307,8 +307,8 @@ def test_nothing_is_said_before_there_is_a_converged_estimate_and_memory_is_boun
     watched(plain.blocks(64), estimate_of(plain), detector)
     assert detector.scored == 156
     assert len(detector._blocks) == KEPT
-    assert len(detector._single) < 2 * KEPT + 1
-    assert detector._intake._count < 128
+    assert len(detector._single_gains) < 2 * KEPT + 1
+    assert detector._builder._count < 128
 
 
 def test_a_block_says_what_the_model_says():
