@@ -98,10 +98,10 @@ def test_delay_turns_what_the_field_is_the_image_of():
         np.ones((5, 3)), rate * dt[:, None], dt, np.ones((5, 3)), np.cumsum(dt), measures_first=True
     )
     np.testing.assert_allclose(row_rates(data), np.tile(rate, (5, 1)))
-    seen = with_lag(data, 0.1).seen(np.tile([1.0, 0.0, 0.0], (5, 1)))
+    seen = with_lag(data, 0.1).field_directions(np.tile([1.0, 0.0, 0.0], (5, 1)))
     # u turns against the sensor, so 0.1 s before it was 0.2 rad ahead
     np.testing.assert_allclose(seen, np.tile([np.cos(0.2), np.sin(0.2), 0.0], (5, 1)))
-    back = with_lag(with_lag(data, 0.1), -0.1).seen(np.tile([1.0, 0.0, 0.0], (5, 1)))
+    back = with_lag(with_lag(data, 0.1), -0.1).field_directions(np.tile([1.0, 0.0, 0.0], (5, 1)))
     np.testing.assert_allclose(back, np.tile([1.0, 0.0, 0.0], (5, 1)), atol=1e-15)
 
 
