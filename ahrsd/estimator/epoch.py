@@ -362,13 +362,8 @@ _FIELD_COLUMNS, _MOTION_COLUMNS = np.r_[0:9, LAG, PLACE], np.r_[9:15, SCALE:22]
 _PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
 IMPERFECTIONS = ("axes", "lag", "scales", "place", "bias")
 _PLACE = np.r_[10:16]
-_IMPERFECTION_ROWS = (
-    np.r_[0:3],
-    np.r_[3:4],
-    np.r_[4:10],
-    _PLACE,
-    np.r_[16:19],
-)  # among the 19 imperfections
+# among the 19 imperfections
+_IMPERFECTION_ROWS = (np.r_[0:3], np.r_[3:4], np.r_[4:10], _PLACE, np.r_[16:19])
 _MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # beyond any gyro's tolerance; and significant
 _GYRO = np.r_[TURN, SCALE:22]  # turn, scale and shape of the gyro's angles
 GYRO_AMONG_IMPERFECTIONS = _GYRO - 12  # the same among the 19 imperfections
@@ -1123,9 +1118,8 @@ def _whitening(H: Array) -> tuple[Array, Array]:
 _MOST_ROWS = 0.6  # share of the rows that must contradict
 _LEAST_SPREAD_RAD = 0.1  # spread of the field's direction over the rows that contradict
 _EXPLAINED = 0.9  # share of the epoch's cost that another hard iron alone must take away
-_IRON_AND_BORDERS = np.r_[
-    6:9, 12:16
-]  # hard iron and borders among the numbers of `chain.Quadratic`
+# hard iron and borders among the numbers of `chain.Quadratic`
+_IRON_AND_BORDERS = np.r_[6:9, 12:16]
 
 
 def contradicts(

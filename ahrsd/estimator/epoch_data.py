@@ -586,10 +586,8 @@ def with_gyro_matrix(data: chain.EpochData, gyro: Array, lag_s: float) -> chain.
 # and the differences of the fields inside it, which matter only at large rotations (_TURN_RAD).
 
 _LARGEST_GROUP = 7
-_TURN_RAD, _FAST_SHARE = (
-    0.3,
-    0.95,
-)  # rotation in a group, which this share of the steps respects
+# rotation in a group, which this share of the steps respects
+_TURN_RAD, _FAST_SHARE = 0.3, 0.95
 _LOST_INFORMATION = 0.03
 _FEWEST_ROWS = 3  # shorter epochs are not grouped
 

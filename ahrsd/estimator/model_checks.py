@@ -44,10 +44,8 @@ from ahrsd.samples import Array
 # covariance is widened accordingly.
 
 _HARD = slice(6, 9)
-_CHI2, _MISFIT_RATIO = (
-    100.0,
-    3.0,
-)  # of a second hard iron; factor by which the misfit must fall
+# of a second hard iron; factor by which the misfit must fall
+_CHI2, _MISFIT_RATIO = 100.0, 3.0
 _LEAST_EPOCHS = 2  # before and after: a single epoch may have been at another place
 _LEAST_CHANGE = 0.03  # of the field: a smaller change may be due to place
 _CHANCE = 12.0  # chi squared of the best time by chance, in units of the misfit

@@ -29,9 +29,8 @@ from ahrsd.samples import Array
 
 _MAD = 1.4826
 _GYRO_LIMIT = 1.5
-_FAR_RATIO = (
-    1.7  # ratio of the gyro's variance to the assumed one, beyond which that step is not extended
-)
+# ratio of the gyro's variance to the assumed one, beyond which that step is not extended
+_FAR_RATIO = 1.7
 _LEAST_FREEDOM = 0.2  # least share of the degrees of freedom that fitting leaves
 # Degrees of freedom of the prior that shrinks an epoch's noise towards the usual one. The gyro has
 # so few per epoch that its level per epoch would be mostly chance, and weighting by chance is
@@ -307,10 +306,8 @@ def _square_root(covariance: Array) -> Array:
 _DECAYED = float(np.exp(-1.0))  # of the correlation, at which it counts as decayed
 _APART, _APART_S = 4.0, 2.0  # correlation times, and seconds, between independent visits
 _FEWEST_VISITS = 12  # repeated visits of directions, in total
-_REPEATING, _NOT_REPEATING = (
-    0.6,
-    0.3,
-)  # correlation of visits above which errors repeat, below which they do not
+# correlation of visits above which errors repeat, below which they do not
+_REPEATING, _NOT_REPEATING = 0.6, 0.3
 _SLOW_SHARE = 0.2  # least slow share of the residuals' variance
 _LEAST_REST = 10.0  # correlation times at rest that are needed for a decision
 _GOES_ON, _STOPS = 0.5, 0.1  # share of its variance at rest

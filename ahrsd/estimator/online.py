@@ -257,9 +257,8 @@ class HeadingAdvice:
         for R in pieces:
             columns = chain.symmetric_columns(R @ field)
             integral = np.cumsum(np.swapaxes(R, 1, 2), axis=0) * (_SECONDS / len(pieces) / len(R))
-            bias = (
-                -M @ R @ so3.skew(field) @ integral
-            )  # rotation error in the level frame by the gyro bias
+            # rotation error in the level frame by the gyro bias
+            bias = -M @ R @ so3.skew(field) @ integral
             iron = np.concatenate([columns, np.tile(np.eye(3), (len(R), 1, 1)), bias], axis=2)
             J = np.concatenate([iron, M @ R @ across], axis=2).reshape(-1, 14)
             H = J.T @ J

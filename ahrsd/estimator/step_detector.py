@@ -47,10 +47,8 @@ LEAST_ROWS = 64  # least rows of a piece before a gap that is scored
 #: columns of a block: those of `Estimate.gyro_covariance`, then a drift of the field in the world
 SOFT, IRON, GYRO, MATRIX = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 21)
 DRIFT, _LAG, _RESIDUAL = slice(21, 24), 27, 28
-_CALIBRATION_COLUMNS, _OWN = (
-    21,
-    slice(24, 28),
-)  # and the nuisance parameters of a block: field (3) and lag
+# and the nuisance parameters of a block: field (3) and lag
+_CALIBRATION_COLUMNS, _OWN = 21, slice(24, 28)
 _ENTRIES = np.triu_indices(3)
 # least 1-sigma of a calibration: its own changes from minute to minute
 _FLOOR = np.r_[np.full(6, 1e-3), np.full(3, 5e-4), np.full(3, 2e-4)]
@@ -223,12 +221,8 @@ RATE_HZ = 12.5  # of the thinned samples: a higher rate follows faster motion an
 KEPT = 16  # blocks
 _LARGEST_READING = 100.0  # gauss or rad/s: beyond the range of these sensors
 _RATE_ROWS = 9  # that give the rate of a piece, independently of the blocks
-_WINDOWS = (
-    1,
-    2,
-    4,
-    8,
-)  # numbers of informative blocks that are tested together; 1: for the baseline only
+# numbers of informative blocks that are tested together; 1: for the baseline only
+_WINDOWS = (1, 2, 4, 8)
 _LEAST_BASELINE, _LONGEST_BASELINE = 4, 24  # number of blocks in the baseline
 _LEAST_GAIN_RATIO = 40.0  # T over the baseline; in a simulated week 17, with coloured noise 27
 _LEAST_GAIN_SHARE = 0.7  # of the gain of each block by a D of its own

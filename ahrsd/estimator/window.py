@@ -496,9 +496,8 @@ class Window:
         """
         if np.linalg.eigvalsh(chain.symmetric(self.graph.c[:6]))[0] <= 0:
             return float(np.inf)
-        which = [
-            k for k, e in enumerate(self.epochs) if e.has_motion
-        ]  # the others do not depend on c
+        # the others do not depend on c
+        which = [k for k, e in enumerate(self.epochs) if e.has_motion]
         epochs = [self.epochs[k] for k in which]
         places = zip(epochs, self._moved_directions(which), strict=True)
         self._replace(which, [LinearisationPlan(e.piece, u, e.used, e.weights) for e, u in places])
@@ -589,9 +588,8 @@ class Window:
         )
         graph.temper, graph.hold = 1.0, np.zeros((9, 9))
         self.found_misfit, chance = self.misfit.value(factors, scores, graph, graph.step())
-        significant = (
-            self.found_misfit > 1.0 + _CHANCE * chance
-        )  # below, it could only widen the sigmas
+        # below, it could only widen the sigmas
+        significant = self.found_misfit > 1.0 + _CHANCE * chance
         self._excess_misfit = max(1.0, self.found_misfit - _CHANCE * chance)
         graph.temper = max(
             1.0, self.found_misfit if significant else 1.0, self._attitude_inflation()
@@ -675,10 +673,8 @@ class Window:
 # noise of the field.
 
 _LEAST_CURVATURE = 0.02  # sigmas
-_NOISE_CHANGE, _NOISE_CHANGE_EXACT = (
-    0.1,
-    0.04,
-)  # relative change of the gyro's noise level since the linearisation
+# relative change of the gyro's noise level since the linearisation
+_NOISE_CHANGE, _NOISE_CHANGE_EXACT = 0.1, 0.04
 
 _LEAST_DRIFT = 0.3  # of the field's noise: drift at rest by a changed bias
 
