@@ -589,8 +589,8 @@ def lag_uncertainty(
     H = past.at(graph.c, InstrumentCorrection.identity())[0]
     H = H + sum(epoch.instrument.H for epoch in epochs if epoch.instrument is not None)
     H = prior_quadratic(graph, sigma_bias)[0] + H[:_ESTIMATED, :_ESTIMATED]
-    sigma = float(np.sqrt(graph.temper * _inverse(H)[LAG, LAG]))
-    return Lag(sigma, -sigma * (_inverse(H[:12, :12]) @ H[:12, LAG]))
+    sigma = float(np.sqrt(graph.temper * _scaled_inverse(H)[LAG, LAG]))
+    return Lag(sigma, -sigma * (_scaled_inverse(H[:12, :12]) @ H[:12, LAG]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -601,16 +601,11 @@ class Lag:
     spread: Array
 
 
-def _inverses(H: Array) -> Array:
-    """Inverse of each matrix (..., n, n), as `_inverse`."""
+def _scaled_inverse(H: Array) -> Array:
+    """Inverse of each positive definite matrix (..., n, n), whose rows may have any units."""
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=-2, axis2=-1), 1e-30))
     sizes = scale[..., :, None] * scale[..., None, :]
     return np.asarray(np.linalg.inv(H * sizes) * sizes)
-
-
-def _inverse(H: Array) -> Array:
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
-    return np.asarray(np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale))
 
 
 def estimate_instrument(
@@ -628,7 +623,7 @@ def estimate_instrument(
     if before is not None:
         H, g = H + before[0][:_ESTIMATED, :_ESTIMATED], g + before[1][:_ESTIMATED]
     H, g = H + epochs[0].sum(axis=0), g + epochs[1].sum(axis=0)
-    covariance = _inverse(H)
+    covariance = _scaled_inverse(H)
     step = -covariance @ g
     misfit = max(1.0, disagreement(*epochs, step))
     return Instrument(step, misfit * covariance, misfit, scaled)
@@ -671,7 +666,9 @@ class ImperfectionLikelihood:
         H[:_SIZE, :_SIZE] += before[0]
         g[:_SIZE] += before[1]
         prior_H, prior_g = prior_quadratic(graph, sigma_bias)
-        covariance = _inverse(H[_CALIBRATION, _CALIBRATION] + prior_H[_CALIBRATION, _CALIBRATION])
+        covariance = _scaled_inverse(
+            H[_CALIBRATION, _CALIBRATION] + prior_H[_CALIBRATION, _CALIBRATION]
+        )
         response, gradient = (
             -covariance @ H[_CALIBRATION, _IMPERFECT],
             g[_CALIBRATION] + prior_g[_CALIBRATION],
@@ -697,7 +694,7 @@ class ImperfectionLikelihood:
         sigmas (..., 19): prior sigmas.
         """
         prior_information = temper / sigmas**2
-        covariance = _inverses(
+        covariance = _scaled_inverse(
             self.information + prior_information[..., None] * np.eye(prior_information.shape[-1])
         )
         return covariance, -(

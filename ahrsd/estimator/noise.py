@@ -306,8 +306,7 @@ def _square_root(covariance: Array) -> Array:
 _DECAYED = float(np.exp(-1.0))  # of the correlation, at which it counts as decayed
 _APART, _APART_S = 4.0, 2.0  # correlation times, and seconds, between independent visits
 _FEWEST_VISITS = 12  # repeated visits of directions, in total
-# correlation of visits above which errors repeat, below which they do not
-_REPEATING, _NOT_REPEATING = 0.6, 0.3
+_NOT_REPEATING = 0.3  # correlation of visits below which errors do not repeat
 _SLOW_SHARE = 0.2  # least slow share of the residuals' variance
 _LEAST_REST = 10.0  # correlation times at rest that are needed for a decision
 _GOES_ON, _STOPS = 0.5, 0.1  # share of its variance at rest

@@ -38,6 +38,7 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.calibration import Estimate
+from ahrsd.estimator.chain import symmetric_columns
 from ahrsd.estimator.epoch import GYRO_BASIS, InstrumentCorrection
 from ahrsd.samples import Array, SampleBlock
 
@@ -151,7 +152,7 @@ class Scorer:
         h = y.mean(axis=0)
         Z = np.zeros((n, 3, _RESIDUAL + 1))
         across = so3.skew(h)
-        Z[:, :, SOFT] = lever @ _soft_iron_columns(h @ R)
+        Z[:, :, SOFT] = lever @ symmetric_columns(h @ R)
         Z[:, :, IRON] = lever
         bias_integral = np.cumsum(R * dt_s[:, None, None], axis=0) @ reference.gyro_correction
         Z[:, :, GYRO] = -across @ bias_integral
@@ -205,15 +206,6 @@ def _rates_at_rows(turn: Array, dt_s: Array) -> Array:
     rate = turn[1:] / dt_s[1:, None]
     out = np.concatenate([rate[:1], rate])
     out[1:-1] = (rate[:-1] + rate[1:]) / 2
-    return out
-
-
-def _soft_iron_columns(field_b: Array) -> Array:
-    """d(A h)/d entries of the symmetric A, (n, 3, 6)."""
-    out = np.zeros((len(field_b), 3, 6))
-    for column, (i, j) in enumerate(zip(*_ENTRIES, strict=True)):
-        out[:, i, column] = field_b[:, j]
-        out[:, j, column] = field_b[:, i]
     return out
 
 
