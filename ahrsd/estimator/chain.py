@@ -1,19 +1,19 @@
-"""One epoch: n field directions linked by the gyroscope, eliminated onto what the epochs share.
+"""One epoch: n field directions linked by the gyroscope, eliminated onto the shared variables.
 
 Model of an epoch (frame b, sensor; u_k unit vectors, M = A |h|):
 
     field    m_k = M u_k + b + noise,                   noise_mag per axis
     motion   u_k = Exp(-(phi_k - w_b dt_k)) u_(k-1) + tangential noise of noise_gyro * dt_k
 
-The field's magnitude never changes along the chain, because u_k stays on the sphere: the norm
-information of TWOSTEP and the rotation information of MAGYC are one likelihood, and nothing is
-differentiated. Gyro noise about u_k itself moves nothing and needs no state. A row may stand for
+The field's magnitude is constant along the chain, because u_k stays on the sphere. So the norm
+information of TWOSTEP and the rotation information of MAGYC form one likelihood, and nothing is
+differentiated. Gyro noise about u_k itself has no effect and needs no state. A row may stand for
 several steps (`Averaging`): then m_k = M P_k u_k + b, with less noise.
 
 Each u_k moves in its tangent plane, u_k + T_k d_k. Gauss-Newton then gives a block tridiagonal
-system in the d_k, bordered by what is shared: x = [M (6), b (3)], the epoch's gyro bias (3) and the
-two border directions (2 + 2), which the neighbouring epochs see too. The interior is eliminated by
-a banded Cholesky factorisation; what remains is one quadratic in 16 numbers, whatever n is.
+system in the d_k, bordered by the shared variables: x = [M (6), b (3)], the gyro bias of the epoch
+(3) and the two border directions (2 + 2), which the neighbouring epochs share. A banded Cholesky
+factorisation eliminates the interior; the result is one quadratic in 16 numbers, whatever n is.
 
 Residuals and their derivatives (checked numerically in tests/estimator/test_chain.py):
 
@@ -37,10 +37,10 @@ from ahrsd.samples import Array
 
 # -- Epochs in a row, and the residuals of field and motion ----------------------------------------
 #
-# Epochs as rows: what they measured, and the residuals of field and motion with derivatives.
+# Epochs as rows: their measurements, and the residuals of field and motion with derivatives.
 #
-# Several epochs, each where it is to be linearised, are put in one row and handled together: a few
-# operations on long arrays instead of many on short ones.
+# Several epochs, each with its own linearisation point, are concatenated and handled together: a
+# few operations on long arrays instead of many on short ones.
 
 _ROWS = np.array([0, 0, 0, 1, 1, 2])
 _COLS = np.array([0, 1, 2, 1, 2, 2])
@@ -79,12 +79,12 @@ class Noise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Averaging:
-    """Rows whose field is a mean over several steps (`epoch_data.grouped`).
+    """Rows whose field is a mean over several steps (`epoch_data.group_steps`).
 
-    count (n,) steps in a row, turn (n, 3, 3) mean rotation P from the row's direction u to those of
-    its steps: the row measured M P u + b with the noise of one step / sqrt(count); spread_s (n,)
-    root of the sum of squared steps of time on the way from the row before: the gyro's noise;
-    rate_b_rad_s (n, 3) mean of its steps.
+    count (n,): steps in a row; turn (n, 3, 3): mean rotation P from the row's direction u to those
+    of its steps, so that the row measured M P u + b with the noise of one step / sqrt(count);
+    spread_s (n,): root of the sum of squared time steps since the row before, which scales the
+    gyro's noise; rate_b_rad_s (n, 3): mean over its steps.
     """
 
     count: Array
@@ -95,11 +95,12 @@ class Averaging:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpochData:
-    """What an epoch measured. Row 0 is the border shared with the previous epoch (or a fresh start,
-    then `measures_first`); angle and dt of row 0 are not used.
+    """Measurements of an epoch. Row 0 is the border shared with the previous epoch, or a fresh
+    start (then `measures_first`); angle and dt of row 0 are not used.
 
-    field_b_gauss (n, 3), angle_b_rad (n, 3), dt_s (n,), down_b (n, 3) unit or nan, time_s (n,)
-    linked (n,) is 0 for rows that the gyro does not link to the row before, else 1; None: all are.
+    field_b_gauss (n, 3), angle_b_rad (n, 3), dt_s (n,), down_b (n, 3) unit or nan, time_s (n,).
+    linked (n,): 0 for rows that the gyro does not link to the row before, else 1; None: all are
+    linked.
     """
 
     field_b_gauss: Array
@@ -116,30 +117,32 @@ class EpochData:
 
     @property
     def count(self) -> Array | float:
-        """Steps that a row's field is the mean of."""
+        """Number of steps averaged in each row's field."""
         return 1.0 if self.averaging is None else self.averaging.count
 
     @property
     def steps(self) -> int:
-        """How many steps it holds."""
+        """Total number of steps."""
         return len(self) if self.averaging is None else int(self.averaging.count.sum())
 
-    def seen(self, directions: Array) -> Array:
-        """What the field of each row is the image of: directions (n, 3) or tangents (n, 3, 2)."""
+    def field_directions(self, directions: Array) -> Array:
+        """Directions (n, 3) or tangents (n, 3, 2) after averaging, so that M times them predicts
+        the field of each row.
+        """
         if self.averaging is None:
             return directions
         if directions.ndim == 3:
             return np.asarray(self.averaging.turn @ directions)
-        return times(self.averaging.turn, directions)
+        return matrix_vector(self.averaging.turn, directions)
 
     def field_error(self, u: Array, x: Array) -> Array:
         """Field less its prediction at directions u (n, 3) and x = [M6, b]; gauss."""
-        return np.asarray(self.field_b_gauss - self.seen(u) @ symmetric(x[:6]) - x[6:9])
+        return np.asarray(self.field_b_gauss - self.field_directions(u) @ symmetric(x[:6]) - x[6:9])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """An epoch and where it is to be linearised: directions u (n, 3), gyro bias (3,) in rad/s.
+    """An epoch and its linearisation point: directions u (n, 3), gyro bias (3,) in rad/s.
 
     weights (n,) are those of the field residuals, None for 1.
     """
@@ -153,13 +156,14 @@ class Chain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Chains in one row, N rows in all; the motion into the first row of each links nothing.
+    """Concatenated chains, N rows in all; no motion links the first row of each.
 
-    Arrays of vectors and matrices have the row as their last axis (`linearise_all` runs over long
-    axes). first, last (E,): where each begins and ends; per row: field_b_gauss, angle_b_rad, u,
-    bias (3, N), dt_s (N,); stiff (N,) 1 / (spread of the gyro's noise), 0 where nothing links;
-    count (N,), turn (3, 3, N) or None as in `Averaging`; mag_gauss (N,) noise of a step; weights
-    (N,) of the field; measured (N,) 0 where the field was counted by the epoch before.
+    Arrays of vectors and matrices have the row as their last axis, so that `linearise_all` runs
+    over long axes. first, last (E,): first and last row of each chain. Per row: field_b_gauss,
+    angle_b_rad, u, bias (3, N), dt_s (N,); stiff (N,): 1 / (standard deviation of the gyro's
+    noise), 0 without a link; count (N,) and turn (3, 3, N) or None, as in `Averaging`; mag_gauss
+    (N,): noise of a step; weights (N,) of the field; measured (N,): 0 if the epoch before counts
+    the field.
     """
 
     first: Index
@@ -178,7 +182,7 @@ class Rows:
 
     @staticmethod
     def of(chains: Sequence[Chain]) -> Rows:
-        """Epochs one after the other."""
+        """Concatenate epochs."""
         data = [c.data for c in chains]
         sizes = np.array([len(d) for d in data])
         first = np.cumsum(sizes) - sizes
@@ -205,10 +209,10 @@ class Rows:
         return Rows(
             first,
             first + sizes - 1,
-            _columns([d.field_b_gauss for d in data]),
-            _columns([d.angle_b_rad for d in data]),
+            _row_last([d.field_b_gauss for d in data]),
+            _row_last([d.angle_b_rad for d in data]),
             dt,
-            _columns([c.u for c in chains]),
+            _row_last([c.u for c in chains]),
             np.repeat(np.array([c.bias for c in chains]).T, sizes, axis=1),
             linked / (gyro * spread),
             count,
@@ -219,7 +223,7 @@ class Rows:
         )
 
 
-def _columns(pieces: Sequence[Array]) -> Array:
+def _row_last(pieces: Sequence[Array]) -> Array:
     return np.ascontiguousarray(np.concatenate(pieces).T)
 
 
@@ -229,7 +233,7 @@ def robust_weights(residual: Array, limit_gauss: Array | float) -> Array:
     return np.asarray(np.minimum(1.0, limit_gauss**2 / size2))
 
 
-def times(J: Array, v: Array) -> Array:
+def matrix_vector(J: Array, v: Array) -> Array:
     """J_k v_k for stacks of matrices (n, i, j) and vectors (n, j)."""
     return np.asarray((J @ v[:, :, None])[:, :, 0])
 
@@ -241,7 +245,7 @@ class FieldPart:
     J: Array
     tangents: Array
     weights: Array
-    seen: Array  # (2, N) squared sizes of the columns of M P_k T_k
+    column_squares: Array  # (2, N) of M P_k T_k
 
     @property
     def r(self) -> Array:
@@ -249,7 +253,7 @@ class FieldPart:
         return self.J[:, 11]
 
     @property
-    def own(self) -> Array:
+    def by_direction(self) -> Array:
         """d r/d d_k (3, 2, N)."""
         return self.J[:, :2]
 
@@ -275,7 +279,7 @@ class MotionPart:
         return self.J[:, 5]
 
     @property
-    def prev(self) -> Array:
+    def by_previous(self) -> Array:
         """d q/d d_(k-1) (2, 2, N)."""
         return self.J[:, :2]
 
@@ -285,13 +289,15 @@ class MotionPart:
         return self.J[:, 2:5]
 
 
-def parts(rows: Rows, x: Array, outlier_sigma: float | None = None) -> tuple[FieldPart, MotionPart]:
+def field_and_motion(
+    rows: Rows, x: Array, outlier_sigma: float | None = None
+) -> tuple[FieldPart, MotionPart]:
     """Residuals of field and motion with their derivatives; see `linearise_all`."""
     frame = so3.frames(rows.u)
-    return _field(rows, frame, x, outlier_sigma), _motion(rows, frame)
+    return _field_part(rows, frame, x, outlier_sigma), _motion_part(rows, frame)
 
 
-def _field(rows: Rows, frame: Array, x: Array, outlier_sigma: float | None) -> FieldPart:
+def _field_part(rows: Rows, frame: Array, x: Array, outlier_sigma: float | None) -> FieldPart:
     seen = frame if rows.turn is None else np.einsum("ijn,jkn->ikn", rows.turn, frame)
     image = (symmetric(x[:6]) @ seen.reshape(3, -1)).reshape(seen.shape)
     error = rows.field_b_gauss - image[:, 2] - x[6:9, None]
@@ -312,27 +318,27 @@ def _field(rows: Rows, frame: Array, x: Array, outlier_sigma: float | None) -> F
     return FieldPart(J, frame[:, :2], weights, np.sum(own * own, axis=0))
 
 
-def _motion(rows: Rows, frame: Array) -> MotionPart:
+def _motion_part(rows: Rows, frame: Array) -> MotionPart:
     dt = rows.dt_s
     R, Jl = so3.columns_exp_and_left_jacobian(rows.bias * dt - rows.angle_b_rad)
     turned = np.einsum("ijn,jkn->ikn", R[:, :, 1:], frame[:, :, :-1])
     across = frame[:, :2, 1:] * rows.stiff[1:]
-    moved = np.einsum("jin,jkn->ikn", across, turned)
+    derivatives = np.einsum("jin,jkn->ikn", across, turned)
     J = np.zeros((2, 6, frame.shape[2]))
-    J[:, :2, 1:], J[:, 5, 1:] = moved[:, :2], moved[:, 2]
+    J[:, :2, 1:], J[:, 5, 1:] = derivatives[:, :2], derivatives[:, 2]
     (x, y, z), (p, q, r) = turned[:, 2] * dt[1:], across
-    beside = np.array([y * r - z * q, z * p - x * r, x * q - y * p])  # - across^T [R u dt]x
-    np.einsum("jin,jkn->ikn", beside, Jl[:, :, 1:], out=J[:, 2:5, 1:])
+    by_bias = np.array([y * r - z * q, z * p - x * r, x * q - y * p])  # - across^T [R u dt]x
+    np.einsum("jin,jkn->ikn", by_bias, Jl[:, :, 1:], out=J[:, 2:5, 1:])
     return MotionPart(J, rows.stiff)
 
 
-def interior(field: FieldPart, motion: MotionPart) -> tuple[Array, Array, Array]:
+def interior_blocks(field: FieldPart, motion: MotionPart) -> tuple[Array, Array, Array]:
     """Diagonal blocks (2, 2, N), blocks above them (2, 2, N - 1), and the border columns
     (2, 13, N): x (9), bias (3), gradient.
     """
     scale = motion.scale
-    own = np.einsum("rin,rjn->ijn", field.own, field.J)
-    prev = np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], motion.J[:, :, 1:])
+    own = np.einsum("rin,rjn->ijn", field.by_direction, field.J)
+    prev = np.einsum("rin,rjn->ijn", motion.by_previous[:, :, 1:], motion.J[:, :, 1:])
     diag = own[:, :2].copy()
     for i in range(2):
         diag[i, i] += scale**2
@@ -342,20 +348,20 @@ def interior(field: FieldPart, motion: MotionPart) -> tuple[Array, Array, Array]
     np.multiply(motion.J[:, 2:], -scale, out=border[:, 9:])
     border[:, 12] += own[:, 11]
     border[:, 9:, :-1] += prev[:, 2:]
-    return diag, -scale[1:] * motion.prev[:, :, 1:].transpose(1, 0, 2), border
+    return diag, -scale[1:] * motion.by_previous[:, :, 1:].transpose(1, 0, 2), border
 
 
 # -- The interior eliminated -----------------------------------------------------------------------
 #
-# Block tridiagonal chains of 2x2 blocks: their interior eliminated onto what is shared.
+# Elimination of the interior of block tridiagonal chains of 2x2 blocks onto the shared variables.
 #
-# Several chains are handled as one whose couplings between them are zero. Each keeps its first and
-# its last block. The interior's Hessian is factored as L L^T (banded); with Y = L^-1 B, B what
-# couples the interior to the rest and its gradient, the Schur complement takes Y^T Y away, and a
-# step of the interior costs one more triangular solution, for one column.
+# Several chains are handled as one with zero couplings between them. Each keeps its first and its
+# last block. The Hessian of the interior is factored as L L^T (banded). With Y = L^-1 B, where B
+# holds the coupling of the interior to the other variables and its gradient, the Schur complement
+# subtracts Y^T Y. A step of the interior costs one more triangular solution, for one column.
 
 Index = NDArray[np.intp]
-_SHARED = 12  # columns of what all blocks couple to; then come the first and the last block
+_SHARED = 12  # columns of the shared variables; the first and the last block follow
 _GRADIENT = 16
 
 
@@ -367,22 +373,25 @@ class Interior:
     half: Array
 
     def step(self, z: Array) -> Array:
-        """Moves (n, 2) of the interior where the 16 numbers that it couples to move by z."""
+        """Moves (n, 2) of the interior if the 16 numbers to which it couples move by z."""
         right = self.half[:, :_GRADIENT] @ z + self.half[:, _GRADIENT]
         solved, _ = dtbtrs(self.factor, -right[:, None], uplo="L", trans="T", overwrite_b=1)
         return np.asarray(solved.reshape(-1, 2))
 
     def part(self, first: int, last: int) -> Interior:
-        """A copy of what lies between two border blocks, given where they are."""
+        """A copy of the rows between two border blocks, given their positions."""
         rows = slice(2 * first + 2, 2 * last)
         return Interior(self.factor[:, rows].copy(order="F"), self.half[rows].copy(order="F"))
 
 
-def eliminated(diag: Array, upper: Array, border: Array, first: Index, last: Index) -> Interior:
-    """Of chains in one row: blocks (2, 2, N), those above them (2, 2, N - 1), border (2, 13, N).
+def eliminate_interior(
+    diag: Array, upper: Array, border: Array, first: Index, last: Index
+) -> Interior:
+    """Eliminate concatenated chains: blocks (2, 2, N), those above them (2, 2, N - 1), border (2,
+    13, N).
 
     border: coupling to the 12 shared numbers, and the gradient; first, last: rows of each chain's
-    border blocks, whose rows of the result mean nothing. LinAlgError where a direction is not
+    border blocks. Those rows of the result have no meaning. LinAlgError if a direction is not
     determined.
     """
     n = diag.shape[2]
@@ -395,19 +404,19 @@ def eliminated(diag: Array, upper: Array, border: Array, first: Index, last: Ind
     diag, upper = diag.copy(), upper.copy()
     diag[:, :, first] = diag[:, :, last] = np.eye(2)[:, :, None]
     upper[:, :, first] = upper[:, :, last - 1] = 0.0
-    return Interior(*halfway(diag, upper, right))
+    return Interior(*factor_and_solve_lower(diag, upper, right))
 
 
-def halfway(diag: Array, upper: Array, right: Array) -> tuple[Array, Array]:
+def factor_and_solve_lower(diag: Array, upper: Array, right: Array) -> tuple[Array, Array]:
     """L, banded, of a symmetric block tridiagonal matrix, and L^-1 times right (columns, N, 2)."""
-    factor, info = dpbtrf(band(diag, upper), lower=1, overwrite_ab=1)
+    factor, info = dpbtrf(banded_storage(diag, upper), lower=1, overwrite_ab=1)
     if info != 0:
         raise np.linalg.LinAlgError(f"directions of an epoch are not determined (dpbtrf {info})")
     half, _ = dtbtrs(factor, right.reshape(len(right), -1).T, uplo="L", overwrite_b=1)
     return factor, half
 
 
-def band(diag: Array, upper: Array) -> Array:
+def banded_storage(diag: Array, upper: Array) -> Array:
     """Lower banded storage (4, 2n) of a symmetric block tridiagonal matrix with 2x2 blocks."""
     out = np.zeros((4, 2 * diag.shape[2]), order="F")
     out[0, 0::2], out[0, 1::2] = diag[0, 0], diag[1, 1]
@@ -423,7 +432,7 @@ def band(diag: Array, upper: Array) -> Array:
 FIRST = slice(12, 14)
 LAST = slice(14, 16)
 WIDTH = 16
-_COUPLED = np.r_[0:12, 16]  # of the 17 numbers, gradient last: those that all directions couple to
+_COUPLED = np.r_[0:12, 16]  # of the 17 numbers, gradient last: those coupled to all directions
 _FIELD = np.ix_(np.r_[0:9, 16], np.r_[0:9, 16])
 _MOTION = np.ix_(np.r_[9:12, 16], np.r_[9:12, 16])
 
@@ -432,9 +441,9 @@ _MOTION = np.ix_(np.r_[9:12, 16], np.r_[9:12, 16])
 class Quadratic:
     """An epoch's cost around its linearisation point: c + g^T z + z^T H z / 2, z of WIDTH numbers.
 
-    `cost` and the sums of squares of the whitened residuals are those with the interior directions
-    at their best for z = 0; tangents (3, 2, n); weights (n,) those of the field residuals; seen
-    (2, n) the squared sizes of the columns of M P_k T_k.
+    `cost` and the sums of squares of the whitened residuals are minimised over the interior
+    directions for z = 0; tangents (3, 2, n); weights (n,) of the field residuals; column_squares
+    (2, n): squared norms of the columns of M P_k T_k.
     """
 
     H: Array
@@ -443,7 +452,7 @@ class Quadratic:
     interior: Interior
     tangents: Array
     weights: Array
-    seen: Array
+    column_squares: Array
     sum_mag: float
     sum_gyro: float
     count_mag: float
@@ -472,20 +481,20 @@ def linearise(
 def linearise_all(
     chains: Sequence[Chain], x: Array, *, outlier_sigma: float | None = None
 ) -> list[Quadratic]:
-    """Quadratics of several epochs at the same x = [M6, b], as chains in one row.
+    """Quadratics of several epochs at the same x = [M6, b], as concatenated chains.
 
-    With `outlier_sigma` the weights are those of the residuals here (`robust_weights`).
-    LinAlgError where the directions of one are not determined.
+    With `outlier_sigma` the weights follow the present residuals (`robust_weights`). LinAlgError if
+    the directions of an epoch are not determined.
     """
     rows = Rows.of(chains)
-    field, motion = parts(rows, x, outlier_sigma)
-    blocks = interior(field, motion)
-    inside = eliminated(*blocks, rows.first, rows.last)
+    field, motion = field_and_motion(rows, x, outlier_sigma)
+    blocks = interior_blocks(field, motion)
+    interior = eliminate_interior(*blocks, rows.first, rows.last)
     ends = list(zip(rows.first.tolist(), rows.last.tolist(), strict=True))
-    insides = [inside.part(a, b) for a, b in ends]
-    sums = _sums(field, motion, blocks, rows)
-    sums -= np.array([part.half.T @ part.half for part in insides])
-    best = field.r + np.einsum("rin,ni->rn", field.own, inside.step(np.zeros(WIDTH)))
+    interiors = [interior.part(a, b) for a, b in ends]
+    sums = _epoch_sums(field, motion, blocks, rows)
+    sums -= np.array([part.half.T @ part.half for part in interiors])
+    best = field.r + np.einsum("rin,ni->rn", field.by_direction, interior.step(np.zeros(WIDTH)))
     sum_mag = np.add.reduceat(np.sum(best**2, axis=0), rows.first)
     count_mag = 3.0 * np.add.reduceat(field.weights * rows.measured, rows.first)
     count_gyro = 2.0 * np.add.reduceat((rows.stiff > 0.0).astype(np.float64), rows.first)
@@ -494,10 +503,10 @@ def linearise_all(
             H=sums[k, :WIDTH, :WIDTH].copy(),  # a view would keep all epochs' arrays alive
             g=sums[k, :WIDTH, WIDTH].copy(),
             cost=0.5 * float(sums[k, WIDTH, WIDTH]),
-            interior=insides[k],
+            interior=interiors[k],
             tangents=field.tangents[:, :, a : b + 1].copy(),
             weights=field.weights[a : b + 1].copy(),
-            seen=field.seen[:, a : b + 1].copy(),
+            column_squares=field.column_squares[:, a : b + 1].copy(),
             sum_mag=float(sum_mag[k]),
             sum_gyro=max(float(sums[k, WIDTH, WIDTH] - sum_mag[k]), 0.0),
             count_mag=float(count_mag[k]),
@@ -507,15 +516,15 @@ def linearise_all(
     ]
 
 
-def _sums(
+def _epoch_sums(
     field: FieldPart, motion: MotionPart, blocks: tuple[Array, Array, Array], rows: Rows
 ) -> Array:
-    """Each epoch's Hessian, gradient and square sum (E, 17, 17), all directions as they are."""
+    """Hessian, gradient and sum of squares (E, 17, 17) of each epoch, before the elimination."""
     diag, _, border = blocks
     sums = np.zeros((len(rows.first), WIDTH + 1, WIDTH + 1))
     for k, (a, b) in enumerate(zip(rows.first, rows.last + 1, strict=True)):
-        sums[k][_FIELD] = squares(field.J[:, 2:, a:b])
-        sums[k][_MOTION] += squares(motion.J[:, 2:, a:b])
+        sums[k][_FIELD] = outer_sum(field.J[:, 2:, a:b])
+        sums[k][_MOTION] += outer_sum(motion.J[:, 2:, a:b])
     for where, ends in ((FIRST, rows.first), (LAST, rows.last)):
         sums[:, where, where] = diag[:, :, ends].transpose(2, 0, 1)
         sums[:, where, _COUPLED] = border[:, :, ends].transpose(2, 0, 1)
@@ -523,13 +532,13 @@ def _sums(
     return sums
 
 
-def squares(J: Array) -> Array:
+def outer_sum(J: Array) -> Array:
     """Sum of J_rn J_rn^T over residuals r and rows n, (i, i), of J (r, i, n)."""
     return np.asarray((J @ J.transpose(0, 2, 1)).sum(axis=0))
 
 
-def move(u: Array, quadratic: Quadratic, z: Array) -> Array:
-    """Directions after the shared quantities and borders moved by z (WIDTH,): back-substitution."""
+def move_directions(u: Array, quadratic: Quadratic, z: Array) -> Array:
+    """Directions after a move z (WIDTH,) of the shared variables and borders: back-substitution."""
     step = np.empty((len(u), 2))
     step[0], step[-1] = z[FIRST], z[LAST]
     step[1:-1] = quadratic.interior.step(z)
@@ -539,36 +548,36 @@ def move(u: Array, quadratic: Quadratic, z: Array) -> Array:
 
 # -- The first linearisation point -----------------------------------------------------------------
 #
-# From a linear problem: no starting value, no iteration.
+# A linear problem: no starting value, no iteration.
 #
 # Over a lag of L rows with the gyro's rotation R the corrected field must turn with the sensor:
 #
 #     C m_(k+L) - R C m_k - (I - R) d = 0,    d = C b
 #
-# linear and homogeneous in the symmetric C (6) and d (3). The field's noise enters the regressors
-# of C, adding (its variance) * D with D = 2 diag(1,2,2,1,2,1) per row triple to their Gram matrix,
-# so plain least squares would shrink C where motion is small; minimising v^T G v / v^T D v instead
-# is the errors-in-variables solution: the smallest generalised eigenvector. The sign and scale of C
-# follow from det C > 0 and |C (m - b)| = 1.
+# linear and homogeneous in the symmetric C (6) and d (3). The noise of the field enters the
+# regressors of C and adds (its variance) * D with D = 2 diag(1,2,2,1,2,1) per row triple to their
+# Gram matrix, so ordinary least squares would shrink C where motion is small. The minimum of v^T G
+# v / v^T D v is the errors-in-variables solution: the smallest generalised eigenvector. Sign and
+# scale of C follow from det C > 0 and |C (m - b)| = 1.
 
 _LAGS_S = (0.6, 1.8, 4.5)  # from quick turns to slow ones
 _NOISE_GRAM = np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])
 
 
 def linear_start(epochs: Sequence[EpochData]) -> Array | None:
-    """c = [M (6), b (3)] in gauss, or None where the linear problem has no sound answer."""
+    """c = [M (6), b (3)] in gauss, or None if the linear problem has no valid solution."""
     gram = np.zeros((9, 9))
     rows = 0
     for data in epochs:
-        turned = _orientations(data)
+        orientations = _orientations_from_first(data)
         columns = symmetric_columns(data.field_b_gauss)
-        piece = np.zeros(len(data)) if data.linked is None else np.cumsum(data.linked == 0)
+        piece_index = np.zeros(len(data)) if data.linked is None else np.cumsum(data.linked == 0)
         for lag_s in _LAGS_S:
             lag = max(1, round(lag_s / float(np.median(data.dt_s[1:]))))
-            same = piece[lag:] == piece[:-lag]
-            R = np.swapaxes(turned[lag:], 1, 2) @ turned[:-lag]
-            phi = np.concatenate([columns[lag:] - R @ columns[:-lag], R - np.eye(3)], axis=2)
-            flat = phi[same].reshape(-1, 9)
+            same = piece_index[lag:] == piece_index[:-lag]
+            R = np.swapaxes(orientations[lag:], 1, 2) @ orientations[:-lag]
+            regressors = np.concatenate([columns[lag:] - R @ columns[:-lag], R - np.eye(3)], axis=2)
+            flat = regressors[same].reshape(-1, 9)
             gram += flat.T @ flat
             rows += int(np.count_nonzero(same))
     if rows == 0:
@@ -588,8 +597,8 @@ def sphere_start(field: Array) -> Array | None:
     return np.concatenate([upper_triangle(np.eye(3) * np.sqrt(r2)), solution[:3] + centre])
 
 
-def mirrored(c: Array, field: Array) -> Array:
-    """c with its hard iron on the other side of the plane that lies best among fields (N, 3)."""
+def mirror_hard_iron(c: Array, field: Array) -> Array:
+    """c with its hard iron mirrored at the plane that best fits the fields (N, 3)."""
     centre = field.mean(axis=0)
     away = field - centre
     normal = np.linalg.eigh(away.T @ away)[1][:, 0]
@@ -598,20 +607,20 @@ def mirrored(c: Array, field: Array) -> Array:
     return out
 
 
-def _orientations(data: EpochData) -> Array:
-    """R_0k of every step against the epoch's first, (n, 3, 3)."""
+def _orientations_from_first(data: EpochData) -> Array:
+    """R_0k of every step relative to the first of the epoch, (n, 3, 3)."""
     return so3.products(so3.exp(np.vstack([np.zeros((1, 3)), data.angle_b_rad[1:]])))
 
 
 def _linear_solution(gram: Array, rows: int, field: Array) -> Array | None:
     G11, G12, G22 = gram[:6, :6], gram[:6, 6:], gram[6:, 6:]
     ridge = 1e-9 * np.trace(G22) / 3 + 1e-12
-    back = np.linalg.solve(G22 + ridge * np.eye(3), G12.T)
-    reduced = G11 - G12 @ back
+    eliminate_d = np.linalg.solve(G22 + ridge * np.eye(3), G12.T)
+    reduced = G11 - G12 @ eliminate_d
     _, vectors = eigh((reduced + reduced.T) / 2, np.diag(2.0 * rows * _NOISE_GRAM))
     c6 = vectors[:, 0]
     C = symmetric(c6)
-    d = -back @ c6
+    d = -eliminate_d @ c6
     if np.trace(C) < 0:
         C, d = -C, -d
     eigenvalues = np.linalg.eigvalsh(C)

@@ -1,7 +1,8 @@
-"""An epoch in the window: what it measured, where it was linearised, and the factor it became.
+"""An epoch in the window: its measurements, its linearisation point and the factor made from them.
 
-And what it says beyond that factor: of the noise, of the model's misfit, of an instrument's turned
-axes, lag and scale, and whether it contradicts a calibration that is sure.
+Besides the factor, an epoch gives its noise residuals, its misfit score, its information on the
+instrument's imperfections (turned axes, lag, gyro scales), and a test whether it contradicts a
+calibration that is already well known.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from functools import partial
 import numpy as np
 
 from ahrsd.estimator import chain, locked, noise
-from ahrsd.estimator.chain import halfway
-from ahrsd.estimator.epoch_data import rates, spread
+from ahrsd.estimator.chain import factor_and_solve_lower
+from ahrsd.estimator.epoch_data import principal_deviation, row_rates
 from ahrsd.estimator.graph import (
     BORDERS,
     Y_A,
@@ -24,11 +25,11 @@ from ahrsd.estimator.graph import (
     Node,
     Stack,
     Step,
-    at_borders,
+    border_step,
     gap_factor,
 )
 from ahrsd.estimator.noise import DirectionCells
-from ahrsd.estimator.parameters import Kinds, instruments
+from ahrsd.estimator.parameters import Kinds, possible_instruments
 from ahrsd.samples import Array
 
 _SHORTEST_GAP_S = 0.1
@@ -36,22 +37,25 @@ _SHORTEST_GAP_S = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpochContent:
-    """What an epoch is, wherever it is linearised: from node a to the next.
+    """What of an epoch, from node a to a + 1, does not depend on the linearisation point.
 
-    walk: information of the gyro bias's random walk over it; turned: whether it calibrates.
+    walk: information of the random walk of the gyro bias over the epoch, 1/(rad/s)^2; has_motion:
+    whether the epoch carries information on the calibration; typical: medians of its rows.
     """
 
     data: chain.EpochData
     a: int
     walk: float
-    turned: bool
+    has_motion: bool
     typical: noise.Typical
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InstrumentInformation:
-    """Quadratic of an epoch in iron, gyro's bias and instrument (see `instrument`): H (28, 28), and
-    g (28,) at c (9,) and bias (3,), where the epoch was linearised."""
+    """Quadratic of an epoch in iron, gyro bias and imperfections of the instrument.
+
+    H (28, 28), and the gradient g (28,) at the linearisation point c (9,) and bias (3,).
+    """
 
     H: Array
     g: Array
@@ -59,20 +63,22 @@ class InstrumentInformation:
     bias: Array
 
     def at(self, c: Array, bias: Array) -> Array:
-        """Gradient (28,) there."""
+        """Gradient (28,) at another calibration and bias."""
         return np.asarray(self.g + self.H[:, :12] @ np.r_[c - self.c, bias - self.bias])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LockedInformation:
-    """An epoch's quadratic in what is in `InstrumentInformation` and in what is `locked` besides,
-    in units of its ordinary sizes (`LOCKED` says where): `told`.
+    """Quadratic of an epoch in the columns of the instrument and in those of `locked`.
 
-    roots: by what each of `LOCKED` is whitened, (n, n); freedom: and how many directions of it the
-    epoch tells; noise: that it was linearised with
+    The latter are in units of their ordinary sizes; `LOCKED` has their indices.
+
+    roots (n, n): by component of `LOCKED`, the matrix that whitens its gradient; freedom: by
+    component, the number of directions that the epoch determines; noise: the levels at the
+    linearisation.
     """
 
-    told: InstrumentInformation
+    information: InstrumentInformation
     roots: dict[str, Array]
     freedom: dict[str, int]
     noise: chain.Noise
@@ -80,7 +86,7 @@ class LockedInformation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisationPlan:
-    """Where one is to be linearised: directions, noise, weights of the fields (None for 1)."""
+    """Where to linearise an epoch: directions u, noise levels, field weights (None for 1)."""
 
     piece: EpochContent
     u: Array
@@ -90,10 +96,10 @@ class LinearisationPlan:
 
 @dataclass(slots=True, eq=False)
 class WindowEpoch:
-    """One epoch in the window: what it is, directions, noise, and its factor.
+    """One epoch in the window: content, directions, noise and factor.
 
-    used: the noise that it was linearised with; usual: that of the window then; instrument, locked:
-    set by `linearise_instrument` and `linearise_locked`.
+    used: noise levels at its linearisation; usual: those of the window at that time; instrument,
+    locked: set by `linearise_instrument` and `linearise_locked`.
     """
 
     piece: EpochContent
@@ -110,48 +116,48 @@ class WindowEpoch:
 
     @property
     def data(self) -> chain.EpochData:
-        """What it measured."""
+        """The measurements."""
         return self.piece.data
 
     @property
     def a(self) -> int:
-        """The node at its beginning; the next one is at its end."""
+        """Index of the node at its beginning; the node at its end is a + 1."""
         return self.piece.a
 
     @property
-    def turned(self) -> bool:
-        """Whether it calibrates."""
-        return self.piece.turned
+    def has_motion(self) -> bool:
+        """Whether it carries information on the calibration."""
+        return self.piece.has_motion
 
     @property
     def weights(self) -> Array:
-        """Of its fields."""
+        """Weights of its field residuals."""
         return self.quadratic.weights
 
     @property
     def cells(self) -> DirectionCells:
-        """Where its directions were."""
+        """Cells of the sphere that its directions visited."""
         if self._cells is None:
             self._cells = DirectionCells.of(self.u, self.data.count)
         return self._cells
 
     @property
     def residuals(self) -> noise.Residuals:
-        """What it says about the noise, at its linearisation point."""
+        """Sums of squares of its residuals at the linearisation point."""
         if self._residuals is None:
-            self._residuals = noise.residuals(
+            self._residuals = noise.residual_sums(
                 self.quadratic, self.data, self.used, self.piece.typical
             )
         return self._residuals
 
     @property
     def cost(self) -> float:
-        """Half the sum of squares with the interior directions at their best."""
+        """Half the sum of squared whitened residuals, minimised over the interior directions."""
         return self.quadratic.cost
 
 
-def scores_of(epochs: Sequence[WindowEpoch]) -> list[MisfitScore]:
-    """What epochs ask for, found once where each was linearised."""
+def epoch_scores(epochs: Sequence[WindowEpoch]) -> list[MisfitScore]:
+    """Misfit scores of epochs; each is computed once per linearisation."""
     new = [e for e in epochs if e.score is None]
     for epoch, score in zip(
         new, misfit_scores([e.factor for e in new]) if new else [], strict=True
@@ -160,12 +166,12 @@ def scores_of(epochs: Sequence[WindowEpoch]) -> list[MisfitScore]:
     return [e.score for e in epochs if e.score is not None]
 
 
-def grown(
-    graph: Graph, data: chain.EpochData, walk: float, *, moving: bool
+def begin_epoch(
+    graph: Graph, data: chain.EpochData, walk: float, *, has_motion: bool
 ) -> tuple[EpochContent, Array]:
-    """A new epoch, with the nodes that it needs in the graph, and directions to start from.
+    """Add the nodes of a new epoch to the graph; returns its content and directions to start from.
 
-    walk: of the gyro's bias, rad/s/sqrt(s).
+    walk: random walk of the gyro bias, rad/s/sqrt(s).
     """
     a = graph.last
     u = chain.start_directions(chain.symmetric(graph.c[:6]), graph.c[6:], data.field_b_gauss)
@@ -179,30 +185,28 @@ def grown(
     graph.nodes[a + 1] = Node.at(graph.nodes[a].bias, u[-1])
     graph.until_s = float(data.time_s[-1])
     information = 1.0 / (walk**2 * float(np.sum(data.dt_s[1:])))
-    return EpochContent(data, a, information, moving, noise.Typical.of(data)), u
+    return EpochContent(data, a, information, has_motion, noise.Typical.of(data)), u
 
 
-def place_borders(graph: Graph, begun: Sequence[WindowEpoch]) -> None:
-    """Put borders that are at directions of single fields to where their epochs alone want them.
+def place_borders(graph: Graph, new_epochs: Sequence[WindowEpoch]) -> None:
+    """Move border directions that come from single fields to the optimum of their epochs.
 
-    Until then a chain is bent towards the noise of one field and seems that noisy itself; for an
-    epoch at rest, whose borders only a token moves, for long.
+    Until then each chain is bent towards the noise of one field, which inflates the noise estimate.
+    The borders of an epoch at rest have only a token of information, so they would stay wrong for
+    long.
     """
-    for epoch in begun:
-        step = at_borders(epoch.quadratic)
+    for epoch in new_epochs:
+        step = border_step(epoch.quadratic)
         own = [(epoch.a + 1, step[2:])]
         if epoch.data.measures_first:
             own.append((epoch.a, step[:2]))
         for j, tangent in own:
-            graph.nodes[j] = graph.nodes[j].retracted(np.r_[np.zeros(3), tangent])
+            graph.nodes[j] = graph.nodes[j].moved_by(np.r_[np.zeros(3), tangent])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """A window's calibration c (9,), nodes by index, epochs and factors at one moment.
-
-    damping: of the next step
-    """
+    """Calibration c (9,), nodes, epochs and factors of a window, and damping of its next step."""
 
     damping: float
     c: Array
@@ -213,52 +217,55 @@ class Snapshot:
 
 # -- Misfit ----------------------------------------------------------------------------------------
 #
-# How much more the epochs disagree than their covariances allow: 1 for a perfect model.
+# Ratio of the disagreement of the epochs to what their covariances allow: 1 for a perfect model.
 #
-# At the optimum an epoch's gradient r_i on (c, bias) has the covariance S_i (its information) if
-# the model is right, so r_i^T S_i^-1 r_i averages to its rank, less what the fit used up. Coloured
-# noise, a wandering field or a lag make it larger, and the covariance of the estimate is multiplied
-# by it.
+# At the optimum the gradient r_i of an epoch with respect to (c, bias) has the covariance S_i,
+# which is its information, if the model is right. So r_i^T S_i^-1 r_i has the mean of its rank,
+# less the degrees of freedom that the fit used. Coloured noise, a field that is not uniform or a
+# lag make it larger, and the covariance of the estimate is multiplied by the ratio.
 
-_KEEP = np.r_[0:12]
-_USED = 12.0  # parameters that the fit took from the misfit_scores
-_MEMORY = 0.98  # per epoch that left the window
+_CALIBRATION_AND_BIAS = np.r_[0:12]
+_FITTED_PARAMETERS = 12.0  # degrees of freedom that the fit used
+_MEMORY = 0.98  # factor on remembered scores, per epoch that leaves the window
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MisfitScore:
-    """What an epoch asks of z = [c, bias] (12,) from where it was linearised, its borders at best.
+    """Whitened gradient of an epoch by z = [c, bias] (12,), minimised over its borders.
 
-    The whitened gradient is `asked` (12,) there and `turning` (12, 12) z more elsewhere.
+    The gradient is `whitened_gradient` (12,) at the linearisation point and changes by `root` (12,
+    12) z away from it.
 
-    freedom: degrees of freedom; directions of which the epoch says nothing ask for nothing.
+    freedom: degrees of freedom. Directions that the epoch does not determine have a zero gradient.
     """
 
-    asked: Array
-    turning: Array
+    whitened_gradient: Array
+    root: Array
     freedom: float
 
     @property
     def information(self) -> Array:
-        """On z (12, 12)."""
-        return np.asarray(self.turning.T @ self.turning)
+        """Information on z (12, 12)."""
+        return np.asarray(self.root.T @ self.root)
 
 
 def misfit_scores(factors: Sequence[Factor]) -> list[MisfitScore]:
-    """Of several epochs' factors."""
+    """Scores of the factors of several epochs."""
     H, g = np.array([f.H for f in factors]), np.array([f.g for f in factors])
-    cross = H[:, _KEEP[:, None], BORDERS]
+    cross = H[:, _CALIBRATION_AND_BIAS[:, None], BORDERS]
     gain = cross @ np.linalg.pinv(H[:, BORDERS[:, None], BORDERS], rcond=1e-12, hermitian=True)
-    S = H[:, _KEEP[:, None], _KEEP] - gain @ np.swapaxes(cross, 1, 2)
-    r = g[:, _KEEP] - (gain @ g[:, BORDERS, None])[:, :, 0]
+    S = H[:, _CALIBRATION_AND_BIAS[:, None], _CALIBRATION_AND_BIAS] - gain @ np.swapaxes(
+        cross, 1, 2
+    )
+    r = g[:, _CALIBRATION_AND_BIAS] - (gain @ g[:, BORDERS, None])[:, :, 0]
     whiten, count = _whitening(S)
-    asked = (whiten @ r[:, :, None])[:, :, 0]
+    whitened = (whiten @ r[:, :, None])[:, :, 0]
     freedom = count.astype(float)
-    return [MisfitScore(*each) for each in zip(asked, whiten @ S, freedom, strict=True)]
+    return [MisfitScore(*each) for each in zip(whitened, whiten @ S, freedom, strict=True)]
 
 
 class Misfit:
-    """Scores of the epochs that left the window, and the figure with those that are in it."""
+    """Misfit of all epochs: those in the window, and the remembered sums of those that left it."""
 
     def __init__(self) -> None:
         self._sum = 0.0
@@ -266,13 +273,13 @@ class Misfit:
 
     @property
     def epochs(self) -> float:
-        """How many whole epochs are remembered."""
-        return self._count / _USED
+        """Effective number of remembered epochs."""
+        return self._count / _FITTED_PARAMETERS
 
     def remember(self, factor: Factor, score: MisfitScore, graph: Graph) -> None:
-        """An epoch leaves the window: keep its score."""
+        """Keep the score of an epoch that leaves the window."""
         bias = graph.nodes[factor.a].bias
-        s, n = _squares([factor], [score], graph.c, bias[None])
+        s, n = _sum_of_squares([factor], [score], graph.c, bias[None])
         self._sum, self._count = _MEMORY * self._sum + s, _MEMORY * self._count + n
 
     def value(
@@ -282,94 +289,97 @@ class Misfit:
         graph: Graph,
         step: Step,
     ) -> tuple[float, float]:
-        """Mean square of the scores per degree of freedom, where `step` leads, and its sigma by
-        chance were the model right.
+        """Mean square of the scores per degree of freedom after `step`, and its 1-sigma by chance
+        if the model is right.
 
-        At the joint optimum, not at the present values: what all epochs ask for together is not
-        disagreement.
+        It is evaluated at the joint optimum, not at the present values: a gradient that all epochs
+        share is no disagreement.
         """
         dc, dy = step
         biases = np.array([graph.nodes[f.a].bias + dy[f.a][:3] for f in factors])
-        s, n = _squares(factors, scores, graph.c + dc, biases)
+        s, n = _sum_of_squares(factors, scores, graph.c + dc, biases)
         total, count = self._sum + s, self._count + n
-        freedom = max(count - _USED, 0.2 * count, 1.0)
+        freedom = max(count - _FITTED_PARAMETERS, 0.2 * count, 1.0)
         return total / freedom, float(np.sqrt(2.0 / freedom))
 
 
-def _squares(
+def _sum_of_squares(
     factors: Sequence[Factor], scores: Sequence[MisfitScore], c: Array, biases: Array
 ) -> tuple[float, float]:
-    """Sum of squares of what is asked for at c and the biases (N, 3), and degrees of freedom."""
+    """Sum of squared whitened gradients at c and biases (N, 3), and their degrees of freedom."""
     z = np.empty((len(factors), 12))
     z[:, :9] = c - np.array([f.point.c for f in factors])
     z[:, 9:] = biases - np.array([f.point.a.bias for f in factors])
-    turning = np.array([s.turning for s in scores])
-    asked = np.array([s.asked for s in scores]) + (turning @ z[:, :, None])[:, :, 0]
-    return float(np.sum(asked * asked)), sum(s.freedom for s in scores)
+    roots = np.array([s.root for s in scores])
+    whitened = np.array([s.whitened_gradient for s in scores]) + (roots @ z[:, :, None])[:, :, 0]
+    return float(np.sum(whitened * whitened)), sum(s.freedom for s in scores)
 
 
 # -- Instrument ------------------------------------------------------------------------------------
 #
-# What an instrument may have besides iron and bias: turned axes, a lag, a wrong scale of angles.
+# Imperfections of an instrument besides iron and bias: turned axes, a lag, a gyro scale, and more.
 #
-# Turn: the magnetometer's axes are taken to be the gyro's. If they are not, the rate in the
-# magnetometer's frame is R w with R = Exp(theta), and a step's rotation is R phi, phi without the
-# bias: what rests tell of the bias in the readings is then nothing of the gyro's matrix, and the
-# bias is in the gyro's own axes. Derivative: dq/dtheta = dq/dphi dphi/dtheta = (dq/dw_b / dt)
-# [phi]x.
+# Turn: the model assumes that the magnetometer's axes are those of the gyro. If they are turned,
+# the rate in the magnetometer's frame is R w with R = Exp(theta), and the rotation of a step is R
+# phi. Here phi is without the bias: the bias acts in the gyro's own axes, so what epochs at rest
+# determine of it says nothing about the gyro's matrix. Derivative: dq/dtheta = dq/dphi dphi/dtheta
+# = (dq/dw_b / dt) [phi]x.
 #
-# Lag: a reading of the field that is tau late is that of the direction u(t - tau). With du/dt = -w
-# x u its derivative is dr/dtau = -M (w x u) / s_m.
+# Lag: a field reading that is late by tau belongs to the direction u(t - tau). With du/dt = -w x u
+# its derivative is dr/dtau = -M (w x u) / s_m.
 #
-# Scale: the gyro's angles are (1 + s) times too small if its unit or the time between samples is
-# wrong: a host's clock, messages lost without a trace. Whoever turns a full circle sees it; what is
-# estimated with it means nothing. dq/ds = -(dq/dw_b / dt) phi.
+# Scale: the gyro's angles are too small by the factor 1 + s if its unit or the sampling interval is
+# wrong (the clock of a host, messages lost without a trace). A full turn shows it; the estimate is
+# void with it. dq/ds = -(dq/dw_b / dt) phi.
 #
-# Shape: the gyro's axes have scales of their own and are not at right angles: its angles are (1 +
-# E) times too small, E symmetric and traceless (5). It is not asked for, only considered: what it
-# may do to the answer widens the answer.
+# Shape: the gyro's axes have different scales and are not orthogonal: its angles are too small by I
+# + E, E symmetric and traceless (5 numbers). It is not estimated but considered: it widens the
+# covariance of the answer.
 #
-# Place: the field in the world differs by place, and a vehicle that circles is at another place on
-# each heading: dh = G e, e the heading's cosine and sine, G (3, 2) in the world's axes. A part of
-# that is the same on all headings in the sensor and passes for hard iron, another for soft iron: no
-# fit shows them. dr/dG = -M R (axis) e / s_m / |h|, R from the field's direction and gravity. It is
-# only considered too, and of one of `parameters.PLACES`, as likely as what does show makes it.
+# Place: the field in the world differs with position, and a circling vehicle has another position
+# on each heading: dh = G e, where e is the cosine and sine of the heading and G (3, 2) is in world
+# axes. A part of it is constant in the sensor frame and looks like hard iron, another part looks
+# like soft iron: no fit shows them. dr/dG = -M R (axis) e / s_m / |h|, with R from gravity and the
+# field's direction. Place is considered too: its size is one of `parameters.PLACES`, each with the
+# posterior probability that the visible part of the effect gives it.
 #
-# One Gauss-Newton step from the answer gives them beside M, b and the bias. On fast motion one
-# looks like another, so they are asked for together. Every epoch stands alone here, its borders
-# free.
+# One Gauss-Newton step from the answer estimates them together with M, b and the bias. In fast
+# motion their effects resemble each other, so they are estimated jointly. Each epoch is taken on
+# its own here, with free borders.
 
-# What the data ask for is taken out of them (`TakenOut`): the field is taken to be late, the gyro's
-# angles are multiplied by a matrix. The step is then one more from there.
+# Imperfections that the data support are removed from the data (`InstrumentCorrection`): the field
+# is taken to be late, and the gyro's angles are multiplied by a matrix. The next step starts from
+# the corrected data.
 
 TURN, LAG, SCALE = slice(12, 15), 15, 16
-_ASKED = 17  # what an instrument is asked for; its shape (5) is only considered
-PLACE = slice(22, 28)  # of how the field differs with where the sensor heads
+_ESTIMATED = 17  # numbers that are estimated; shape (5) and place (6) are only considered
+PLACE = slice(22, 28)  # dependence of the field on the heading
 _SIZE = 28
-_X, _BIAS, _REST = slice(0, 12), slice(9, 12), slice(12, _SIZE + 3)
-_OF_ANGLE = np.r_[12:15, 16:22]
+_CALIBRATION, _BIAS, _IMPERFECT = slice(0, 12), slice(9, 12), slice(12, _SIZE + 3)
+_ANGLE_COLUMNS = np.r_[12:15, 16:22]
 _SCALES = np.r_[SCALE:22]
-_OF_FIELD, _OF_MOTION = np.r_[0:9, LAG, PLACE], np.r_[9:15, SCALE:22]
+_FIELD_COLUMNS, _MOTION_COLUMNS = np.r_[0:9, LAG, PLACE], np.r_[9:15, SCALE:22]
 _PRIOR_TURN_RAD, _PRIOR_LAG_S, _PRIOR_SCALE = 0.2, 0.05, 0.5
 IMPERFECTIONS = ("axes", "lag", "scales", "place", "bias")
 _PLACE = np.r_[10:16]
-_EACH = (np.r_[0:3], np.r_[3:4], np.r_[4:10], _PLACE, np.r_[16:19])  # of what is considered
-_MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # more than any gyro of the kind; beyond chance
-_GYRO = np.r_[TURN, SCALE:22]  # what turns or scales the gyro's angles
-GYRO_OF_ALL = _GYRO - 12  # the same among what is considered
-TOLD = 5.0  # nats by which an instrument with imperfections must be likelier
-_WORTH_SIGMAS = 0.3  # of what is known of them: less is not worth another step
-_LASTING = np.r_[0:9, 12:_SIZE]  # all but the gyro's bias
-_STEEP = 0.05  # sine of an angle: less tells no heading
-_WEAKEST = 1e-4  # scaled information of a direction of which an epoch says something
+# among the 19 imperfections
+_IMPERFECTION_ROWS = (np.r_[0:3], np.r_[3:4], np.r_[4:10], _PLACE, np.r_[16:19])
+_MISSCALED, _MISSCALED_SIGMAS = 0.03, 3.0  # beyond any gyro's tolerance; and significant
+_GYRO = np.r_[TURN, SCALE:22]  # turn, scale and shape of the gyro's angles
+GYRO_AMONG_IMPERFECTIONS = _GYRO - 12  # the same among the 19 imperfections
+REQUIRED_NATS = 5.0  # log odds from which imperfections are removed from the data
+_WORTH_SIGMAS = 0.3  # posterior sigmas of a correction that is worth another step
+_CONSTANT = np.r_[0:9, 12:_SIZE]  # everything but the gyro bias, which walks
+_LEAST_HORIZONTAL = 0.05  # sine of the angle between field and gravity: less gives no heading
+_WEAKEST = 1e-4  # scaled information from which an epoch determines a direction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TakenOut:
-    """What of an instrument is taken out of the epochs' data already.
+class InstrumentCorrection:
+    """Imperfections that are already removed from the data of the epochs.
 
-    lag_s: by which the field is late; gyro: (3, 3) by which the gyro's angles are multiplied
-    walk: by which its bias is let go, besides what every gyro's does, rad/s/sqrt(s)
+    lag_s: lag of the field; gyro (3, 3): matrix on the gyro's angles; walk: random walk of the gyro
+    bias besides that of every gyro, rad/s/sqrt(s).
     """
 
     lag_s: float
@@ -377,18 +387,18 @@ class TakenOut:
     walk: float = 0.0
 
     @staticmethod
-    def nothing() -> TakenOut:
-        """Of a perfect instrument."""
-        return TakenOut(0.0, np.eye(3))
+    def identity() -> InstrumentCorrection:
+        """No correction: a perfect instrument."""
+        return InstrumentCorrection(0.0, np.eye(3))
 
     @property
-    def anything(self) -> bool:
-        """Whether there is any."""
+    def is_nonzero(self) -> bool:
+        """Whether anything is corrected."""
         return self.lag_s != 0.0 or self.walk > 0.0 or not np.array_equal(self.gyro, np.eye(3))
 
     @property
-    def numbers(self) -> Array:
-        """Turn (3), scale and shape (5) of the matrix."""
+    def gyro_parameters(self) -> Array:
+        """Turn (3), scale and shape (5) of the gyro's matrix."""
         E = self.gyro - np.eye(3)
         scale = float(np.trace(E)) / 3
         S = (E + E.T) / 2 - scale * np.eye(3)
@@ -396,9 +406,13 @@ class TakenOut:
         apart = [(S[0, 0] - S[1, 1]) / 2, -S[2, 2] * np.sqrt(3.0) / 2]
         return np.array([*turn, scale, *apart, S[1, 2], S[0, 2], S[0, 1]])
 
-    def with_gyro(self, numbers: Array) -> TakenOut:
-        """With this much more of turn (3), scale and shape (5)."""
-        (x, y, z), scale, (apart, against, yz, xz, xy) = numbers[:3], numbers[3], numbers[4:]
+    def with_gyro(self, parameters: Array) -> InstrumentCorrection:
+        """The correction with a further turn (3), scale and shape (5) of the gyro."""
+        (x, y, z), scale, (apart, against, yz, xz, xy) = (
+            parameters[:3],
+            parameters[3],
+            parameters[4:],
+        )
         third = against / np.sqrt(3.0)
         diagonal = np.array([apart + third, third - apart, -2 * third]) + scale
         sides = np.array([[0.0, xy - z, xz + y], [xy + z, 0.0, yz - x], [xz - y, yz + x, 0.0]])
@@ -406,16 +420,18 @@ class TakenOut:
         return replace(self, gyro=(np.eye(3) + more) @ self.gyro)
 
 
-#: (9, 3, 3) matrices of one of each of turn, scale and shape, on the gyro's angles
-GYRO_WAYS = np.array([TakenOut.nothing().with_gyro(one).gyro - np.eye(3) for one in np.eye(9)])
+#: (9, 3, 3) matrices on the gyro's angles for a unit turn, scale and shape
+GYRO_BASIS = np.array(
+    [InstrumentCorrection.identity().with_gyro(one).gyro - np.eye(3) for one in np.eye(9)]
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instrument:
     """Step (17,) from the answer in [M (6), b (3), w_b (3), theta (3), tau, s], and its covariance.
 
-    misfit: how much the epochs still disagree after the step; it is in the covariance
-    scaled: by how much the gyro's angles were scaled before
+    misfit: misfit of the epochs after the step; the covariance includes it. scaled: scale of the
+    gyro's angles that was corrected before.
     """
 
     step: Array
@@ -430,7 +446,7 @@ class Instrument:
 
     @property
     def misscaled(self) -> float:
-        """Share of themselves by which the gyro's angles are too small; 0: they may be right."""
+        """Relative amount by which the gyro's angles are too small; 0 if they may be right."""
         scale, sigma = self._of(SCALE)
         scale += self.scaled
         return scale if abs(scale) > max(_MISSCALED, _MISSCALED_SIGMAS * sigma) else 0.0
@@ -443,146 +459,156 @@ InformationStack = tuple[Array, Array]
 """H (N, 17, 17) and gradient (N, 17) of epochs, all directions eliminated."""
 
 
-def informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
-    """Quadratics of the epochs with motion around the present estimate.
+def instrument_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+    """Quadratics of the epochs with motion at the present estimate.
 
-    LinAlgError where none has motion, or its directions are not determined.
+    LinAlgError if there is no motion or the directions are not determined.
     """
-    H, g = whole_informations(epochs, graph)
-    return H[:, :_ASKED, :_ASKED], g[:, :_ASKED]
+    H, g = full_instrument_quadratics(epochs, graph)
+    return H[:, :_ESTIMATED, :_ESTIMATED], g[:, :_ESTIMATED]
 
 
-def whole_informations(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+def full_instrument_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
     """The same with the gyro's shape and the place: H (N, 28, 28) and gradient (N, 28).
 
-    Each as it was where the epoch was linearised, so that it is computed once for each.
+    H is computed once, where each epoch was linearised; the gradient is moved to the present
+    values.
     """
     linearise_instrument(epochs)
-    told = [(e.instrument, graph.nodes[e.a].bias) for e in epochs if e.turned]
-    if not told:
+    moving = [(e.instrument, graph.nodes[e.a].bias) for e in epochs if e.has_motion]
+    if not moving:
         raise np.linalg.LinAlgError("no epoch with motion")
-    known = [(one, bias) for one, bias in told if one is not None]
+    known = [(one, bias) for one, bias in moving if one is not None]
     H = np.array([one.H for one, _ in known])
     return H, np.array([one.at(graph.c, bias) for one, bias in known])
 
 
-def of_rests(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
-    """Quadratics (R, 28, 28) and gradients (R, 28) of the epochs without motion: of the gyro's bias
-    alone, around that of their nodes."""
-    resting = [e for e in epochs if not e.turned]
+def rest_quadratics(epochs: Sequence[WindowEpoch], graph: Graph) -> InformationStack:
+    """Quadratics (R, 28, 28) and gradients (R, 28) of the epochs at rest.
+
+    They are in the gyro bias only, at the bias of their nodes.
+    """
+    resting = [e for e in epochs if not e.has_motion]
     H, g = np.zeros((len(resting), _SIZE, _SIZE)), np.zeros((len(resting), _SIZE))
     for k, epoch in enumerate(resting):
         factor = epoch.factor
         H[k, _BIAS, _BIAS] = factor.H[_BIAS, _BIAS]
-        moved = graph.nodes[epoch.a].bias - factor.point.a.bias
-        g[k, _BIAS] = factor.g[_BIAS] + factor.H[_BIAS, _BIAS] @ moved
+        bias_change = graph.nodes[epoch.a].bias - factor.point.a.bias
+        g[k, _BIAS] = factor.g[_BIAS] + factor.H[_BIAS, _BIAS] @ bias_change
     return H, g
 
 
 class FoldedInformation:
     """Information on iron, turn, lag and scale from epochs that left the window, as one Gaussian.
 
-    The gyro's bias walks, so each epoch had its own, which is eliminated.
+    The gyro bias walks, so each epoch has its own, which is marginalised.
     """
 
     def __init__(self) -> None:
         self._H: Array = np.zeros((_SIZE, _SIZE))
-        self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x as `_place`
+        self._eta: Array = np.zeros(_SIZE)  # H x - gradient, x of `_instrument_point`
 
     @staticmethod
-    def of_iron(graph: Graph, taken: TakenOut) -> FoldedInformation:
+    def of_iron(graph: Graph, correction: InstrumentCorrection) -> FoldedInformation:
         """Information on the iron from the epochs folded into the graph; none on a lag."""
-        H, g = (each[0] for each in Stack([graph.prior], graph.c, graph.nodes).here())
+        H, g = (each[0] for each in Stack([graph.prior], graph.c, graph.nodes).quadratics())
         gain = H[C, Y_A] @ np.linalg.pinv(H[Y_A, Y_A], rcond=1e-12, hermitian=True)
         own_H, own_g = np.zeros((_SIZE, _SIZE)), np.zeros(_SIZE)
         own_H[C, C], own_g[C] = H[C, C] - gain @ H[Y_A, C], g[C] - gain @ g[Y_A]
         past = FoldedInformation()
-        past._add(own_H, own_g, graph.c, taken)
+        past._add(own_H, own_g, graph.c, correction)
         return past
 
     @staticmethod
     def of_lag(lag_s: float, sigma_s: float) -> FoldedInformation:
-        """A lag is known, and nothing of the iron."""
+        """A known lag, and no information on the iron."""
         past = FoldedInformation()
         past._H[LAG, LAG] = 1.0 / sigma_s**2
         past._eta[LAG] = lag_s / sigma_s**2
         return past
 
     def with_epoch(
-        self, told: InstrumentInformation, taken: TakenOut, sigma_bias: float
+        self,
+        information: InstrumentInformation,
+        correction: InstrumentCorrection,
+        sigma_bias: float,
     ) -> FoldedInformation:
-        """With one epoch more, which was linearised with this taken out; sigma_bias in rad/s."""
+        """The same with one epoch added, which was linearised with this correction; sigma_bias in
+        rad/s.
+        """
         bias = slice(9, 12)
-        own = told.H[bias, bias] + np.eye(3) / sigma_bias**2
-        gain = np.linalg.solve(own, told.H[bias]).T
-        H, g = told.H - gain @ told.H[bias], told.g - gain @ told.g[bias]
+        own = information.H[bias, bias] + np.eye(3) / sigma_bias**2
+        gain = np.linalg.solve(own, information.H[bias]).T
+        H, g = (
+            information.H - gain @ information.H[bias],
+            information.g - gain @ information.g[bias],
+        )
         keep = np.zeros(_SIZE)
-        keep[_LASTING] = 1.0
+        keep[_CONSTANT] = 1.0
         past = FoldedInformation()
         past._H, past._eta = self._H.copy(), self._eta.copy()
-        past._add(H * np.outer(keep, keep), g * keep, told.c, taken)
+        past._add(H * np.outer(keep, keep), g * keep, information.c, correction)
         return past
 
-    def _add(self, H: Array, g: Array, c: Array, taken: TakenOut) -> None:
+    def _add(self, H: Array, g: Array, c: Array, correction: InstrumentCorrection) -> None:
         self._H = self._H + H
-        self._eta = self._eta + H @ _place(c, taken) - g
+        self._eta = self._eta + H @ _instrument_point(c, correction) - g
 
-    def at(self, c: Array, taken: TakenOut) -> tuple[Array, Array]:
-        """H (28, 28) and gradient (28,) there."""
-        return self._H, self._H @ _place(c, taken) - self._eta
+    def at(self, c: Array, correction: InstrumentCorrection) -> tuple[Array, Array]:
+        """H (28, 28) and gradient (28,) at a calibration and correction."""
+        return self._H, self._H @ _instrument_point(c, correction) - self._eta
 
 
-def _place(c: Array, taken: TakenOut) -> Array:
+def _instrument_point(c: Array, correction: InstrumentCorrection) -> Array:
     x = np.zeros(_SIZE)
-    x[:9], x[LAG], x[_GYRO] = c, taken.lag_s, taken.numbers
+    x[:9], x[LAG], x[_GYRO] = c, correction.lag_s, correction.gyro_parameters
     return x
 
 
 def linearise_instrument(epochs: Sequence[WindowEpoch]) -> None:
-    """Compute `WindowEpoch.instrument` of the epochs with motion that do not have it yet, together
-    those that were linearised at one calibration."""
-    silent = [epoch for epoch in epochs if epoch.turned and epoch.instrument is None]
-    for place in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in silent}.values():
-        _informations([epoch for epoch in silent if epoch.factor.point.c is place], place)
+    """Compute `WindowEpoch.instrument` of the epochs with motion that lack it.
+
+    Epochs that were linearised at the same calibration are handled together.
+    """
+    missing = [epoch for epoch in epochs if epoch.has_motion and epoch.instrument is None]
+    for point in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in missing}.values():
+        _set_instrument_information(
+            [epoch for epoch in missing if epoch.factor.point.c is point], point
+        )
 
 
-def lag_known(
+def lag_uncertainty(
     epochs: Sequence[WindowEpoch], graph: Graph, past: FoldedInformation, sigma_bias: float
 ) -> Lag:
-    """Sigma of the lag that is taken out of the field, from all data.  LinAlgError: unobservable.
+    """Sigma of the lag that is removed from the field, from all data; LinAlgError if unobservable.
 
-    The iron is estimated with that lag. Its errors at the true lag do not correlate with that of
-    the lag, so what both make adds up.
+    The iron is estimated at that lag. The errors of the iron at the true lag are not correlated
+    with the error of the lag, so the two contributions add up.
     """
     linearise_instrument(epochs)
-    H = past.at(graph.c, TakenOut.nothing())[0]
+    H = past.at(graph.c, InstrumentCorrection.identity())[0]
     H = H + sum(epoch.instrument.H for epoch in epochs if epoch.instrument is not None)
-    H = believed(graph, sigma_bias)[0] + H[:_ASKED, :_ASKED]
-    sigma = float(np.sqrt(graph.temper * _inverse(H)[LAG, LAG]))
-    return Lag(sigma, -sigma * (_inverse(H[:12, :12]) @ H[:12, LAG]))
+    H = prior_quadratic(graph, sigma_bias)[0] + H[:_ESTIMATED, :_ESTIMATED]
+    sigma = float(np.sqrt(graph.temper * _scaled_inverse(H)[LAG, LAG]))
+    return Lag(sigma, -sigma * (_scaled_inverse(H[:12, :12]) @ H[:12, LAG]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lag:
-    """1-sigma of a lag, and by how much [M, b, w_b] (12,) would be wrong were it one sigma off."""
+    """1-sigma of a lag, and the error of [M, b, w_b] (12,) if the lag is one sigma off."""
 
     sigma_s: float
     spread: Array
 
 
-def _inverses(H: Array) -> Array:
-    """Of each (..., n, n), as `_inverse`."""
+def _scaled_inverse(H: Array) -> Array:
+    """Inverse of each positive definite matrix (..., n, n), whose rows may have any units."""
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=-2, axis2=-1), 1e-30))
     sizes = scale[..., :, None] * scale[..., None, :]
     return np.asarray(np.linalg.inv(H * sizes) * sizes)
 
 
-def _inverse(H: Array) -> Array:
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-30))
-    return np.asarray(np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale))
-
-
-def instrument(
+def estimate_instrument(
     epochs: InformationStack,
     graph: Graph,
     sigma_bias: float,
@@ -591,36 +617,36 @@ def instrument(
 ) -> Instrument:
     """Misalignment, lag and scale from the epochs of a settled window and those before it.
 
-    LinAlgError where the motion does not tell.
+    LinAlgError if the motion does not determine them.
     """
-    H, g = believed(graph, sigma_bias)
+    H, g = prior_quadratic(graph, sigma_bias)
     if before is not None:
-        H, g = H + before[0][:_ASKED, :_ASKED], g + before[1][:_ASKED]
+        H, g = H + before[0][:_ESTIMATED, :_ESTIMATED], g + before[1][:_ESTIMATED]
     H, g = H + epochs[0].sum(axis=0), g + epochs[1].sum(axis=0)
-    covariance = _inverse(H)
+    covariance = _scaled_inverse(H)
     step = -covariance @ g
     misfit = max(1.0, disagreement(*epochs, step))
     return Instrument(step, misfit * covariance, misfit, scaled)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Considered:
-    """What is known of an instrument's imperfections (`_REST`, 19), and what they do to the answer.
+class ImperfectionLikelihood:
+    """Likelihood of the imperfections (19, `_IMPERFECT`), and their effect on the answer.
 
-    alone (12, 12) covariance of [M, b, w_b] were it perfect; by_rest (12, 19): what one of each
-    does to them; own (12,) their gradient; known (19, 19) and asked (19,): information and gradient
-    of the imperfections from the data, the answer following them; already (19,): what of them is
-    taken out of the data
-    disagree: how much the epochs disagree after a step (31,) of all
+    covariance (12, 12): of [M, b, w_b] for a perfect instrument; response (12, 19): change of [M,
+    b, w_b] per unit of each imperfection; gradient (12,): of [M, b, w_b]; information (19, 19) and
+    imperfection_gradient (19,): of the imperfections, marginalised over [M, b, w_b]; corrected
+    (19,): what is removed from the data already; misfit_after: misfit of the epochs after a step
+    (31,) of all
     """
 
-    alone: Array
-    by_rest: Array
-    own: Array
-    known: Array
-    asked: Array
-    already: Array
-    disagree: Callable[[Array], float]
+    covariance: Array
+    response: Array
+    gradient: Array
+    information: Array
+    imperfection_gradient: Array
+    corrected: Array
+    misfit_after: Callable[[Array], float]
 
     @staticmethod
     def of(
@@ -629,110 +655,143 @@ class Considered:
         graph: Graph,
         sigma_bias: float,
         before: tuple[Array, Array],
-        taken: TakenOut,
-    ) -> Considered:
-        """Of epochs (of these times, (N,)) and those before.  LinAlgError: the motion tells not."""
-        epochs = with_drift(epochs, times_s)
+        correction: InstrumentCorrection,
+    ) -> ImperfectionLikelihood:
+        """From epochs at times_s (N,) and the folded ones.
+
+        LinAlgError if the motion does not determine the answer.
+        """
+        epochs = add_bias_drift(epochs, times_s)
         H, g = epochs[0].sum(axis=0), epochs[1].sum(axis=0)
         H[:_SIZE, :_SIZE] += before[0]
         g[:_SIZE] += before[1]
-        own_H, own_g = believed(graph, sigma_bias)
-        alone = _inverse(H[_X, _X] + own_H[_X, _X])
-        by_rest, own = -alone @ H[_X, _REST], g[_X] + own_g[_X]
-        known = H[_REST, _REST] + H[_REST, _X] @ by_rest
-        already = np.zeros(len(known))
-        already[GYRO_OF_ALL] = taken.numbers
-        asked = g[_REST] + by_rest.T @ own
-        return Considered(
-            alone, by_rest, own, known, asked, already, partial(disagreement, *epochs)
+        prior_H, prior_g = prior_quadratic(graph, sigma_bias)
+        covariance = _scaled_inverse(
+            H[_CALIBRATION, _CALIBRATION] + prior_H[_CALIBRATION, _CALIBRATION]
+        )
+        response, gradient = (
+            -covariance @ H[_CALIBRATION, _IMPERFECT],
+            g[_CALIBRATION] + prior_g[_CALIBRATION],
+        )
+        information = H[_IMPERFECT, _IMPERFECT] + H[_IMPERFECT, _CALIBRATION] @ response
+        corrected = np.zeros(len(information))
+        corrected[GYRO_AMONG_IMPERFECTIONS] = correction.gyro_parameters
+        imperfection_gradient = g[_IMPERFECT] + response.T @ gradient
+        return ImperfectionLikelihood(
+            covariance,
+            response,
+            gradient,
+            information,
+            imperfection_gradient,
+            corrected,
+            partial(disagreement, *epochs),
         )
 
-    def found(self, sigmas: Array, temper: float) -> tuple[Array, Array]:
-        """Spread (..., 19, 19) over the temper, and what they are beyond what is taken out
-        (..., 19), of instruments like that (..., 19)."""
-        pull = temper / sigmas**2
-        spread = _inverses(self.known + pull[..., None] * np.eye(pull.shape[-1]))
-        return spread, -(spread @ (self.asked + pull * self.already)[..., None])[..., 0]
+    def posterior(self, sigmas: Array, temper: float) -> tuple[Array, Array]:
+        """Covariance (..., 19, 19) over the temper, and mean (..., 19) beyond the present
+        correction.
+
+        sigmas (..., 19): prior sigmas.
+        """
+        prior_information = temper / sigmas**2
+        covariance = _scaled_inverse(
+            self.information + prior_information[..., None] * np.eye(prior_information.shape[-1])
+        )
+        return covariance, -(
+            covariance
+            @ (self.imperfection_gradient + prior_information * self.corrected)[..., None]
+        )[..., 0]
 
     def temper(self, sigmas: Array, most: float) -> float:
-        """By how much the epochs disagree once what they say of the imperfections is in."""
-        rest = self.found(sigmas, most)[1]
-        step = np.r_[-self.alone @ self.own + self.by_rest @ rest, rest]
-        return min(most, max(1.0, self.disagree(step)))
+        """Misfit of the epochs after the maximum a posteriori step, between 1 and `most`."""
+        mean = self.posterior(sigmas, most)[1]
+        step = np.r_[-self.covariance @ self.gradient + self.response @ mean, mean]
+        return min(most, max(1.0, self.misfit_after(step)))
 
-    def evidence(self, sigmas: Array, rest: Array, temper: float) -> Array:
-        """Log of how likely the data are of instruments like that (..., 19), up to a constant.
-
-        rest: what they were found to be
+    def log_evidence(self, sigmas: Array, mean: Array, temper: float) -> Array:
+        """Log evidence (...) for prior sigmas (..., 19) with their posterior mean, up to a
+        constant.
         """
-        sizes = sigmas[..., :, None] * sigmas[..., None, :]
-        told = np.linalg.slogdet(np.eye(sigmas.shape[-1]) + self.known / temper * sizes)[1]
-        left = np.sum((rest @ self.known + 2.0 * self.asked) * rest, axis=-1) / temper
-        left = left + np.sum(np.square((self.already + rest) / sigmas), axis=-1)
-        return np.asarray(-0.5 * (left + told))
+        outer = sigmas[..., :, None] * sigmas[..., None, :]
+        log_determinant = np.linalg.slogdet(
+            np.eye(sigmas.shape[-1]) + self.information / temper * outer
+        )[1]
+        penalty = (
+            np.sum((mean @ self.information + 2.0 * self.imperfection_gradient) * mean, axis=-1)
+            / temper
+        )
+        penalty = penalty + np.sum(np.square((self.corrected + mean) / sigmas), axis=-1)
+        return np.asarray(-0.5 * (penalty + log_determinant))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Weighed:
-    """All instruments that may be, at all places, against what the data say of them.
+class InstrumentPosterior:
+    """All possible instruments at all places, with their evidence.
 
-    every (K, 19) their sigmas; prior (K,) log of how likely they are without the data; evidence
-    (K,); spread (K, 19, 19) and rest (K, 19) what the data leave open of each and say that it is,
-    beyond what is taken out already
+    sigmas (K, 19): prior sigmas; log_prior (K,); log_evidence (K,); covariances (K, 19, 19) and
+    means (K, 19): posterior of the imperfections of each, beyond the present correction
     """
 
-    said: Considered
-    every: Array
-    prior: Array
-    evidence: Array
-    spread: Array
-    rest: Array
+    likelihood: ImperfectionLikelihood
+    sigmas: Array
+    log_prior: Array
+    log_evidence: Array
+    covariances: Array
+    means: Array
 
     @staticmethod
-    def of(said: Considered, graph: Graph, kinds: Kinds) -> Weighed:
-        """What an imperfection makes the epochs disagree is no noise."""
-        may_be = instruments(*kinds)
-        every = may_be.sigmas
-        temper = said.temper(every.max(axis=0), graph.temper)
-        spread, rest = said.found(every, temper)
-        evidence = said.evidence(every, rest, temper)
-        return Weighed(said, every, may_be.log_prior, evidence, temper * spread, rest)
+    def of(likelihood: ImperfectionLikelihood, graph: Graph, kinds: Kinds) -> InstrumentPosterior:
+        """The posterior at the temper that remains after the imperfections are fitted.
 
-    def likely(self) -> Array:
-        """How likely each is (K,), the data and all else taken together."""
-        told = self.evidence + self.prior
-        shares = np.exp(told - told.max())
+        Disagreement that they explain is no noise.
+        """
+        instruments = possible_instruments(*kinds)
+        sigmas = instruments.sigmas
+        temper = likelihood.temper(sigmas.max(axis=0), graph.temper)
+        covariances, means = likelihood.posterior(sigmas, temper)
+        log_evidence = likelihood.log_evidence(sigmas, means, temper)
+        return InstrumentPosterior(
+            likelihood, sigmas, instruments.log_prior, log_evidence, temper * covariances, means
+        )
+
+    def probabilities(self) -> Array:
+        """Posterior probabilities (K,)."""
+        log_weights = self.log_evidence + self.log_prior
+        shares = np.exp(log_weights - log_weights.max())
         return np.asarray(shares / shares.sum())
 
-    def likelier(self, which: Array | slice, told: float = TOLD) -> int | None:
-        """The likeliest of those in which some of `which` are larger than need be; None where it is
-        not likelier than the others by `told` nats."""
-        found, gain = self.against_plain(which)
-        return None if gain < told else found
-
-    def against_plain(self, which: Array | slice) -> tuple[int, float]:
-        """The likeliest of those in which some of `which` are larger than need be, and by how many
-        nats it is likelier than the likeliest of those in which all are as small as may be.
-
-        Whatever else is wrong with either is free: a field that differs by place may be what looks
-        like a gyro.
+    def most_probable(
+        self, which: Array | slice, required_nats: float = REQUIRED_NATS
+    ) -> int | None:
+        """The instrument of the largest evidence among those in which some of `which` exceed their
+        least size. None if its evidence exceeds that of the others by less than `required_nats`.
         """
-        sized = self.every[:, which]
-        plain = np.all(sized == sized.min(axis=0), axis=1)
-        if plain.all():
+        found, gain = self.log_odds_against_smallest(which)
+        return None if gain < required_nats else found
+
+    def log_odds_against_smallest(self, which: Array | slice) -> tuple[int, float]:
+        """The instrument of the largest evidence among those in which some of `which` exceed their
+        least size, and its log odds against the best of those in which all have their least size.
+
+        The other imperfections are free in both: a field that differs by place may look like a gyro
+        error.
+        """
+        sizes = self.sigmas[:, which]
+        smallest = np.all(sizes == sizes.min(axis=0), axis=1)
+        if smallest.all():
             return 0, -np.inf
-        others = np.where(plain, -np.inf, self.evidence)
-        return int(np.argmax(others)), float(others.max() - self.evidence[plain].max())
+        others = np.where(smallest, -np.inf, self.log_evidence)
+        return int(np.argmax(others)), float(others.max() - self.log_evidence[smallest].max())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Widening:
-    """What imperfections of the instrument and the place do to an answer.
+    """Effect of the imperfections and of the place on the covariance of an answer.
 
-    added: to the covariance (12, 12) of [M, b, w_b]; parts: what each of `IMPERFECTIONS` alone
-    adds, which together may be more or less; place_gauss: by how much the field differs with the
-    heading, rms of what is expected of its six numbers; gyro (9, 9): covariance of turn, scale and
-    shape of the gyro's angles beyond what is taken out; with_gyro (12, 9): and with [M, b, w_b]
+    added (12, 12): to the covariance of [M, b, w_b]; parts: the part of each of `IMPERFECTIONS`
+    alone (they need not add up to `added`); place_gauss: rms of the six numbers of the field's
+    dependence on the heading; gyro (9, 9): covariance of turn, scale and shape of the gyro's angles
+    beyond the correction; with_gyro (12, 9): cross covariance with [M, b, w_b]
     """
 
     added: Array
@@ -742,66 +801,76 @@ class Widening:
     with_gyro: Array
 
     def joint(self, covariance: Array, K: Array) -> Array:
-        """(21, 21) of K (12, 12) times [M, b, w_b], whose covariance is given, and the gyro's."""
-        beside = K @ self.with_gyro
-        return np.block([[covariance, beside], [beside.T, self.gyro]])
+        """(21, 21) covariance of K (12, 12) [M, b, w_b], whose covariance is given, and of the
+        gyro.
+        """
+        cross = K @ self.with_gyro
+        return np.block([[covariance, cross], [cross.T, self.gyro]])
 
     @staticmethod
-    def nothing() -> Widening:
-        """Of a perfect instrument, or where nobody can tell."""
+    def zero() -> Widening:
+        """For a perfect instrument, or if the imperfections are unknown."""
         return Widening(np.zeros((12, 12)), {}, float("nan"), np.zeros((9, 9)), np.zeros((12, 9)))
 
 
-def considered(weighed: Weighed) -> Widening:
-    """What imperfections of the instrument do to the answer.
+def widening_by_imperfections(posterior: InstrumentPosterior) -> Widening:
+    """Effect of the imperfections on the answer, which assumes a perfect instrument.
 
-    The answer takes the instrument to be perfect. It is one of `instruments`, each as likely as
-    the data make it. Of each, what the data leave open of the imperfections spreads the answer, and
-    what they say that they are is an error of it. So their sizes, which a few numbers tell badly,
-    count as far as they are not known: the mean of the variances, not that of the likeliest.
+    The instrument is one of `possible_instruments`, with their posterior probabilities. For each of
+    them, the posterior covariance of the imperfections spreads the answer, and their posterior mean
+    is an error of it. The sizes of the imperfections are poorly determined by a few numbers, so the
+    result is the mean of the variances over the instruments, not the variance of the most probable
+    one.
     """
-    by_rest, rest, likely = weighed.said.by_rest, weighed.rest, weighed.likely()
-    mean = np.tensordot(likely, weighed.spread, 1) + (likely * rest.T) @ rest
-    added = by_rest @ mean @ by_rest.T
-    each = [by_rest[:, i] @ mean[np.ix_(i, i)] @ by_rest[:, i].T for i in _EACH]
+    response, means, probabilities = (
+        posterior.likelihood.response,
+        posterior.means,
+        posterior.probabilities(),
+    )
+    mean = np.tensordot(probabilities, posterior.covariances, 1) + (probabilities * means.T) @ means
+    added = response @ mean @ response.T
+    each = [response[:, i] @ mean[np.ix_(i, i)] @ response[:, i].T for i in _IMPERFECTION_ROWS]
     return Widening(
         (added + added.T) / 2,
         dict(zip(IMPERFECTIONS, each, strict=True)),
         float(np.sqrt(np.mean(np.diag(mean)[_PLACE]))),
-        mean[np.ix_(GYRO_OF_ALL, GYRO_OF_ALL)],
-        by_rest @ mean[:, GYRO_OF_ALL],
+        mean[np.ix_(GYRO_AMONG_IMPERFECTIONS, GYRO_AMONG_IMPERFECTIONS)],
+        response @ mean[:, GYRO_AMONG_IMPERFECTIONS],
     )
 
 
-def walk_asked(weighed: Weighed, span_s: float) -> float:
-    """Walk of the gyro's bias (rad/s/sqrt(s)) by which it would drift as far as it did in span_s.
+def required_bias_walk(posterior: InstrumentPosterior, span_s: float) -> float:
+    """Walk of the gyro bias (rad/s/sqrt(s)) that would produce the drift found over span_s.
 
-    0 where an instrument that does not drift is as likely.
+    0 if an instrument without drift is as probable.
     """
-    found = weighed.likelier(slice(-3, None))
-    drift = np.zeros(3) if found is None else weighed.rest[found][-3:]
+    found = posterior.most_probable(slice(-3, None))
+    drift = np.zeros(3) if found is None else posterior.means[found][-3:]
     return float(np.sqrt(np.mean(np.square(drift)) / max(span_s, 1.0)))
 
 
-def gyro_asked(weighed: Weighed, told: float) -> Array | None:
-    """Turn (3), scale and shape (5) that the gyro's angles are to be corrected by, once more.
+def required_gyro_correction(posterior: InstrumentPosterior, required_nats: float) -> Array | None:
+    """Further turn (3), scale and shape (5) by which to correct the gyro's angles.
 
-    None where an instrument like that is not likelier than its maker's by `told` nats, unless some
-    of it is taken out already, or where the step is not worth it.
+    None if the log odds against an instrument within its specification are below `required_nats`
+    and nothing is corrected yet, or if the step is not worth it.
     """
-    found = weighed.likelier(GYRO_OF_ALL, -np.inf if weighed.said.already.any() else told)
+    found = posterior.most_probable(
+        GYRO_AMONG_IMPERFECTIONS, -np.inf if posterior.likelihood.corrected.any() else required_nats
+    )
     if found is None:
         return None
-    step = weighed.rest[found][GYRO_OF_ALL]
-    known = weighed.spread[found][np.ix_(GYRO_OF_ALL, GYRO_OF_ALL)]
+    step = posterior.means[found][GYRO_AMONG_IMPERFECTIONS]
+    known = posterior.covariances[found][np.ix_(GYRO_AMONG_IMPERFECTIONS, GYRO_AMONG_IMPERFECTIONS)]
     worth = float(np.sqrt(step @ np.linalg.solve(known, step) / len(step)))
     return step if worth > _WORTH_SIGMAS else None
 
 
-def with_drift(epochs: InformationStack, times_s: Array) -> InformationStack:
-    """H (N, 31, 31) and g (N, 31): and by how much the gyro's bias came to be in all the epochs.
+def add_bias_drift(epochs: InformationStack, times_s: Array) -> InformationStack:
+    """H (N, 31, 31) and g (N, 31) with three more columns: the total drift of the gyro bias over
+    all epochs.
 
-    It moved at one rate; w_b is that of the newest epoch.
+    The drift has a constant rate; w_b is the bias in the newest epoch.
     """
     H, g = epochs
     span_s = max(float(np.ptp(times_s)), 1e-9)
@@ -811,9 +880,9 @@ def with_drift(epochs: InformationStack, times_s: Array) -> InformationStack:
     return both, np.concatenate([g, until * g[:, _BIAS]], axis=1)
 
 
-def believed(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:
-    """H (17, 17) and gradient (17,) of what is known without the epochs."""
-    H, g = np.zeros((_ASKED, _ASKED)), np.zeros(_ASKED)
+def prior_quadratic(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:
+    """H (17, 17) and gradient (17,) of the prior, without the epochs."""
+    H, g = np.zeros((_ESTIMATED, _ESTIMATED)), np.zeros(_ESTIMATED)
     pull = graph.temper * graph.anchor[1] + graph.hold
     H[:9, :9], g[:9] = pull, pull @ (graph.c - graph.anchor[0])
     prior = [*[sigma_bias] * 3, *[_PRIOR_TURN_RAD] * 3, _PRIOR_LAG_S, _PRIOR_SCALE]
@@ -824,19 +893,19 @@ def believed(graph: Graph, sigma_bias: float) -> tuple[Array, Array]:
 def disagreement(H: Array, g: Array, steps: Array) -> float:
     """Mean square per degree of freedom of the gradients of epochs (N, n, n), (N, n) after steps.
 
-    steps (n,), or (N, n) where each takes its own.
+    steps (n,), or (N, n) with one for each epoch.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-30))
     values, vectors = np.linalg.eigh(H * scale[:, :, None] * scale[:, None, :])
     good = values > _WEAKEST
-    left = scale * (g + (H @ np.broadcast_to(steps, g.shape)[:, :, None])[:, :, 0])
-    asked = (np.swapaxes(vectors, 1, 2) @ left[:, :, None])[:, :, 0]
+    gradients = scale * (g + (H @ np.broadcast_to(steps, g.shape)[:, :, None])[:, :, 0])
+    projected = (np.swapaxes(vectors, 1, 2) @ gradients[:, :, None])[:, :, 0]
     count = int(np.count_nonzero(good))
-    return float(np.sum(asked[good] ** 2 / values[good]) / max(count - H.shape[1], 0.2 * count))
+    return float(np.sum(projected[good] ** 2 / values[good]) / max(count - H.shape[1], 0.2 * count))
 
 
-def _informations(epochs: Sequence[WindowEpoch], c: Array) -> None:
-    """`WindowEpoch.instrument` of epochs that were linearised at c."""
+def _set_instrument_information(epochs: Sequence[WindowEpoch], c: Array) -> None:
+    """Set `WindowEpoch.instrument` of epochs that were linearised at c."""
     for epoch, own in zip(epochs, _quadratics(epochs, c), strict=True):
         at = c, epoch.factor.point.a.bias
         epoch.instrument = InstrumentInformation(own[:_SIZE, :_SIZE], own[:_SIZE, _SIZE], *at)
@@ -847,20 +916,20 @@ def _quadratics(
 ) -> Array:
     """H (E, n, n) with the gradient as its last column, of epochs that were linearised at c.
 
-    further: makes of both parts, directions, rates and rows more columns, whose numbers come after
-    those of the instrument, the field's before the motion's
+    further: returns more columns for given field and motion parts, directions, rates and rows.
+    Their indices follow those of the instrument, the field's columns before the motion's.
     """
     rows = chain.Rows.of(
         [chain.Chain(e.data, e.u, e.factor.point.a.bias, e.used, e.weights) for e in epochs]
     )
-    field, motion = chain.parts(rows, c)
+    field, motion = chain.field_and_motion(rows, c)
     turned = rows.angle_b_rad - rows.bias * rows.dt_s
-    turn = _of_angle(motion.by_bias / rows.dt_s, turned)
-    seen = np.concatenate([e.data.seen(e.u) for e in epochs])
-    rate = np.concatenate([rates(e.data) for e in epochs])
+    turn = _gyro_matrix_columns(motion.by_bias / rows.dt_s, turned)
+    seen = np.concatenate([e.data.field_directions(e.u) for e in epochs])
+    rate = np.concatenate([row_rates(e.data) for e in epochs])
     swept = chain.symmetric(c[:6]) @ np.cross(rate, seen).T
     late = field.by_x[0, 6] * swept  # by_x holds - sqrt(weight) / s_m in that place
-    place = _by_place(field, seen, np.concatenate([e.data.down_b for e in epochs]), c)
+    place = _place_columns(field, seen, np.concatenate([e.data.down_b for e in epochs]), c)
     of_field, of_motion = np.zeros((3, 0, len(rate))), np.zeros((2, 0, len(rate)))
     if further is not None:
         of_field, of_motion = further(field, motion, seen, rate - rows.bias.T, turned / rows.dt_s)
@@ -868,27 +937,29 @@ def _quadratics(
     size = split + of_motion.shape[1]
     J = np.concatenate([field.by_x, late[:, None], place, of_field, field.r[:, None]], axis=1)
     K = np.concatenate([motion.by_bias, turn, of_motion, motion.q[:, None]], axis=1)
-    diag, upper, border = chain.interior(field, motion)
+    diag, upper, border = chain.interior_blocks(field, motion)
     columns = np.zeros((2, size + 1, len(rate)))
     columns[:, :12], columns[:, size] = border[:, :12], border[:, 12]
-    angles = np.r_[_OF_ANGLE, split:size]
+    angles = np.r_[_ANGLE_COLUMNS, split:size]
     by_angle = K[:, 3:-1]
     columns[:, angles] = -motion.scale * by_angle
-    columns[:, angles, :-1] += np.einsum("rin,rjn->ijn", motion.prev[:, :, 1:], by_angle[:, :, 1:])
-    columns[:, LAG] = np.einsum("rn,rin->in", late, field.own)
-    columns[:, PLACE] = np.einsum("rjn,rin->ijn", place, field.own)
-    columns[:, _SIZE:split] = np.einsum("rjn,rin->ijn", of_field, field.own)
-    _, half = halfway(diag, upper, np.ascontiguousarray(columns.transpose(1, 2, 0)))
-    fields = np.r_[_OF_FIELD, _SIZE:split, size]
-    motions = np.r_[_OF_MOTION, split:size, size]
+    columns[:, angles, :-1] += np.einsum(
+        "rin,rjn->ijn", motion.by_previous[:, :, 1:], by_angle[:, :, 1:]
+    )
+    columns[:, LAG] = np.einsum("rn,rin->in", late, field.by_direction)
+    columns[:, PLACE] = np.einsum("rjn,rin->ijn", place, field.by_direction)
+    columns[:, _SIZE:split] = np.einsum("rjn,rin->ijn", of_field, field.by_direction)
+    _, half = factor_and_solve_lower(diag, upper, np.ascontiguousarray(columns.transpose(1, 2, 0)))
+    fields = np.r_[_FIELD_COLUMNS, _SIZE:split, size]
+    motions = np.r_[_MOTION_COLUMNS, split:size, size]
     H = np.zeros((len(epochs), size + 1, size + 1))
     for k, (a, b) in enumerate(zip(rows.first.tolist(), (rows.last + 1).tolist(), strict=True)):
         Y = half[2 * a : 2 * b]
         H[k] = -(Y.T @ Y)
-        H[k][np.ix_(fields, fields)] += chain.squares(J[:, :, a:b])
-        H[k][np.ix_(motions, motions)] += chain.squares(K[:, :, a:b])
+        H[k][np.ix_(fields, fields)] += chain.outer_sum(J[:, :, a:b])
+        H[k][np.ix_(motions, motions)] += chain.outer_sum(K[:, :, a:b])
     for epoch, own in zip(epochs, H, strict=True):
-        own[_SCALES, size] -= _by_noise(epoch)
+        own[_SCALES, size] -= _gyro_noise_gradient(epoch)
     return H
 
 
@@ -896,44 +967,51 @@ _Columns = tuple[Array, Array]
 """Of the field's residuals (3, n, N) and of the motion's (2, m, N)."""
 
 
-def _by_place(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Array:
-    """Residuals (3, 6, N) by a field that differs with the heading, gauss: north, east and down of
-    it, each with the heading's cosine and sine.
+def _place_columns(field: chain.FieldPart, seen: Array, down: Array, c: Array) -> Array:
+    """Derivatives (3, 6, N) of the residuals by a field that depends on the heading, in gauss: its
+    north, east and down components, each with the cosine and the sine of the heading.
 
-    seen, down (N, 3): directions of the field and to the earth. Nothing where they do not tell.
+    seen, down (N, 3): directions of the field and towards the earth. Zero where they give no
+    heading.
     """
     down = np.nan_to_num(down)
     east = np.cross(down, seen)
     flat = np.linalg.norm(east, axis=1)[:, None]
-    told = flat > _STEEP
-    east, down = np.where(told, east / np.maximum(flat, _STEEP), 0.0), np.where(told, down, 0.0)
+    determined = flat > _LEAST_HORIZONTAL
+    east, down = (
+        np.where(determined, east / np.maximum(flat, _LEAST_HORIZONTAL), 0.0),
+        np.where(determined, down, 0.0),
+    )
     north = np.cross(east, down)
-    ahead = np.column_stack([north[:, 0], east[:, 0]])
-    ahead /= np.maximum(np.linalg.norm(ahead, axis=1), _STEEP)[:, None]
+    heading = np.column_stack([north[:, 0], east[:, 0]])
+    heading /= np.maximum(np.linalg.norm(heading, axis=1), _LEAST_HORIZONTAL)[:, None]
     M = chain.symmetric(c[:6]) / np.cbrt(np.linalg.det(chain.symmetric(c[:6])))
-    ahead = (field.by_x[0, 6] * ahead.T)[None]  # by_x holds - sqrt(weight) / s_m in that place
-    moved = np.stack([M @ axis.T for axis in (north, east, down)], axis=1)
-    return np.asarray((moved[:, :, None] * ahead[:, None]).reshape(3, 6, -1), dtype=np.float64)
+    heading = (field.by_x[0, 6] * heading.T)[None]  # by_x holds - sqrt(weight) / s_m in that place
+    in_sensor = np.stack([M @ axis.T for axis in (north, east, down)], axis=1)
+    return np.asarray(
+        (in_sensor[:, :, None] * heading[:, None]).reshape(3, 6, -1), dtype=np.float64
+    )
 
 
-def _by_noise(epoch: WindowEpoch) -> Array:
-    """What the gyro's own noise seems to ask of scale (1) and shape (5): the gradient that it has.
+def _gyro_noise_gradient(epoch: WindowEpoch) -> Array:
+    """Gradient by scale (1) and shape (5) that the gyro's noise alone produces.
 
-    Angles that are made smaller have less noise. A step's noise (1 + E) n is seen across the field,
-    so half its square grows by n' (1 - u u') E n, of which a half is in each direction.
+    Smaller angles have less noise, so noise alone favours them. The noise (1 + E) n of a step is
+    seen across the field, so half its square grows by n' (1 - u u') E n, of which one half is in
+    each direction.
     """
     uu = epoch.u.T @ epoch.u / len(epoch.u)
     along = [uu[0, 0] - uu[1, 1], (uu[0, 0] + uu[1, 1] - 2 * uu[2, 2]) / np.sqrt(3.0)]
     along += [2 * uu[1, 2], 2 * uu[0, 2], 2 * uu[0, 1]]
-    # of squares beyond what noise makes, the gyro is not the cause
+    # more squares than noise makes are not due to the gyro
     squares = min(epoch.quadratic.sum_gyro, epoch.residuals.gyro_freedom)
     return np.asarray(squares * np.array([1.0, *(-0.5 * x for x in along)]))
 
 
-def _of_angle(by_angle: Array, angle: Array) -> Array:
-    """dq/dtheta, dq/ds and dq/dE, (2, 9, N), of dq/dphi (2, 3, N) and phi (3, N).
+def _gyro_matrix_columns(by_angle: Array, angle: Array) -> Array:
+    """dq/dtheta, dq/ds and dq/dE, (2, 9, N), from dq/dphi (2, 3, N) and phi (3, N).
 
-    E: x and y apart, z against both, then the three shears.
+    E: x against y, both against z, then the three shears.
     """
     (x, y, z), (p, q, r) = by_angle.transpose(1, 0, 2), angle
     turn = [y * r - z * q, z * p - x * r, x * q - y * p]  # by_angle [phi]x
@@ -942,53 +1020,54 @@ def _of_angle(by_angle: Array, angle: Array) -> Array:
     return np.array([*turn, -(x * p + y * q + z * r), *shape]).transpose(1, 0, 2)
 
 
-# -- What is locked to attitude, rate and time -----------------------------------------------------
+# -- Residuals that follow attitude, rate or time --------------------------------------------------
 #
-# What real instruments and places leave over besides (`locked`): harmonics of the field's direction
-# on each axis of the sensor; the field by the rate, and its change by axes that are late by
-# different times; products of the gyro's rates. They are not asked for, only watched
-# (`model_checks`). What follows time is a hard iron of each epoch's own, and needs no columns.
+# What real instruments and places leave in the residuals besides (`locked`): harmonics of the
+# field's direction on each axis of the sensor; terms in the rate, and in the field's change with a
+# different delay on each axis; products of the gyro's rates. They are not estimated, only tested
+# (`model_checks`). What follows time is a hard iron of its own in each epoch and needs no columns.
 
-_FROM = _SIZE
-_NEARBY = 1e-2  # of the field: a calibration that moved by less leaves 1e-4 of it to second order
-_ALIKE = 0.1  # of a noise level, by which another makes another epoch
+_FIRST_LOCKED = _SIZE
+_SAME_CALIBRATION = 1e-2  # of the field: a smaller move changes the result by 1e-4 (second order)
+_SAME_NOISE = 0.1  # relative change of a noise level up to which the result is kept
 LOCKED = {
-    "attitude": np.arange(_FROM, _FROM + 36),
-    "rate": np.arange(_FROM + 36, _FROM + 36 + 9 + 8 + 18),
+    "attitude": np.arange(_FIRST_LOCKED, _FIRST_LOCKED + 36),
+    "rate": np.arange(_FIRST_LOCKED + 36, _FIRST_LOCKED + 36 + 9 + 8 + 18),
     "time": np.arange(6, 9),
 }
 
 
 def linearise_locked(epochs: Sequence[WindowEpoch]) -> None:
-    """Compute `WindowEpoch.locked` of the epochs with motion that do not have it yet, as
-    `linearise_instrument`."""
-    silent = [epoch for epoch in epochs if epoch.turned and epoch.locked is None]
-    for place in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in silent}.values():
-        here = [epoch for epoch in silent if epoch.factor.point.c is place]
-        found = _quadratics(here, place, partial(_locked_columns, c=place))
+    """Compute `WindowEpoch.locked` of the epochs with motion that lack it, as
+    `linearise_instrument`.
+    """
+    missing = [epoch for epoch in epochs if epoch.has_motion and epoch.locked is None]
+    for point in {id(epoch.factor.point.c): epoch.factor.point.c for epoch in missing}.values():
+        here = [epoch for epoch in missing if epoch.factor.point.c is point]
+        found = _quadratics(here, point, partial(_locked_columns, c=point))
         H, g = found[:, :-1, :-1], found[:, :-1, -1]
         roots = {key: _whitening(H[:, at[:, None], at]) for key, at in LOCKED.items()}
         for k, epoch in enumerate(here):
-            told = InstrumentInformation(H[k], g[k], place, epoch.factor.point.a.bias)
+            information = InstrumentInformation(H[k], g[k], point, epoch.factor.point.a.bias)
             own = {key: root[k] for key, (root, _) in roots.items()}
             freedom = {key: int(count[k]) for key, (_, count) in roots.items()}
-            epoch.locked = LockedInformation(told, own, freedom, epoch.used)
+            epoch.locked = LockedInformation(information, own, freedom, epoch.used)
 
 
-def still_locked(old: WindowEpoch, new: WindowEpoch) -> LockedInformation | None:
-    """What is locked in an epoch that was linearised again, where that is as good as before."""
+def reusable_locked(old: WindowEpoch, new: WindowEpoch) -> LockedInformation | None:
+    """The `locked` information of an epoch that was linearised again, if it is still accurate."""
     known = old.locked
     if known is None or old.data is not new.data:
         return None
-    c, moved = new.factor.point.c, new.factor.point.c - known.told.c
-    far = float(np.linalg.norm(moved)) > _NEARBY * float(
+    c, change = new.factor.point.c, new.factor.point.c - known.information.c
+    has_moved = float(np.linalg.norm(change)) > _SAME_CALIBRATION * float(
         np.cbrt(np.linalg.det(chain.symmetric(c[:6])))
     )
-    other = max(
+    noise_change = max(
         abs(new.used.mag_gauss / known.noise.mag_gauss - 1.0),
         abs(new.used.gyro_rad_s / known.noise.gyro_rad_s - 1.0),
     )
-    return None if far or other > _ALIKE else known
+    return None if has_moved or noise_change > _SAME_NOISE else known
 
 
 def _locked_columns(
@@ -1000,25 +1079,26 @@ def _locked_columns(
     *,
     c: Array,
 ) -> _Columns:
-    """Of directions seen and rates (N, 3) at the rows, and of the step to each (3, N)."""
+    """Columns for directions and rates (N, 3) at the rows, and rates of the step to each (3, N)."""
     change = np.cross(seen, rate) @ chain.symmetric(c[:6])
     by_field = np.concatenate(
         [
             locked.BY_DIRECTION * locked.on_each_axis(locked.harmonics(seen)),
             locked.FIELD_BY_RATE * locked.on_each_axis(rate),
-            locked.BY_CHANGE * locked.of_change(change),
+            locked.BY_CHANGE * locked.change_columns(change),
         ],
         axis=2,
     )
-    products = locked.BY_RATE_SQUARED * locked.squares(step_rate.T)
+    products = locked.BY_RATE_SQUARED * locked.rate_products(step_rate.T)
     by_motion = np.einsum("rin,nk->rkin", motion.by_bias, products)
     weight = field.by_x[0, 6]  # - sqrt(weight) / s_m
     return weight * by_field.transpose(1, 2, 0), by_motion.reshape(2, -1, len(seen))
 
 
 def _whitening(H: Array) -> tuple[Array, Array]:
-    """Roots (E, n, n) by which gradients of H (E, n, n) are whitened, and how many directions each
-    tells (E,)."""
+    """Roots (E, n, n) that whiten gradients of H (E, n, n), and the number of determined directions
+    (E,).
+    """
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-30))
     values, vectors = np.linalg.eigh(H * scale[:, :, None] * scale[:, None, :])
     good = values > _WEAKEST
@@ -1029,35 +1109,38 @@ def _whitening(H: Array) -> tuple[Array, Array]:
 
 # -- A contradiction -------------------------------------------------------------------------------
 #
-# A magnet that passes disturbs some rows; one that stays with the sensor disturbs them all, and
-# another hard iron explains what it does (`model_checks.py`).
+# A passing magnet disturbs some rows. A magnet that stays with the sensor disturbs all of them, and
+# another hard iron explains the residuals (`model_checks.py`).
 
-_MOST_ROWS = 0.6
-_ATTITUDES = 0.1  # rad, spread of the field's direction over the rows that contradict
+_MOST_ROWS = 0.6  # share of the rows that must contradict
+_LEAST_SPREAD_RAD = 0.1  # spread of the field's direction over the rows that contradict
 _EXPLAINED = 0.9  # share of the epoch's cost that another hard iron alone must take away
-_FREE = np.r_[6:9, 12:16]  # hard iron and borders among the numbers of `chain.Quadratic`
+# hard iron and borders among the numbers of `chain.Quadratic`
+_IRON_AND_BORDERS = np.r_[6:9, 12:16]
 
 
 def contradicts(
     epoch: WindowEpoch, c: Array, covariance: Array, usual: chain.Noise, limit_sigma: float
 ) -> bool:
-    """Most of its rows are beyond what noise and the covariance (9, 9) of c allow, and b mends it.
+    """Whether most rows are beyond what noise and the covariance (9, 9) of c allow, and another
+    hard iron explains the epoch.
 
-    They must be of more than one attitude: in one, another iron and another place are the same.
+    The rows must have more than one attitude: at a single attitude, a change of the iron and a
+    change of place look the same.
 
-    Its directions must still be where the epoch was linearised, at c.
+    The directions must still be where the epoch was linearised, at c.
     """
-    u = chain.move(epoch.u, epoch.quadratic, np.zeros(chain.WIDTH))
-    J = chain.symmetric_columns(epoch.data.seen(u))
-    J = np.concatenate([J, np.broadcast_to(np.eye(3), (len(u), 3, 3))], axis=2)
-    known = np.sum((J @ covariance) * J, axis=(1, 2))
+    u = chain.move_directions(epoch.u, epoch.quadratic, np.zeros(chain.WIDTH))
+    jacobian = chain.symmetric_columns(epoch.data.field_directions(u))
+    jacobian = np.concatenate([jacobian, np.broadcast_to(np.eye(3), (len(u), 3, 3))], axis=2)
+    known = np.sum((jacobian @ covariance) * jacobian, axis=(1, 2))
     error = np.sum(epoch.data.field_error(u, c) ** 2, axis=1)
     beyond = error > limit_sigma**2 * (usual.mag_gauss**2 / epoch.data.count + known)
-    if not epoch.turned or float(np.mean(beyond)) <= _MOST_ROWS:
+    if not epoch.has_motion or float(np.mean(beyond)) <= _MOST_ROWS:
         return False
-    if spread(u[beyond]) < _ATTITUDES:
+    if principal_deviation(u[beyond]) < _LEAST_SPREAD_RAD:
         return False
     q = epoch.quadratic
-    H, g = q.H[np.ix_(_FREE, _FREE)], q.g[_FREE]
+    H, g = q.H[np.ix_(_IRON_AND_BORDERS, _IRON_AND_BORDERS)], q.g[_IRON_AND_BORDERS]
     explained = 0.5 * g @ np.linalg.lstsq(H, g, rcond=1e-12)[0]
     return bool(explained > _EXPLAINED * q.cost)

@@ -1,14 +1,14 @@
-"""From blocks of samples to steps and to the data of epochs, and what is done with those.
+"""From blocks of samples to steps and epochs, and the preparation of their data.
 
-Any split into blocks gives the same. The rate is measured on the first _RATE_ROWS samples after a
-start or a gap, whatever blocks they came in; from it follows how many samples make a step, and
-likewise whether the magnetometer's readings are held over several samples (`HeldReadings`). Pieces
-between short gaps share an epoch: nothing links the steps on the two sides of a gap, but the gyro's
-bias is the same.
+Any split of the samples into blocks gives the same result. The rate is measured on the first
+_RATE_ROWS samples after a start or a gap. It determines how many samples make a step. The same
+samples show whether the magnetometer's readings are held over several samples (`HeldReadings`).
+Pieces between short gaps share an epoch: nothing links the steps on the two sides of a gap, but the
+gyro bias is the same.
 
-Before the data of an epoch are linearised: did it turn the sensor? Its fields are shifted by the
-magnetometer's lag, its steps grouped where several may share a state; for a search it is thinned,
-and joined to others.
+Before the data of an epoch are linearised: a test for motion, a shift of the fields by the
+magnetometer's lag, and grouping of steps that can share a state. For a search, epochs are thinned
+and joined.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from ahrsd.samples import Array, SampleBlock
 
 # -- Samples averaged into steps -------------------------------------------------------------------
 #
-# Averaging of fast streams into steps, exactly where it can be.
+# Averaging of fast streams into steps, exact where possible.
 #
-# A step's field is the mean of an odd number n of consecutive samples and belongs to the middle
-# one; the rotation between two steps is the product of all sample rotations between their middle
-# samples. Averaging shortens the field by (w T)^2 / 24 for a rate w over the averaging time T: 0.04
-# % at 4 rad/s and 25 ms.
+# The field of a step is the mean of an odd number n of consecutive samples and belongs to the
+# middle one. The rotation between two steps is the product of all sample rotations between their
+# middle samples. Averaging shortens the field by (w T)^2 / 24 for a rate w over the averaging time
+# T: 0.04 % at 4 rad/s and 25 ms.
 
 
 # -- From samples to epochs ------------------------------------------------------------------------
@@ -43,9 +43,9 @@ from ahrsd.samples import Array, SampleBlock
 class Steps:
     """N consecutive steps; the rotation of row k leads from step k-1 to step k.
 
-    time_s (N,), field_b_gauss (N, 3), angle_b_rad (N, 3) rotation vector of the step,
-    dt_s (N,), accel_b_m_s2 (N, 3), linked (N,): 0 for a step that nothing leads to, the first of a
-    piece, whose rotation and time are nan, else 1.
+    time_s (N,), field_b_gauss (N, 3), angle_b_rad (N, 3) rotation vector of the step, dt_s (N,),
+    accel_b_m_s2 (N, 3), linked (N,): 0 for the first step of a piece, whose rotation and time are
+    nan, else 1.
     """
 
     time_s: Array
@@ -66,7 +66,7 @@ def samples_per_step(rate_hz: float, step_rate_hz: float) -> int:
 
 
 class StepAverager:
-    """Samples in, steps out. The state is at most n samples, so any split gives the same steps."""
+    """Samples in, steps out. It keeps at most n samples, so any split gives the same steps."""
 
     def __init__(self, averaged: int) -> None:
         self.averaged = averaged
@@ -81,20 +81,20 @@ class StepAverager:
         if self._rows:
             rows = np.vstack([*self._rows, rows])
         n, half = self.averaged, self.averaged // 2
-        # The second half of the last step's samples is kept: its rotations lead to the next step.
+        # The second half of the last step's samples is kept: their rotations lead to the next step.
         lead = half if self._linked else 0
         count = max(0, (len(rows) - lead) // n)
         used = lead + count * n
         if count == 0:
             self._rows = [rows]
-            return _empty()
-        steps = _average(rows[:used], lead, n, count, self._linked)
+            return _no_steps()
+        steps = _average_rows(rows[:used], lead, n, count, self._linked)
         self._rows = [rows[used - half :]]
         self._linked = True
         return steps
 
 
-def _average(rows: Array, lead: int, n: int, count: int, linked: bool) -> Steps:
+def _average_rows(rows: Array, lead: int, n: int, count: int, linked: bool) -> Steps:
     half = n // 2
     body = rows[lead:].reshape(count, n, -1)
     dt = rows[:, 1]
@@ -118,8 +118,8 @@ def _average(rows: Array, lead: int, n: int, count: int, linked: bool) -> Steps:
     )
 
 
-def join(parts: Sequence[Steps]) -> Steps:
-    """Consecutive steps in one record."""
+def join_steps(parts: Sequence[Steps]) -> Steps:
+    """Concatenate consecutive steps."""
     if len(parts) == 1:
         return parts[0]
     return Steps(
@@ -132,12 +132,12 @@ def join(parts: Sequence[Steps]) -> Steps:
     )
 
 
-def split(steps: Steps, at: int) -> tuple[Steps, Steps]:
-    """The first `at` steps and the rest."""
-    return _part(steps, slice(0, at)), _part(steps, slice(at, None))
+def split_steps(steps: Steps, at: int) -> tuple[Steps, Steps]:
+    """The first `at` steps and the remaining ones."""
+    return _select_steps(steps, slice(0, at)), _select_steps(steps, slice(at, None))
 
 
-def _part(s: Steps, rows: slice) -> Steps:
+def _select_steps(s: Steps, rows: slice) -> Steps:
     return Steps(
         s.time_s[rows],
         s.field_b_gauss[rows],
@@ -148,33 +148,33 @@ def _part(s: Steps, rows: slice) -> Steps:
     )
 
 
-def _empty() -> Steps:
+def _no_steps() -> Steps:
     z3 = np.zeros((0, 3))
     return Steps(np.zeros(0), z3, z3, np.zeros(0), z3, np.zeros(0))
 
 
 # -- Readings that are held over several samples ---------------------------------------------------
 #
-# A magnetometer that is read more slowly than the gyro: each reading counts once.
+# A magnetometer that is sampled more slowly than the gyro: each reading counts once.
 #
-# Loggers write the newest reading of each sensor into every row, so that a 10 Hz magnetometer in
-# 100 Hz rows repeats each reading ten times.  Taken as ten measurements they turn with the sensor
-# and look like a field that comes and goes.  Rows are therefore merged from one new reading to the
-# next: the gyro's rotations are composed, the reading and the force are those of the row in which
-# it came.
+# Loggers write the newest reading of each sensor into every row, so a 10 Hz magnetometer in 100 Hz
+# rows repeats each reading ten times. If these were ten measurements, the repeated field would seem
+# to turn with the sensor. So the rows from one new reading to the next are merged: the gyro's
+# rotations are composed; reading and specific force are those of the row with the new reading.
 
 TIME, STEP, FIELD, GYRO = 0, 1, slice(2, 5), slice(5, 8)  # columns of the rows, accel behind them
-_RUNS = 8  # of equal readings, by which a slow magnetometer is told
-_MOST_ROWS = 512  # after which nobody waits for them
-_REPEATED = 0.4  # share of the rows
-_LONGEST = 5  # usual runs, after which a reading counts again: it is stuck, or nothing turns
+_RUNS = 8  # of equal readings that identify a slow magnetometer
+_MOST_ROWS = 512  # limit of the wait for these runs
+_REPEATED = 0.4  # share of the rows that repeat a reading
+_LONGEST_RUNS = 5  # in typical runs: a reading that is held for longer counts again
 
 
 def rows_per_reading(rows: Array, fewest: int) -> int | None:
-    """How many rows a reading is held for, 1 where each has its own; None: too few rows to tell.
+    """Number of rows for which a reading is held, 1 if each row has its own; None: too few rows to
+    decide.
 
-    rows (N, 11): of one piece from its beginning; fewest: that are needed in any case. The answer
-    depends on the first rows only, so that it is the same however they are split.
+    rows (N, 11): of one piece from its beginning; fewest: number of rows needed in any case. The
+    result depends on the first rows only, so it is the same for any split.
     """
     if len(rows) < fewest:
         return None
@@ -194,48 +194,48 @@ def rows_per_reading(rows: Array, fewest: int) -> int | None:
 
 
 class HeldReadings:
-    """Rows in, one row for each new reading out; the state is the rows since the last one."""
+    """Rows in, one row per new reading out; it keeps the rows since the last one."""
 
     def __init__(self, length: int) -> None:
         self.length = length
         self._rows = np.empty((0, 0))
-        self._begun = False
+        self._has_reading = False
 
     def copy(self) -> HeldReadings:
-        """A copy that goes its own way."""
+        """An independent copy."""
         return copy(self)
 
-    def thin(self, rows: Array) -> Array:
-        """(M, 11) rows with a new reading of the next (N, 11), which follow without a gap."""
+    def merge_rows(self, rows: Array) -> Array:
+        """(M, 11) rows with a new reading from the next (N, 11), which follow without a gap."""
         if len(self._rows):
             rows = np.vstack([self._rows, rows])
         new = np.concatenate([[False], np.any(rows[1:, FIELD] != rows[:-1, FIELD], axis=1)])
-        at = self._not_too_far(np.flatnonzero(new).tolist(), len(rows))
+        at = self._limit_distance(np.flatnonzero(new).tolist(), len(rows))
         out: list[Array] = []
         before = 0
         for row in at:
-            out.append(self._merged(rows[before + 1 : row + 1]))
+            out.append(self._merge(rows[before + 1 : row + 1]))
             before = row
-        self._rows = rows[before:] if self._begun else rows[-1:]
+        self._rows = rows[before:] if self._has_reading else rows[-1:]
         return np.array(out).reshape(-1, rows.shape[1])
 
-    def _not_too_far(self, at: list[int], count: int) -> list[int]:
-        """The rows with new readings, and some of those between that are very far apart."""
-        most = _LONGEST * self.length
+    def _limit_distance(self, at: list[int], count: int) -> list[int]:
+        """The rows with new readings, and rows in between where these are too far apart."""
+        most = _LONGEST_RUNS * self.length
         out: list[int] = []
         last = 0
         for row in [*at, count]:
-            out += range(last + most, row, most) if self._begun or out else []
+            out += range(last + most, row, most) if self._has_reading or out else []
             if row < count:
                 out.append(row)
             last = row
         return out
 
-    def _merged(self, rows: Array) -> Array:
-        """One row for those up to a new reading; nothing leads to the first one of a piece."""
+    def _merge(self, rows: Array) -> Array:
+        """One row for the rows up to a new reading; the first of a piece has no time step."""
         row: Array = rows[-1].copy()
-        if not self._begun:
-            self._begun = True
+        if not self._has_reading:
+            self._has_reading = True
             row[STEP] = np.nan
             return row
         step_s = float(rows[:, STEP].sum())
@@ -247,14 +247,14 @@ class HeldReadings:
 # -- Epochs ----------------------------------------------------------------------------------------
 
 _RATE_ROWS = 33
-_LONGEST_GAP_S = 60.0  # after a longer one the gyro's bias may have moved
-_SPARE = 2  # steps by which the count of what waits may be wrong
+_LONGEST_GAP_S = 60.0  # after a longer one the gyro bias may have changed
+_SPARE_STEPS = 2  # steps by which the estimated count of waiting steps may be wrong
 
 
 def check_samples(block: SampleBlock) -> None:
     """Raises ValueError naming the first row that is not a finite sample with a positive step.
 
-    Only the first row of a block after a gap may lack its step.
+    Only the first row of a block after a gap may have no step.
     """
     table = (
         ("time_s", block.time_s),
@@ -275,31 +275,31 @@ def check_samples(block: SampleBlock) -> None:
 
 
 class EpochBuilder:
-    """Blocks in, epochs out; also counts what went in."""
+    """Blocks in, epochs out; counts samples and duration."""
 
     def __init__(self, parameters: EstimatorParameters) -> None:
         self._parameters = parameters
         self.averaged = 1
         self.samples = 0
         self._averager: StepAverager | None = None
-        self._held: HeldReadings | None = None
-        self._rows: list[Array] = []  # samples of a piece whose rate is not known yet
-        self._waiting: list[Array] = []  # samples that are not steps yet
+        self._held_readings: HeldReadings | None = None
+        self._rows: list[Array] = []  # samples of a piece of unknown rate
+        self._waiting: list[Array] = []  # samples that are not averaged yet
         self._waiting_count = 0
         self._pending: list[Steps] = []
         self._pending_count = 0
-        self._fresh = True
+        self._measures_first = True
         self._earlier_s = 0.0
         self._from_s: float | None = None
         self._to_s = 0.0
 
     @property
     def duration_s(self) -> float:
-        """Time covered, gaps left out."""
+        """Time covered, without gaps."""
         return self._earlier_s + (0.0 if self._from_s is None else self._to_s - self._from_s)
 
     def add(self, block: SampleBlock) -> list[chain.EpochData]:
-        """Take samples that follow the last ones without a gap; return completed epochs."""
+        """Take samples that follow the last ones without a gap; returns completed epochs."""
         if len(block) == 0:
             return []
         self.samples += len(block)
@@ -317,37 +317,37 @@ class EpochBuilder:
             if length is None:
                 return []
             self._rows.clear()
-            closed = self._measure(rows[1:_RATE_ROWS, 1], length)
-        if self._held is not None:
-            rows = self._held.thin(rows)
+            closed = self._measure_rate(rows[1:_RATE_ROWS, 1], length)
+        if self._held_readings is not None:
+            rows = self._held_readings.merge_rows(rows)
         self._waiting.append(rows)
         self._waiting_count += len(rows)
-        enough = self._parameters.epoch_steps + int(self._fresh)
-        if self._pending_count + self._waiting_count // self.averaged + _SPARE >= enough:
-            self._work_off()
-        return closed + self._complete()
+        enough = self._parameters.epoch_steps + int(self._measures_first)
+        if self._pending_count + self._waiting_count // self.averaged + _SPARE_STEPS >= enough:
+            self._average_waiting()
+        return closed + self._complete_epochs()
 
-    def _work_off(self) -> None:
-        """Make steps of what waits; small blocks wait, because each would cost as much as one."""
+    def _average_waiting(self) -> None:
+        """Average the waiting samples; they wait because each call has a fixed cost."""
         if self._waiting:
-            self._take(np.vstack(self._waiting))
+            self._add_steps(np.vstack(self._waiting))
             self._waiting.clear()
             self._waiting_count = 0
 
-    def _measure(self, dt_s: Array, length: int) -> list[chain.EpochData]:
-        """Measure the rate; steps of another length do not share an epoch.
+    def _measure_rate(self, dt_s: Array, length: int) -> list[chain.EpochData]:
+        """Measure the rate; steps of different lengths do not share an epoch.
 
-        length: samples for which a reading is held
+        length: number of samples for which a reading is held.
         """
-        self._held = HeldReadings(length) if length > 1 else None
+        self._held_readings = HeldReadings(length) if length > 1 else None
         rate_hz = 1.0 / (length * float(np.median(dt_s)))
         averaged = samples_per_step(rate_hz, self._parameters.step_rate_hz)
-        data = self._closed() if averaged != self.averaged else None
+        data = self._close_pending() if averaged != self.averaged else None
         self.averaged = averaged
         self._averager = StepAverager(averaged)
         return [] if data is None else [data]
 
-    def _take(self, rows: Array) -> None:
+    def _add_steps(self, rows: Array) -> None:
         averager = self._averager or StepAverager(self.averaged)
         steps = averager.add(rows)
         if len(steps):
@@ -355,98 +355,109 @@ class EpochBuilder:
             self._pending_count += len(steps)
 
     def gap(self, next_s: float) -> list[chain.EpochData]:
-        """The next sample, at `next_s`, does not follow the last one; epochs that end here."""
-        self._work_off()
-        if self._averager is None and self._pending_count and self._too_short:
-            rows = np.vstack(self._rows)  # too short to tell its rate: as the one before
-            self._take(rows if self._held is None else HeldReadings(self._held.length).thin(rows))
-        closed = self._settled() + self._complete()
+        """The next sample, at `next_s`, does not follow the last one; returns the epochs that end
+        here.
+        """
+        self._average_waiting()
+        if self._averager is None and self._pending_count and self._is_unmeasured_short:
+            rows = np.vstack(self._rows)  # too short for its rate: as in the piece before
+            self._add_steps(
+                rows
+                if self._held_readings is None
+                else HeldReadings(self._held_readings.length).merge_rows(rows)
+            )
+        closed = self._close_unmeasured() + self._complete_epochs()
         if self._pending_count and 0.0 <= next_s - self._to_s <= _LONGEST_GAP_S:
-            self._cut()
+            self._start_piece()
         elif (data := self.interrupt()) is not None:
             closed.append(data)
         return closed
 
     @property
-    def _too_short(self) -> bool:
+    def _is_unmeasured_short(self) -> bool:
         return 0 < sum(map(len, self._rows)) < _RATE_ROWS
 
-    def _settled(self) -> list[chain.EpochData]:
-        """A piece that ends before it is known how long readings are held: as in the one before."""
-        if self._averager is not None or not self._rows or self._too_short:
+    def _close_unmeasured(self) -> list[chain.EpochData]:
+        """Close a piece that ends before the held length is known: it is taken as in the piece
+        before.
+        """
+        if self._averager is not None or not self._rows or self._is_unmeasured_short:
             return []
         rows = np.vstack(self._rows)
         self._rows.clear()
-        length = 1 if self._held is None else self._held.length
-        closed = self._measure(rows[1:_RATE_ROWS, 1], length)
-        self._take(rows if self._held is None else self._held.thin(rows))
+        length = 1 if self._held_readings is None else self._held_readings.length
+        closed = self._measure_rate(rows[1:_RATE_ROWS, 1], length)
+        self._add_steps(
+            rows if self._held_readings is None else self._held_readings.merge_rows(rows)
+        )
         return closed
 
-    def _cut(self) -> None:
+    def _start_piece(self) -> None:
         self._rows.clear()
         self._averager = None
         self._earlier_s, self._from_s = self.duration_s, None
 
-    def _complete(self) -> list[chain.EpochData]:
+    def _complete_epochs(self) -> list[chain.EpochData]:
         closed = []
-        while self._pending_count >= self._parameters.epoch_steps + int(self._fresh):
-            closed.append(self._close(self._parameters.epoch_steps + int(self._fresh)))
+        while self._pending_count >= self._parameters.epoch_steps + int(self._measures_first):
+            closed.append(
+                self._take_epoch(self._parameters.epoch_steps + int(self._measures_first))
+            )
         return closed
 
     @property
     def pending(self) -> int:
-        """Steps of the epoch that is not complete yet."""
-        self._work_off()
+        """Number of steps of the incomplete epoch."""
+        self._average_waiting()
         return self._pending_count
 
     def copy(self) -> EpochBuilder:
-        """A copy that goes its own way, for closing the epoch early."""
-        self._work_off()
+        """An independent copy, with which to close the epoch early."""
+        self._average_waiting()
         other = copy(self)
         other._pending, other._rows = list(self._pending), list(self._rows)
         other._averager, other._waiting = copy(self._averager), []
-        other._held = None if self._held is None else self._held.copy()
+        other._held_readings = None if self._held_readings is None else self._held_readings.copy()
         return other
 
     def interrupt(self) -> chain.EpochData | None:
-        """What is pending as a short epoch, if it is worth one; the next one starts anew."""
-        self._work_off()
-        data = self._closed()
-        self._cut()
+        """The pending steps as a short epoch, if there are enough; the next one starts anew."""
+        self._average_waiting()
+        data = self._close_pending()
+        self._start_piece()
         return data
 
-    def _closed(self) -> chain.EpochData | None:
+    def _close_pending(self) -> chain.EpochData | None:
         enough = self._pending_count >= MIN_EPOCH_STEPS
-        data = self._close(self._pending_count) if enough else None
+        data = self._take_epoch(self._pending_count) if enough else None
         self._pending.clear()
         self._pending_count = 0
-        self._fresh = True
+        self._measures_first = True
         return data
 
-    def _close(self, count: int) -> chain.EpochData:
-        steps, rest = split(join(self._pending), count)
-        self._pending = [rest] if len(rest) else []
-        self._pending_count = len(rest)
-        fresh, self._fresh = self._fresh, False
+    def _take_epoch(self, count: int) -> chain.EpochData:
+        steps, remaining = split_steps(join_steps(self._pending), count)
+        self._pending = [remaining] if len(remaining) else []
+        self._pending_count = len(remaining)
+        fresh, self._measures_first = self._measures_first, False
         cut = steps.linked == 0
         angle = np.where(cut[:, None], 0.0, steps.angle_b_rad)
         return chain.EpochData(
             steps.field_b_gauss,
             angle,
             np.where(cut, np.median(steps.dt_s[~cut]), steps.dt_s),
-            _down(steps.accel_b_m_s2, angle),
+            _down_directions(steps.accel_b_m_s2, angle),
             steps.time_s,
             measures_first=fresh,
             linked=steps.linked if cut[1:].any() else None,
         )
 
 
-def _down(accel: Array, angle: Array) -> Array:
+def _down_directions(accel: Array, angle: Array) -> Array:
     """Unit vectors towards the earth (n, 3) from specific force, which points up at rest.
 
-    The force is averaged over the epoch in one frame, that of its middle, to which the gyro's
-    angles (n, 3) turn it: what a vehicle does to get round a bend averages out there, and so does a
-    gyro's bias to first order.
+    The force is averaged over the epoch in the frame of its middle, to which the gyro's angles (n,
+    3) rotate it. So accelerations of the vehicle average out, and a gyro bias does to first order.
     """
     if not np.isfinite(accel).all():
         return np.full_like(accel, np.nan)
@@ -456,7 +467,7 @@ def _down(accel: Array, angle: Array) -> Array:
 
 
 def with_border(data: chain.EpochData, before: chain.EpochData) -> chain.EpochData:
-    """Put the previous epoch's last step in front, as the shared border."""
+    """Prepend the last step of the previous epoch, as the shared border."""
     return chain.EpochData(
         np.vstack([before.field_b_gauss[-1:], data.field_b_gauss]),
         np.vstack([np.zeros((1, 3)), data.angle_b_rad]),
@@ -470,53 +481,59 @@ def with_border(data: chain.EpochData, before: chain.EpochData) -> chain.EpochDa
 
 # -- Whether an epoch turned the sensor ------------------------------------------------------------
 #
-# Whether an epoch turned the sensor: one that did not says nothing about the iron.
+# Whether the sensor turned during an epoch: without motion it has no information on the iron.
 #
-# A field that changes while the sensor rests (a lift, a magnet, drift) would be taken for a strange
-# calibration. So both sensors must have seen a rotation. How much of a steady rate is the gyro's
-# bias is not known well: where the field swept far, any turn that the gyro saw will do.
+# A field that changes while the sensor is at rest (a lift, a magnet, drift) would look like a
+# different calibration. So both sensors must have seen a rotation. How much of a steady rate is the
+# gyro bias is not well known: if the field swept far, any turn seen by the gyro suffices.
 
 # -- Before they are linearised --------------------------------------------------------------------
 
 
-_SWEPT = 0.10  # spread of the field over its size: a turn, if the gyro saw any
-_SEEN = 0.3  # spread of the integrated rate, less the bias as known, over that: it saw any
-_STIRRED = 0.004  # the same, if the gyro saw the turn
-_TURNED_RAD = 0.002  # spread of the integrated rate less its mean
-_SMOOTHED = 16  # steps
+_LEAST_SWEEP = 0.10  # spread of the field over its size: a turn, if the gyro saw one
+_LEAST_PATH = 0.3  # spread of the integrated rate less the known bias, over that of the field
+_LEAST_SWEEP_UNSTEADY = 0.004  # spread of the field, if the gyro saw an unsteady turn
+_TURNED_RAD = 0.002  # spread of the integrated rate less its mean: an unsteady turn
+_SMOOTHED_STEPS = 16  # steps
 
 
-def spread(field: Array) -> float:
-    """Standard deviation of (N, 3) along the direction in which it varied most."""
+def principal_deviation(field: Array) -> float:
+    """Standard deviation of (N, 3) along the direction of largest variance."""
     away = field - field.mean(axis=0)
     return float(np.sqrt(np.linalg.eigvalsh(away.T @ away)[-1] / (len(field) - 1)))
 
 
-def turned(data: chain.EpochData, bias_rad_s: Array) -> bool:
-    """True where the epoch is worth a factor on the calibration; bias (3,) of the gyro as known."""
-    count = len(data) // _SMOOTHED
-    field = data.field_b_gauss[: count * _SMOOTHED].reshape(count, _SMOOTHED, 3).mean(axis=1)
-    relative = spread(field) / float(np.median(np.linalg.norm(data.field_b_gauss, axis=1)))
+def has_motion(data: chain.EpochData, bias_rad_s: Array) -> bool:
+    """Whether the epoch has information on the calibration; bias (3,): known bias of the gyro."""
+    count = len(data) // _SMOOTHED_STEPS
+    field = (
+        data.field_b_gauss[: count * _SMOOTHED_STEPS]
+        .reshape(count, _SMOOTHED_STEPS, 3)
+        .mean(axis=1)
+    )
+    relative = principal_deviation(field) / float(
+        np.median(np.linalg.norm(data.field_b_gauss, axis=1))
+    )
     angle = data.angle_b_rad[1:]
     path = np.cumsum(angle - bias_rad_s * data.dt_s[1:, None], axis=0)
-    if relative > _SWEPT and spread(path) > _SEEN * relative:
+    if relative > _LEAST_SWEEP and principal_deviation(path) > _LEAST_PATH * relative:
         return True
     unsteady = np.cumsum(angle - angle.mean(axis=0), axis=0)
-    return relative > _STIRRED and spread(unsteady) > _TURNED_RAD
+    return relative > _LEAST_SWEEP_UNSTEADY and principal_deviation(unsteady) > _TURNED_RAD
 
 
 # -- A lag of the magnetometer ---------------------------------------------------------------------
 #
-# A magnetometer that is late against the gyro: a reading at t is of the direction at t - tau.
+# A lag of the magnetometer against the gyro: a reading at t has the direction at t - tau.
 #
-# Filters, buses and interrupts make it so in every real system, and a lag of tau at a rate w looks
-# like a field that is turned by w tau. It is taken out where the field is seen: the row measured
-# M Exp(w tau) u + b. The gyro's readings stay as they are, so nothing is smoothed and no noise is
-# mixed. For tau of a few steps at most: w is the mean rate of the row's steps.
+# Every real system has one, by filters, buses and interrupts. A lag of tau at a rate w looks like a
+# field that is turned by w tau. It is corrected in the prediction of the field: the row measured M
+# Exp(w tau) u + b. The gyro's readings stay as they are, so nothing is smoothed and no noise is
+# mixed. This holds for tau of a few steps at most: w is the mean rate of the row's steps.
 
 
-def rates(data: chain.EpochData) -> Array:
-    """Rate (n, 3) in rad/s at each row: mean of the steps to it and from it, as far as linked."""
+def row_rates(data: chain.EpochData) -> Array:
+    """Rate (n, 3) in rad/s at each row: mean of the steps before and after it, if linked."""
     if data.averaging is not None:
         return data.averaging.rate_b_rad_s
     linked = np.ones(len(data)) if data.linked is None else data.linked.copy()
@@ -529,9 +546,9 @@ def rates(data: chain.EpochData) -> Array:
     return np.asarray(both / np.maximum(sides, 1.0)[:, None])
 
 
-def delayed(data: chain.EpochData, lag_s: float) -> chain.EpochData:
-    """The same epoch with its fields taken to be `lag_s` later than before."""
-    rate = rates(data)
+def with_lag(data: chain.EpochData, lag_s: float) -> chain.EpochData:
+    """The same epoch with its fields taken to be late by a further `lag_s`."""
+    rate = row_rates(data)
     turn = so3.exp(lag_s * rate)
     averaging = data.averaging
     if averaging is None:
@@ -541,11 +558,11 @@ def delayed(data: chain.EpochData, lag_s: float) -> chain.EpochData:
     return replace(data, averaging=averaging)
 
 
-def corrected(data: chain.EpochData, gyro: Array, lag_s: float) -> chain.EpochData:
+def with_gyro_matrix(data: chain.EpochData, gyro: Array, lag_s: float) -> chain.EpochData:
     """The same epoch with the gyro's angles multiplied by a matrix (3, 3).
 
-    lag_s: by which its fields are taken to be late already. Inside a group the angles are so small
-    that only the way of the lag is another.
+    lag_s: lag of its fields that is already applied. Inside a group the angles are so small that
+    only the rotation by the lag changes.
     """
     angle, averaging = data.angle_b_rad @ gyro.T, data.averaging
     if averaging is not None:
@@ -557,55 +574,55 @@ def corrected(data: chain.EpochData, gyro: Array, lag_s: float) -> chain.EpochDa
 
 # -- Steps in groups -------------------------------------------------------------------------------
 #
-# Several steps in one state of the chain: the same information at a fraction of the cost.
+# Several steps in one state of the chain: nearly the same information at a fraction of the cost.
 #
-# Where the gyro carries the direction over a few steps much better than the magnetometer sees it,
-# the steps of a group need no states of their own: their fields, turned by the gyro into the
-# group's middle, are averaged. The mean of M u_j + b over the group is M P u + b exactly, with P
-# the mean of the rotations from the middle to each step, so a turning sensor loses nothing either.
-# Groups never span a gap; the first and the last row of an epoch stay by themselves, because its
-# neighbours share them.
+# If the gyro propagates the direction over a few steps much better than the magnetometer measures
+# it, the steps of a group need no states of their own: their fields are averaged. The mean of M u_j
+# + b over the group is M P u + b exactly, with P the mean of the rotations from the middle to each
+# step, so rotation inside the group loses nothing. Groups never span a gap; the first and the last
+# row of an epoch stay single, because the neighbouring epochs share them.
 #
-# What is lost is the gyro's noise inside a group (its variance adds _LOST of the field's) and the
-# field's differences inside it, which matter only if the sensor turned much (_TURN_RAD).
+# The loss is the gyro's noise inside a group (it adds _LOST_INFORMATION of the field's variance)
+# and the differences of the fields inside it, which matter only at large rotations (_TURN_RAD).
 
-_LARGEST = 7
-_TURN_RAD, _OFTEN = 0.3, 0.95  # of rotation in a group; share of the steps that may not turn faster
-_LOST = 0.03
-_FEWEST = 3  # rows that are never grouped
+_LARGEST_GROUP = 7
+# rotation in a group, which this share of the steps respects
+_TURN_RAD, _FAST_SHARE = 0.3, 0.95
+_LOST_INFORMATION = 0.03
+_FEWEST_ROWS = 3  # shorter epochs are not grouped
 
 
 def group_size(data: chain.EpochData, noise: chain.Noise, size_gauss: float) -> int:
-    """How many steps may share a state: odd, 1 where the gyro is poor or the turn fast.
+    """Number of steps that can share a state: odd, 1 if the gyro is poor or the rotation fast.
 
-    noise: a guess, per step; size_gauss: of the field. The mean of k fields has the variance
-    s_m^2 / k, and the gyro's noise adds k / 12 (size s_g dt)^2.
+    noise: a guess, per step; size_gauss: of the field. The mean of k fields has the variance s_m^2
+    / k, and the gyro's noise adds k / 12 (size s_g dt)^2.
     """
     dt = float(np.median(data.dt_s[1:]))
     ratio = noise.mag_gauss / (size_gauss * noise.gyro_rad_s * dt)
     turns = np.sqrt(np.sum(data.angle_b_rad[1:] ** 2, axis=1))
-    fast = int(np.ceil(_OFTEN * (len(turns) - 1)))
+    fast = int(np.ceil(_FAST_SHARE * (len(turns) - 1)))
     turn = float(np.partition(turns, fast)[fast])
-    most = min(ratio * np.sqrt(12 * _LOST), _TURN_RAD / max(turn, 1e-9), _LARGEST)
+    most = min(ratio * np.sqrt(12 * _LOST_INFORMATION), _TURN_RAD / max(turn, 1e-9), _LARGEST_GROUP)
     return max(1, int(most) - 1 + int(most) % 2)
 
 
-def grouped(epochs: Sequence[chain.EpochData], sizes: Sequence[int]) -> list[chain.EpochData]:
-    """Epochs of single steps with as many of them in a state, odd numbers; all at once."""
+def group_steps(epochs: Sequence[chain.EpochData], sizes: Sequence[int]) -> list[chain.EpochData]:
+    """Epochs of single steps with `sizes` (odd) steps in each state; all at once."""
     out = list(epochs)
-    which = [k for k, size in enumerate(sizes) if size > 1 and len(epochs[k]) > _FEWEST]
+    which = [k for k, size in enumerate(sizes) if size > 1 and len(epochs[k]) > _FEWEST_ROWS]
     if which:
-        few = _grouped([epochs[k] for k in which], [sizes[k] for k in which])
+        few = _group_epochs([epochs[k] for k in which], [sizes[k] for k in which])
         for k, data in zip(which, few, strict=True):
             out[k] = data
     return out
 
 
-def _grouped(epochs: Sequence[chain.EpochData], sizes: Sequence[int]) -> list[chain.EpochData]:
+def _group_epochs(epochs: Sequence[chain.EpochData], sizes: Sequence[int]) -> list[chain.EpochData]:
     lengths = np.array([len(d) for d in epochs])
     first = np.cumsum(lengths) - lengths
     linked = [np.ones(len(d)) if d.linked is None else d.linked for d in epochs]
-    edges = [_edges(own, size) for own, size in zip(linked, sizes, strict=True)]
+    edges = [_group_starts(own, size) for own, size in zip(linked, sizes, strict=True)]
     ends = np.cumsum([len(e) for e in edges])
     links = np.concatenate(linked)
     links[first] = 0.0
@@ -616,11 +633,11 @@ def _grouped(epochs: Sequence[chain.EpochData], sizes: Sequence[int]) -> list[ch
         np.where(links[:, None] > 0, np.concatenate([d.angle_b_rad for d in epochs]), 0.0)
     )
     step = np.concatenate([d.dt_s for d in epochs])
-    angle, dt, spread, joins = _between(step, turn, links, rows)
+    angle, dt, spread, joins = _rotations_between(step, turn, links, rows)
     field, rate, P = (
         np.add.reduceat(np.concatenate([d.field_b_gauss for d in epochs]), edge) / count[:, None],
-        np.add.reduceat(np.concatenate([rates(d) for d in epochs]), edge) / count[:, None],
-        _means(turn, rows, edge, count),
+        np.add.reduceat(np.concatenate([row_rates(d) for d in epochs]), edge) / count[:, None],
+        _mean_rotations(turn, rows, edge, count),
     )
     out = []
     for data, own, end, at in zip(epochs, edges, ends, first, strict=True):
@@ -645,18 +662,18 @@ def _grouped(epochs: Sequence[chain.EpochData], sizes: Sequence[int]) -> list[ch
     return out
 
 
-def _edges(linked: Array, size: int) -> Index:
-    """First row of each group of an epoch; its first and last row are groups by themselves."""
+def _group_starts(linked: Array, size: int) -> Index:
+    """First row of each group of an epoch; its first and last row are groups of one."""
     n = len(linked)
     cuts = [1, *(2 + np.flatnonzero(linked[2 : n - 1] == 0)), n - 1]
     return np.concatenate([[0], *(np.arange(a, b, size) for a, b in pairwise(cuts)), [n - 1]])
 
 
-def _between(
+def _rotations_between(
     step_s: Array, turn: Array, linked: Array, rows: Index
 ) -> tuple[Array, Array, Array, Array]:
-    """To each state from the one before: rotation vector, time, root of the sum of squared steps
-    of time, 1 if linked else 0; of the first state only the shapes.
+    """For each state from the one before: rotation vector, time, root of the sum of squared time
+    steps, 1 if linked else 0; of the first state only the shapes are valid.
     """
     before = np.r_[rows[0], rows[:-1]]
     total = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
@@ -672,8 +689,10 @@ def _between(
     )
 
 
-def _means(turn: Array, rows: Index, start: Index, length: Index) -> Array:
-    """Mean over each group of the rotations from its middle's sensor frame to its steps'."""
+def _mean_rotations(turn: Array, rows: Index, start: Index, length: Index) -> Array:
+    """Mean over each group of the rotations from the sensor frame of its middle to those of its
+    steps.
+    """
     P = np.broadcast_to(np.eye(3), (len(rows), 3, 3)).copy()
     end = start + length
     ahead = behind = np.broadcast_to(np.eye(3), P.shape)
@@ -689,8 +708,8 @@ def _means(turn: Array, rows: Index, start: Index, length: Index) -> Array:
 # -- Parts of a window for a search ----------------------------------------------------------------
 
 
-def thinned(data: chain.EpochData, k: int) -> chain.EpochData:
-    """Every k-th row of an epoch, by itself."""
+def thin_rows(data: chain.EpochData, k: int) -> chain.EpochData:
+    """Every k-th row of an epoch, on its own."""
     if k == 1:
         return data
     count = (len(data) - 1) // k
@@ -718,8 +737,8 @@ def thinned(data: chain.EpochData, k: int) -> chain.EpochData:
     )
 
 
-def joined(parts: Sequence[chain.EpochData]) -> chain.EpochData:
-    """Epochs as one chain that is cut between them; each measures its first field."""
+def join_epochs(parts: Sequence[chain.EpochData]) -> chain.EpochData:
+    """Epochs as one chain with cuts between them; each measures its first field."""
     ones = [np.ones(len(p)) for p in parts]
     linked = [
         np.r_[0.0, (o if p.linked is None else p.linked)[1:]]
@@ -728,7 +747,8 @@ def joined(parts: Sequence[chain.EpochData]) -> chain.EpochData:
     averaging = None
     if any(p.averaging is not None for p in parts):
         all_ = [
-            p.averaging or chain.Averaging(o, np.tile(np.eye(3), (len(p), 1, 1)), p.dt_s, rates(p))
+            p.averaging
+            or chain.Averaging(o, np.tile(np.eye(3), (len(p), 1, 1)), p.dt_s, row_rates(p))
             for p, o in zip(parts, ones, strict=True)
         ]
         averaging = chain.Averaging(

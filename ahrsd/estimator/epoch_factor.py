@@ -1,4 +1,4 @@
-"""An epoch of readings as one factor, for anybody's own GTSAM graph.
+"""An epoch of readings as one factor, for any GTSAM graph.
 
     epoch = Epoch.of(field_b_gauss, gyro_b_rad_s, dt_s, Noise(1e-3, 5e-3))
     graph.add(epoch_factor(epoch, EpochKeys(C(0), B(k))))
@@ -7,20 +7,20 @@ Variables, by the keys that the caller chooses (frame b is the sensor's):
 
     calibration  Vector (9): M's upper triangle by rows and b, gauss, of m = M u + b; M = A |h|
     gyro bias    Vector (3): rad/s, one per epoch or one for all
-    first, last  Unit3, may be left out: the field's direction at the epoch's first and last reading
+    first, last  Unit3, optional: the field's direction at the epoch's first and last reading
 
-Whatever the number of readings, the factor says all that they say about these variables: it is
-minus the logarithm of their likelihood (docs/design/estimator.md, "Model"), up to a constant,
-with all other directions at their best. The noise must be white, the field's magnitude constant.
+Whatever the number of readings, the factor has all their information on these variables: it is the
+negative log likelihood (docs/design/estimator.md, "Model"), up to a constant, minimised over all
+other directions. The noise must be white and the field's magnitude constant.
 
-`first` and `last` join an epoch to the next (whose first reading is this one's last: `follows`) and
-to whatever else the graph knows of directions, such as u = R_nb^T n of an attitude node. An epoch
-without them stands for itself. The gyroscope's readings are used here: another factor with the same
-ones, such as a preintegrated rotation, would count them twice.
+`first` and `last` join an epoch to the next one (whose first reading is this one's last: `follows`)
+and to other factors on directions, such as u = R_nb^T n of an attitude node. An epoch without them
+is independent. The factor uses the gyroscope's readings: another factor with the same ones, such as
+a preintegrated rotation, would count them twice.
 
-Two forms. `epoch_factor` keeps the readings and is exact wherever the variables are; one
-linearisation costs a few milliseconds for 512 readings. `EpochSummary.factor` is 12 to 16 numbers
-squared around one point, for epochs whose variables hardly move any more, and costs nothing.
+There are two forms. `epoch_factor` keeps the readings and is exact at any values; one linearisation
+costs a few milliseconds for 512 readings. `EpochSummary.factor` is a quadratic in 12 to 16 numbers
+around one point, for epochs whose variables hardly move any more, and costs nothing.
 
 docs/guide/examples/smoothing_with_epochs.py smooths attitude and maps the local field with both.
 """
@@ -43,17 +43,17 @@ from ahrsd.samples import Array
 __all__ = ["Epoch", "EpochKeys", "EpochSummary", "Noise", "Point", "epoch_factor", "summarise"]
 
 _LEAST_ROWS = 4
-_SETTLED_RAD = 1e-9
+_CONVERGED_RAD = 1e-9
 _MOST_STEPS, _MOST_HALVINGS = 60, 20
-_ROUNDING = 1e-12  # relative: by less than that a cost does not rise
+_ROUNDING = 1e-12  # relative increase of a cost that is rounding
 _SHARED = 12  # calibration and gyro bias
 _BORDERS = slice(12, 16)
-_BLIND = 1e-14  # of the largest scaled eigenvalue: what the epoch says nothing about
+_UNDETERMINED = 1e-14  # of the largest scaled eigenvalue: undetermined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Epoch:
-    """Consecutive readings without a gap, ready to be linearised anywhere.  Make it by `of`."""
+    """Consecutive readings without a gap, ready to be linearised at any point. Make it by `of`."""
 
     data: chain.EpochData
     noise: Noise
@@ -69,9 +69,9 @@ class Epoch:
     ) -> Epoch:
         """Readings (n, 3) gauss, (n, 3) rad/s and the step (n,) in s that ends at each; n >= 4.
 
-        The gyro's value is the mean rate over its step; row 0's step and rate are not used.
-        noise: standard deviations per reading and axis; follows: row 0 is the last row of the epoch
-        before, whose field was counted there. ValueError names what cannot be, and the row.
+        The gyro's value is the mean rate over its step; row 0's step and rate are not used. noise:
+        standard deviations per reading and axis; follows: row 0 is the last row of the epoch
+        before, which counts its field. ValueError names the invalid argument and row.
         """
         count = len(dt_s)
         if count < _LEAST_ROWS:
@@ -82,8 +82,8 @@ class Epoch:
         ):
             if values.shape != (count, 3):
                 raise ValueError(f"{name} has shape {values.shape}, not ({count}, 3)")
-            _all_rows(name, np.isfinite(values[used:].sum(axis=1)), used)
-        _all_rows("dt_s", (dt_s[1:] > 0) & (dt_s[1:] < np.inf), 1)
+            _require_rows(name, np.isfinite(values[used:].sum(axis=1)), used)
+        _require_rows("dt_s", (dt_s[1:] > 0) & (dt_s[1:] < np.inf), 1)
         if not (0 < noise.mag_gauss < np.inf and 0 < noise.gyro_rad_s < np.inf):
             raise ValueError(f"{noise}: noise must be a positive number")
         steps = np.r_[dt_s[1], dt_s[1:]]
@@ -99,7 +99,7 @@ class Epoch:
         return Epoch(data, noise)
 
 
-def _all_rows(name: str, good: NDArray[np.bool], first: int) -> None:
+def _require_rows(name: str, good: NDArray[np.bool], first: int) -> None:
     if not good.all():
         raise ValueError(f"{name} of row {first + int(np.argmin(good))} cannot be used")
 
@@ -135,7 +135,7 @@ class Point:
 
     @staticmethod
     def of(values: gtsam.Values, keys: EpochKeys) -> Point:
-        """What a graph's values are."""
+        """From the values of a graph."""
         return Point(
             np.array(values.atVector(keys.calibration)),
             np.array(values.atVector(keys.gyro_bias)),
@@ -179,31 +179,36 @@ class EpochSummary:
         return gtsam.LinearContainerFactor(hessian, self.point.values(keys))
 
     def rows(self) -> tuple[Array, Array]:
-        """Residuals (n + 1,) and Jacobian (n + 1, n): half the residuals' square sum is the cost.
+        """Residuals (n + 1,) and Jacobian (n + 1, n): half the sum of squared residuals is the
+        cost.
 
-        Rows along the eigenvectors of the scaled information, and one that only carries the rest.
+        The rows are along the eigenvectors of the scaled information, and a constant one has the
+        remaining cost.
         """
         scale = np.sqrt(np.diag(self.information).clip(min=1e-300))
         values, vectors = np.linalg.eigh(self.information / np.outer(scale, scale))
-        root = np.sqrt(np.where(values > _BLIND * values[-1], values, 0.0))
+        root = np.sqrt(np.where(values > _UNDETERMINED * values[-1], values, 0.0))
         J = root[:, None] * (vectors.T * scale)
         seen = root > 0
         r = np.zeros(len(root))
         r[seen] = (vectors.T @ (self.gradient / scale))[seen] / root[seen]
-        rest = np.sqrt(max(0.0, 2.0 * self.cost - float(r @ r)))
-        return np.r_[r, rest], np.vstack([J, np.zeros(len(root))])
+        remaining = np.sqrt(max(0.0, 2.0 * self.cost - float(r @ r)))
+        return np.r_[r, remaining], np.vstack([J, np.zeros(len(root))])
 
 
 def summarise(epoch: Epoch, point: Point, start: Array | None = None) -> EpochSummary:
-    """What an epoch says around a point, all directions that are not in `point` at their best.
+    """The quadratic of an epoch around a point, minimised over all directions that are not in
+    `point`.
 
-    start (n, 3): directions to begin with, otherwise those of the readings. ValueError where M is
-    not positive definite or the directions do not settle.
+    start (n, 3): initial directions, otherwise those of the readings. ValueError if M is not
+    positive definite or the directions do not converge.
     """
-    return _settled(epoch, point, start)[0]
+    return _solve_directions(epoch, point, start)[0]
 
 
-def _settled(epoch: Epoch, point: Point, start: Array | None) -> tuple[EpochSummary, Array]:
+def _solve_directions(
+    epoch: Epoch, point: Point, start: Array | None
+) -> tuple[EpochSummary, Array]:
     """Gauss-Newton over the directions; a step is halved until the cost falls."""
     c, bias, data = point.calibration, point.gyro_bias_rad_s, epoch.data
     M = chain.symmetric(c[:6])
@@ -220,22 +225,22 @@ def _settled(epoch: Epoch, point: Point, start: Array | None) -> tuple[EpochSumm
         z = np.zeros(chain.WIDTH)
         if not joined:
             z[_BORDERS] = -np.linalg.solve(q.H[_BORDERS, _BORDERS], q.g[_BORDERS])
-        step = chain.move(u, q, z) - u
-        if float(np.max(np.abs(step))) < _SETTLED_RAD:
+        step = chain.move_directions(u, q, z) - u
+        if float(np.max(np.abs(step))) < _CONVERGED_RAD:
             return _summary(point, q, u, joined), u
         for _ in range(_MOST_HALVINGS):
-            moved = u + step
-            moved /= np.linalg.norm(moved, axis=1, keepdims=True)
-            new = _cost(epoch, moved, c, turns)
+            candidate = u + step
+            candidate /= np.linalg.norm(candidate, axis=1, keepdims=True)
+            new = _cost(epoch, candidate, c, turns)
             if new <= cost * (1.0 + _ROUNDING):
                 break
             step = step / 2
-        u, cost = moved, new
+        u, cost = candidate, new
     raise ValueError("the directions of an epoch do not settle: far from any solution")
 
 
 def _cost(epoch: Epoch, u: Array, c: Array, turns: Array) -> float:
-    """Half the square sum of the whitened residuals at directions u (n, 3)."""
+    """Half the sum of squared whitened residuals at directions u (n, 3)."""
     data, noise = epoch.data, epoch.noise
     field = (data.field_b_gauss - u @ chain.symmetric(c[:6]) - c[6:]) / noise.mag_gauss
     if not data.measures_first:
@@ -259,27 +264,29 @@ def _summary(point: Point, q: chain.Quadratic, u: Array, joined: bool) -> EpochS
 
 
 def epoch_factor(epoch: Epoch, keys: EpochKeys) -> gtsam.CustomFactor:
-    """The likelihood of an epoch as a nonlinear factor, linearised wherever the graph asks.
+    """The likelihood of an epoch as a nonlinear factor, linearised at any values.
 
-    Where a calibration is asked for that cannot be (M not positive definite, directions that do not
-    settle), the error is infinite, so that a Levenberg-Marquardt search steps back; linearised
-    there, ValueError.
+    At an invalid calibration (M not positive definite, directions that do not converge), the error
+    is infinite, so that a Levenberg-Marquardt search steps back; linearising there raises
+    ValueError.
     """
     widths = (9, 3, 2, 2)[: len(keys.listed)]
     cuts = np.cumsum(widths)[:-1]
-    held: list[Array] = []  # the directions found last, from which the next search sets out
+    last_directions: list[Array] = []  # the last directions found, where the next search starts
 
     def error(
         _factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: MutableSequence[Array] | None
     ) -> Array:
         try:
-            summary, u = _settled(epoch, Point.of(values, keys), held[0] if held else None)
+            summary, u = _solve_directions(
+                epoch, Point.of(values, keys), last_directions[0] if last_directions else None
+            )
         except ValueError:
-            held.clear()
+            last_directions.clear()
             if jacobians is not None:
                 raise
             return np.full(sum(widths) + 1, np.inf)
-        held[:] = [u]
+        last_directions[:] = [u]
         r, J = summary.rows()
         if jacobians is not None:
             for k, part in enumerate(np.split(J, cuts, axis=1)):
@@ -290,7 +297,7 @@ def epoch_factor(epoch: Epoch, keys: EpochKeys) -> gtsam.CustomFactor:
 
 
 def _hessian(keys: list[int], H: Array, g: Array, cost: float) -> gtsam.HessianFactor:
-    """One HessianFactor of any number of keys: its wrapper takes three, and adds up what it gets.
+    """One HessianFactor of any number of keys; its wrapper takes three, so a graph adds several.
 
     Its linear term is minus the gradient, its constant twice the cost.
     """

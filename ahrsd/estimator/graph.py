@@ -1,15 +1,16 @@
-"""The factor graph of epochs on GTSAM: solve, marginals, and folding of what is old.
+"""The factor graph of epochs on GTSAM: solution, marginals, and folding of old epochs.
 
 Keys: `c` for the calibration, `y j` for node j. Every factor is a HessianFactor around the present
-values, so one Gauss-Newton step of the graph is one linear solve, and its cost depends on the
-number of factors only. The oldest node is folded away by GTSAM's own
-elimination, which leaves one factor on (c, y 1) that holds all that the past said.
+values, so one Gauss-Newton step of the graph is one linear solution, whose cost depends only on the
+number of factors. The oldest node is folded away by GTSAM's own elimination, which leaves one
+factor on (c, y 1) with all information of the past.
 
-Traps of the wrapper that shaped this file: HessianFactor's linear term is minus the gradient; views
-that it returns die with their owner, so they are copied at once; a rank-deficient system raises
-RuntimeError; and a block counts as rank-deficient where its last pivot is 2^12 below the others, as
-it is where little is known. So GTSAM eliminates the nodes but the newest, in units in which their
-pivots are alike, and what is left on c and the newest node (14 numbers) is solved here.
+Traps of the wrapper that shaped this file: the linear term of HessianFactor is minus the gradient;
+the views that it returns die with their owner, so they are copied at once; a rank-deficient system
+raises RuntimeError; and a block counts as rank-deficient if its last pivot is 2^12 below the
+others, as happens where little is known. So GTSAM eliminates all nodes but the newest, in units in
+which their pivots are similar, and the remaining system in c and the newest node (14 numbers) is
+solved here.
 """
 
 from __future__ import annotations
@@ -47,14 +48,14 @@ _CHAIN_BORDERS = np.r_[chain.FIRST, chain.LAST]
 _TOKEN = 1.0  # information on a direction, 1/rad^2
 # where chain.Quadratic's 16 numbers go among the factor's 19
 _FROM_CHAIN = np.r_[0:9, 9:12, 12:14, 17:19]
-_AMONG = np.ix_(_FROM_CHAIN, _FROM_CHAIN)
+_CHAIN_BLOCK = np.ix_(_FROM_CHAIN, _FROM_CHAIN)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Node:
     """Border between two epochs: the gyro bias from here on (rad/s) and the field's direction.
 
-    Its arrays are never written to: nodes are replaced, and shared until then.
+    Its arrays are never written to: nodes are shared, and replaced as a whole.
     """
 
     bias: Array
@@ -66,11 +67,11 @@ class Node:
         """A node with a tangent basis of its direction."""
         return Node(bias.copy(), direction.copy(), so3.tangent_basis(direction[None])[0])
 
-    def retracted(self, step: Array) -> Node:
+    def moved_by(self, step: Array) -> Node:
         """The node after a step (5,), on the sphere."""
         return retract_nodes([self], step[None])[0]
 
-    def turned(self, R: Array) -> Node:
+    def rotated(self, R: Array) -> Node:
         """The node with its direction and tangents turned by R (3, 3)."""
         return Node(self.bias, R @ self.direction, R @ self.tangent)
 
@@ -110,7 +111,8 @@ class Factor:
 
 
 class Stack:
-    """Factors around the present values, all at once: z (F, 19), how far each is from its `point`.
+    """Factors around the present values, all at once: z (F, 19), the displacement of each from its
+    `point`.
 
     `nodes` are the present ones by index.
     """
@@ -132,15 +134,15 @@ class Stack:
             self.z[:, at : at + 3] = np.array([n.bias for n in now]) - [n.bias for n in old]
             self.z[:, at + 3 : at + 5] = (back @ moved[:, :, None])[:, :, 0]
             self._tilt[k] = back @ np.array([n.tangent for n in now])
-        self._walked = np.array([nodes[f.b].bias - nodes[f.a].bias for f in factors])
+        self._bias_change = np.array([nodes[f.b].bias - nodes[f.a].bias for f in factors])
 
-    def rises(self) -> Array:
-        """Costs (F,) above those at each factor's `point`, the walk of the bias included."""
+    def cost_increases(self) -> Array:
+        """Costs (F,) above those at the `point` of each factor, including the walk of the bias."""
         pulled = (self._H @ self.z[:, :, None])[:, :, 0]
-        walks = 0.5 * self._walk * np.sum(self._walked**2, axis=1)
+        walks = 0.5 * self._walk * np.sum(self._bias_change**2, axis=1)
         return np.asarray(np.sum((self._g + 0.5 * pulled) * self.z, axis=1) + walks)
 
-    def here(self) -> tuple[Array, Array]:
+    def quadratics(self) -> tuple[Array, Array]:
         """H (F, 19, 19) and gradients (F, 19) around the present values."""
         J = np.tile(np.eye(SIZE), (len(self.z), 1, 1))
         J[:, 12:14, 12:14], J[:, 17:19, 17:19] = self._tilt
@@ -152,8 +154,8 @@ class Stack:
         H[:, j, j] += self._walk[:, None]
         H[:, i, j] -= self._walk[:, None]
         H[:, j, i] -= self._walk[:, None]
-        g[:, i] -= self._walk[:, None] * self._walked
-        g[:, j] += self._walk[:, None] * self._walked
+        g[:, i] -= self._walk[:, None] * self._bias_change
+        g[:, j] += self._walk[:, None] * self._bias_change
         return H, g
 
 
@@ -168,19 +170,20 @@ def epoch_factor(
 ) -> Factor:
     """The factor of one epoch, between nodes a and a + 1, from its eliminated chain.
 
-    One at rest does not calibrate, it speaks of the gyro's bias only, and that whatever c is: the
-    rate that was read is the bias, across the field's direction `rest` (3,), a mean over the epoch.
-    What seems to be said along it comes from the noise of the directions. Its borders keep a token
-    of information, to stay determined. The first and the last, as `drawn` says, are drawn by it to
-    where the epoch wants them; one that an epoch with motion shares is not.
+    An epoch at rest has no information on the calibration, only on the gyro bias, whatever c is:
+    the rate that was read is the bias, across the field's direction `rest` (3,), a mean over the
+    epoch. Apparent information along the field comes from the noise of the directions and is
+    projected out. Its borders keep a token of information, so that they stay determined. `drawn`
+    says whether the first and the last border are drawn to the epoch's own optimum; a border shared
+    with an epoch with motion is not.
     """
     H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
-    H[_AMONG] = q.H
+    H[_CHAIN_BLOCK] = q.H
     g[_FROM_CHAIN] = q.g
     if rest is not None:
         gain = np.linalg.solve(H[BORDERS][:, BORDERS], np.c_[H[BORDERS][:, _BIAS], g[BORDERS]])
         cross = H[_BIAS][:, BORDERS]
-        wanted = at_borders(q) * np.repeat(drawn, 2)
+        wanted = border_step(q) * np.repeat(drawn, 2)
         H_bias, g_bias = H[_BIAS, _BIAS] - cross @ gain[:, :3], g[_BIAS] - cross @ gain[:, 3]
         across = np.eye(3) - np.outer(rest, rest)
         H, g = np.zeros((SIZE, SIZE)), np.zeros(SIZE)
@@ -189,17 +192,17 @@ def epoch_factor(
     return Factor(a, a + 1, H, g, point, walk)
 
 
-def at_borders(q: chain.Quadratic) -> Array:
-    """Where an epoch alone wants its borders (4,), first and last, from where they are.
+def border_step(q: chain.Quadratic) -> Array:
+    """Step (4,) from the present borders, first and last, to the optimum of the epoch alone.
 
-    A direction that it does not tell stays: against that a rad of doubt is nothing.
+    A direction that it does not determine stays: a prior of 1 rad, which is negligible otherwise.
     """
     H, g = q.H[_CHAIN_BORDERS][:, _CHAIN_BORDERS], q.g[_CHAIN_BORDERS]
     return np.asarray(-np.linalg.solve(H + np.eye(len(g)), g), dtype=np.float64)
 
 
 def chain_step(z: Array, *, calibrates: bool = True) -> Array:
-    """The 16 numbers of `chain.move` out of a factor's 19; only the bias for `not calibrates`."""
+    """The 16 numbers of `chain.move` from the 19 of a factor; only the bias if not `calibrates`."""
     step = np.array(z[_FROM_CHAIN])
     if not calibrates:
         step[C], step[12:] = 0.0, 0.0
@@ -207,7 +210,7 @@ def chain_step(z: Array, *, calibrates: bool = True) -> Array:
 
 
 def gap_factor(a: int, c: Array, node_a: Node, node_b: Node, walk: float) -> Factor:
-    """Across a gap, between nodes a and a + 1, only the gyro bias is linked."""
+    """Factor across a gap, between nodes a and a + 1: it links only the gyro bias."""
     point = LinearisationPoint(c.copy(), node_a, node_b)
     return Factor(a, a + 1, np.zeros((SIZE, SIZE)), np.zeros(SIZE), point, walk)
 
@@ -223,12 +226,12 @@ def bias_prior(node: int, c: Array, at: Node, sigma_bias: float) -> Factor:
 #
 # How the calibration moves by a finite step: along the valley of the likelihood, not straight.
 #
-# Where motion is nearly planar the data fix the field's directions u_k up to a common shift along
-# the turn's axis. With C = M^-1 and d = C b, u_k = (C m_k - d) / r, and that family is linear in
-# (C, d) up to the common scale r; in (M, b) it is strongly curved, and a Gauss-Newton step leaves
-# it at once. So a step dc of [M (6), b (3)] is taken in (C, d), and the scale is restored from the
-# field's moments. To first order nothing changes: derivatives, sigmas and the optimum are those of
-# [M, b].
+# If motion is nearly planar, the data determine the field's directions u_k up to a common shift
+# along the axis of the turn. With C = M^-1 and d = C b, u_k = (C m_k - d) / r, and that family is
+# linear in (C, d) up to the common scale r. In (M, b) it is strongly curved, and a Gauss-Newton
+# step leaves it at once. So a step dc of [M (6), b (3)] is taken in (C, d), and the scale is
+# restored from the moments of the field. To first order nothing changes: derivatives, sigmas and
+# the optimum are those of [M, b].
 
 
 class Moments:
@@ -239,7 +242,7 @@ class Moments:
         self._sum: Array = np.zeros(3)
         self._squares: Array = np.zeros((3, 3))
 
-    def take(self, field: Array) -> None:
+    def add(self, field: Array) -> None:
         """Add rows (n, 3) in gauss."""
         self._count += len(field)
         self._sum = self._sum + field.sum(axis=0)
@@ -254,13 +257,13 @@ class Moments:
 
 
 def retract(c: Array, dc: Array, moments: Moments) -> Array:
-    """c = [M (6), b (3)] after a step dc; plainly c + dc where C would not stay positive."""
-    found = along_valley(c, dc, moments)
+    """c = [M (6), b (3)] after a step dc; plain c + dc if C would not stay positive definite."""
+    found = retract_in_valley(c, dc, moments)
     return np.asarray(c + dc) if found is None else found
 
 
-def along_valley(c: Array, dc: Array, moments: Moments) -> Array | None:
-    """c after a step dc; None where the valley does not reach that far: C would not be positive."""
+def retract_in_valley(c: Array, dc: Array, moments: Moments) -> Array | None:
+    """c after a step dc; None if C would not stay positive definite."""
     M, dM = chain.symmetric(c[:6]), chain.symmetric(dc[:6])
     C = np.linalg.inv(M)
     dC = -C @ dM @ C
@@ -272,30 +275,30 @@ def along_valley(c: Array, dc: Array, moments: Moments) -> Array | None:
     return np.concatenate([chain.upper_triangle(new), new @ (d + dd) / scale])
 
 
-def way(c: Array, to: Array, moments: Moments) -> Array:
-    """The step dc (9,) after which `retract` is at another calibration; to - c where there is none.
+def valley_step(c: Array, to: Array, moments: Moments) -> Array:
+    """The step dc (9,) by which `retract` leads to another calibration; to - c if there is none.
 
-    With v = C m - d of each and s the scale that is restored, s^2 = 1 + mean |s v' - v|^2.
+    With v = C m - d of each and the restored scale s, s^2 = 1 + mean |s v' - v|^2.
     """
     M = chain.symmetric(c[:6])
     C = np.asarray(np.linalg.inv(M), dtype=np.float64)
     other = np.asarray(np.linalg.inv(chain.symmetric(to[:6])), dtype=np.float64)
-    d, beyond = C @ c[6:], other @ to[6:]
-    own, theirs = moments.mean_square(C, d), moments.mean_square(other, beyond)
-    both = (moments.mean_square(C + other, d + beyond) - own - theirs) / 2
-    inside = both**2 + (1.0 + own) * (1.0 - theirs)
-    if both <= 0.0 or inside <= 0.0:
+    d, other_d = C @ c[6:], other @ to[6:]
+    own_square, other_square = moments.mean_square(C, d), moments.mean_square(other, other_d)
+    cross = (moments.mean_square(C + other, d + other_d) - own_square - other_square) / 2
+    discriminant = cross**2 + (1.0 + own_square) * (1.0 - other_square)
+    if cross <= 0.0 or discriminant <= 0.0:
         return np.asarray(to - c)
-    scale = (1.0 + own) / (both + np.sqrt(inside))
-    dC, dd = np.asarray(scale * other - C), np.asarray(scale * beyond - d)
+    scale = (1.0 + own_square) / (cross + np.sqrt(discriminant))
+    dC, dd = np.asarray(scale * other - C), np.asarray(scale * other_d - d)
     return np.concatenate([chain.upper_triangle(-M @ dC @ M), M @ (dd - dC @ c[6:])])
 
 
-def curvature(c: Array, covariance: Array, moments: Moments) -> Array:
-    """What the valley's curvature adds to the covariance (9, 9) of c.
+def curvature_covariance(c: Array, covariance: Array, moments: Moments) -> Array:
+    """Addition to the covariance (9, 9) of c by the curvature of the valley.
 
-    One sigma along a principal direction ends q beside the straight line, t sigmas t^2 q: of a
-    standard normal t that has the mean square 3 q q^T.
+    One sigma along a principal direction ends at q from the straight line, t sigmas at t^2 q. For a
+    standard normal t the mean square is 3 q q^T.
     """
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -317,28 +320,28 @@ class SingularError(ValueError):
 _C = gtsam.symbol("c", 0)
 # Unit of the gyro bias inside GTSAM: (rad/s) / 100, which brings its pivots near the directions'.
 _UNITS = np.r_[np.ones(9), np.full(3, 1e-2), 1.0, 1.0, np.full(3, 1e-2), 1.0, 1.0]
-_BADLY = 0.1
-BLIND = 0.5  # posterior over prior sigma above which a direction counts as not determined
-_HOLD = 1e4  # a held direction is this much stiffer than the prior
+_BADLY_KNOWN = 0.1
+UNDETERMINED_RATIO = 0.5  # posterior over prior sigma of an undetermined direction
+_HOLD = 1e4  # information on a held direction over that of the prior
 
 
 _FIRST_Y = gtsam.symbol("y", 0)
 
 
-def _y(j: int) -> int:
+def _node_key(j: int) -> int:
     return int(_FIRST_Y + j)
 
 
-def _hessian(factor: Factor, G: Array, linear: Array) -> gtsam.HessianFactor:
+def _hessian_factor(factor: Factor, G: Array, linear: Array) -> gtsam.HessianFactor:
     c, a, b = C, Y_A, Y_B
     if factor.a == factor.b:
         return gtsam.HessianFactor(
-            _C, _y(factor.a), G[c, c], G[c, a], linear[c], G[a, a], linear[a], 0.0
+            _C, _node_key(factor.a), G[c, c], G[c, a], linear[c], G[a, a], linear[a], 0.0
         )
     return gtsam.HessianFactor(
         _C,
-        _y(factor.a),
-        _y(factor.b),
+        _node_key(factor.a),
+        _node_key(factor.b),
         G[c, c],
         G[c, a],
         G[c, b],
@@ -352,7 +355,7 @@ def _hessian(factor: Factor, G: Array, linear: Array) -> gtsam.HessianFactor:
     )
 
 
-def _singular(error: RuntimeError) -> SingularError:
+def _singular_error(error: RuntimeError) -> SingularError:
     return SingularError(str(error).strip().split("\n", maxsplit=1)[0])
 
 
@@ -363,10 +366,10 @@ Step = tuple[Array, dict[int, Array]]
 class Graph:
     """Calibration c (9,), nodes and factors; all values are the present linearisation point.
 
-    `anchor` is what is believed of c without data, its mean (9,) and information (9, 9); it is
-    never folded, because its weight against the data changes: `temper` multiplies its information
-    (see `epoch.Misfit`), and `hold` (9, 9) is added to it, which keeps the directions of c that
-    nothing determines at the mean.
+    `anchor` is the prior of c, its mean (9,) and information (9, 9). It is never folded, because
+    its weight relative to the data changes: `temper` multiplies its information (see
+    `epoch.Misfit`), and `hold` (9, 9) is added to it, which keeps undetermined directions of c at
+    the mean.
     """
 
     def __init__(self, c: Array, belief: Array, first: Node, prior: Factor) -> None:
@@ -374,18 +377,18 @@ class Graph:
         self.c = c.copy()
         self.anchor = (c.copy(), np.asarray(np.linalg.inv(belief), dtype=np.float64))
         self._whitening = whitening(belief)
-        self._blind: Array = np.zeros((9, 0))
+        self._held_directions: Array = np.zeros((9, 0))
         self.temper = 1.0
         self.hold: Array = np.zeros((9, 9))
         self.moments = Moments()
         self.nodes: dict[int, Node] = {prior.a: first}
         self.prior = prior
-        self.until_s: float | None = None  # when the newest node is
+        self.until_s: float | None = None  # time of the newest node
         self.factors: list[Factor] = []
-        self._kept: tuple[list[object], tuple[gtsam.GaussianBayesNet, Array, Array]] | None = None
+        self._cached: tuple[list[object], tuple[gtsam.GaussianBayesNet, Array, Array]] | None = None
 
     def copy(self) -> Graph:
-        """A copy that goes its own way; nodes and factors are shared, they never change."""
+        """An independent copy; nodes and factors are shared, since they never change."""
         other = copy(self)
         other.nodes, other.factors = dict(self.nodes), list(self.factors)
         other.moments = copy(self.moments)
@@ -401,77 +404,80 @@ class Graph:
         """Index of the newest node."""
         return max(self.nodes)
 
-    def _belief(self) -> Array:
+    def _anchor_information(self) -> Array:
         return np.asarray(self.temper * self.anchor[1])
 
     def anchor_cost(self) -> float:
-        """What departing from the anchor costs, as a negative log likelihood."""
+        """Negative log density of the prior at c, up to a constant."""
         d = self.c - self.anchor[0]
-        return float(0.5 * d @ (self._belief() + self.hold) @ d)
+        return float(0.5 * d @ (self._anchor_information() + self.hold) @ d)
 
     def distance_from_prior(self, covariance: Array) -> float:
-        """Mean square in sigmas of the prior of where c is in the directions that are badly known.
+        """Mean square, in prior sigmas, of the distance of c from the prior in poorly known
+        directions.
 
-        covariance (9, 9) of c, tempered; badly: to no more than _BADLY of the prior's sigma. Beyond
-        1 belief and data disagree by more than either allows. In planar motion directions that fit
-        the noise lead up a valley to any size; this holds them back.
+        covariance (9, 9) of c, tempered. Poorly known: sigma above _BADLY_KNOWN of the prior's.
+        Above 1, prior and data disagree by more than either allows. In planar motion, directions
+        that fit the noise lead along the valley to a calibration of any size; this limits them.
         """
-        values, vectors = self._against_belief(covariance)
-        badly = vectors[:, values > _BADLY**2]
-        away = badly.T @ self._whitening @ (self.c - self.anchor[0])
+        values, vectors = self._variance_over_prior(covariance)
+        badly_known = vectors[:, values > _BADLY_KNOWN**2]
+        away = badly_known.T @ self._whitening @ (self.c - self.anchor[0])
         return float(np.mean(away * away)) if len(away) else 0.0
 
-    def hold_blind(self, limit: float, covariance: Array) -> None:
-        """Hold the directions whose sigma stays above `limit` of the prior's at the prior's mean.
+    def hold_undetermined(self, limit: float, covariance: Array) -> None:
+        """Hold directions whose sigma exceeds `limit` of the prior's at the prior's mean.
 
-        covariance (9, 9) of c, tempered. In the eigenbasis of the posterior, whitened by
-        the prior, both are diagonal: holding one direction moves no other.
+        covariance (9, 9) of c, tempered. In the eigenbasis of the posterior, whitened by the prior,
+        both are diagonal, so holding one direction moves no other.
         """
-        values, vectors = self._against_belief(covariance)
-        self._blind = vectors[:, values > limit**2]
-        blind = self._whitening.T @ self._blind
+        values, vectors = self._variance_over_prior(covariance)
+        self._held_directions = vectors[:, values > limit**2]
+        blind = self._whitening.T @ self._held_directions
         self.hold = np.asarray(_HOLD * self.temper * blind @ blind.T)
 
-    def _against_belief(self, covariance: Array) -> tuple[Array, Array]:
-        """Variances (9,) over the prior's and their directions, columns, whitened by the prior."""
+    def _variance_over_prior(self, covariance: Array) -> tuple[Array, Array]:
+        """Variances (9,) over those of the prior, and their directions (columns), whitened by the
+        prior.
+        """
         W = self._whitening
         scaled = W @ covariance @ W.T
         values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
         return values, vectors
 
-    def _all(self) -> list[Factor]:
+    def _all_factors(self) -> list[Factor]:
         return [self.prior, *self.factors]
 
     def step(self, damping: float = 0.0) -> Step:
         """One Gauss-Newton step: dc (9,) and dy (5,) per node.
 
-        `damping` holds c back by that multiple of the anchor's information (Levenberg-Marquardt).
+        `damping` adds that multiple of the anchor's information (Levenberg-Marquardt).
 
-        Raises SingularError where the graph does not determine all of it.
+        Raises SingularError if the graph does not determine all variables.
         """
-        net, H, g = self._reduced()
+        net, H, g = self._reduced_system()
         H, g = H[:14, :14].copy(), g[:14].copy()
-        pull = self._belief() + self.hold
+        pull = self._anchor_information() + self.hold
         H[C, C] += pull + damping * self.anchor[1]
         g[C] += pull @ (self.c - self.anchor[0])
         if not np.isfinite(g).all():
             raise SingularError("the calibration is not finite")
-        solved = -_inverse(H) @ g
+        solution = -_inverse(H) @ g
         given = gtsam.VectorValues()
-        given.insert(_C, solved[C])
-        given.insert(_y(self.last), solved[Y_A] / _UNITS[Y_A])
+        given.insert(_C, solution[C])
+        given.insert(_node_key(self.last), solution[Y_A] / _UNITS[Y_A])
         delta = net.optimize(given)
-        dy = {j: np.array(delta.at(_y(j))) * _UNITS[Y_A] for j in self.nodes}
-        return np.asarray(solved[C], dtype=np.float64), dy
+        dy = {j: np.array(delta.at(_node_key(j))) * _UNITS[Y_A] for j in self.nodes}
+        return np.asarray(solution[C], dtype=np.float64), dy
 
-    def ahead(self) -> tuple[Array, Array]:
-        """Where an undamped step would take c, dc (9,), and the information (9, 9) of c.
+    def predict_step(self) -> tuple[Array, Array]:
+        """The undamped step dc (9,), and the information (9, 9) of c.
 
         Raises SingularError as `step` does.
         """
-        _, H, g = self._reduced()
+        _, H, g = self._reduced_system()
         H, g = H[:14, :14].copy(), g[:14].copy()
-        pull = self._belief() + self.hold
+        pull = self._anchor_information() + self.hold
         H[C, C] += pull
         g[C] += pull @ (self.c - self.anchor[0])
         covariance = _inverse(H)
@@ -486,56 +492,58 @@ class Graph:
             zip(self.nodes, retract_nodes(list(self.nodes.values()), steps), strict=True)
         )
 
-    def turn_first(self, R: Array) -> None:
-        """Turn the oldest node's direction by R (3, 3), and with it what was folded about it."""
+    def rotate_first(self, R: Array) -> None:
+        """Rotate the direction of the oldest node by R (3, 3), together with the folded factor on
+        it.
+        """
         prior = self.prior
-        point = replace(prior.point, a=prior.point.a.turned(R), b=prior.point.b.turned(R))
+        point = replace(prior.point, a=prior.point.a.rotated(R), b=prior.point.b.rotated(R))
         self.prior = replace(prior, point=point)
-        self.nodes[self.first] = self.nodes[self.first].turned(R)
+        self.nodes[self.first] = self.nodes[self.first].rotated(R)
 
     def covariance(self) -> Array:
-        """Joint covariance (12, 12) of c and the newest node's gyro bias, noise as assumed.
+        """Joint covariance (12, 12) of c and the newest node's gyro bias, for the assumed noise.
 
-        As if nothing were held: what is not determined has the sigma of the prior.
+        Without `hold`: an undetermined direction has the sigma of the prior.
         """
-        H = self._reduced()[1][:14, :14].copy()
-        H[C, C] += self._belief()
+        H = self._reduced_system()[1][:14, :14].copy()
+        H[C, C] += self._anchor_information()
         return _inverse(H)[:12, :12]
 
-    def with_held(self, c: Array) -> Array:
-        """c with the directions that are held put where they are held."""
+    def project_held(self, c: Array) -> Array:
+        """c with the held directions set to the values at which they are held."""
         W = self._whitening
-        beside = self._blind @ self._blind.T @ W @ (c - self.anchor[0])
-        return np.asarray(c - np.linalg.solve(W, beside))
+        moved = self._held_directions @ self._held_directions.T @ W @ (c - self.anchor[0])
+        return np.asarray(c - np.linalg.solve(W, moved))
 
-    def _reduced(self) -> tuple[gtsam.GaussianBayesNet, Array, Array]:
+    def _reduced_system(self) -> tuple[gtsam.GaussianBayesNet, Array, Array]:
         """All nodes but the newest eliminated, without anchor and hold, which are on c alone.
 
-        Kept until a factor or a value is replaced: anchor, hold and damping change more often.
+        Cached until a factor or a value is replaced: anchor, hold and damping change more often.
         """
-        factors = self._all()
+        factors = self._all_factors()
         used: list[object] = [self.c, *factors, *self.nodes.values()]
-        kept = self._kept
-        if kept is None or len(kept[0]) != len(used) or any(map(is_not, kept[0], used)):
-            net, rest = _eliminated(self._linear(factors), self._older())
-            kept = self._kept = (used, (net, *_information(rest)))
-        return kept[1]
+        cached = self._cached
+        if cached is None or len(cached[0]) != len(used) or any(map(is_not, cached[0], used)):
+            net, remaining = _eliminate(self._linear_graph(factors), self._older_nodes())
+            cached = self._cached = (used, (net, *_information_of(remaining)))
+        return cached[1]
 
-    def _linear(self, factors: list[Factor]) -> gtsam.GaussianFactorGraph:
+    def _linear_graph(self, factors: list[Factor]) -> gtsam.GaussianFactorGraph:
         graph = gtsam.GaussianFactorGraph()
-        H, g = Stack(factors, self.c, self.nodes).here()
+        H, g = Stack(factors, self.c, self.nodes).quadratics()
         if not (np.isfinite(H).all() and np.isfinite(g).all()):
             raise SingularError("a factor is not finite")
         H, linear = H * np.outer(_UNITS, _UNITS), -g * _UNITS
         for k, factor in enumerate(factors):
-            graph.add(_hessian(factor, H[k], linear[k]))
+            graph.add(_hessian_factor(factor, H[k], linear[k]))
         return graph
 
-    def _older(self) -> gtsam.Ordering:
-        """All nodes but the newest, from old to new."""
+    def _older_nodes(self) -> gtsam.Ordering:
+        """Ordering of all nodes but the newest, from old to new."""
         ordering = gtsam.Ordering()
         for j in sorted(self.nodes)[:-1]:
-            ordering.push_back(_y(j))
+            ordering.push_back(_node_key(j))
         return ordering
 
     def fold_oldest(self) -> None:
@@ -545,28 +553,28 @@ class Graph:
         new = next(k for f in touching for k in (f.a, f.b) if k != old)
         factors = [self.prior, *touching]
         ordering = gtsam.Ordering()
-        ordering.push_back(_y(old))
-        H, g = _information(_eliminated(self._linear(factors), ordering)[1])
+        ordering.push_back(_node_key(old))
+        H, g = _information_of(_eliminate(self._linear_graph(factors), ordering)[1])
         node = self.nodes[new]
         self.prior = Factor(new, new, H, g, LinearisationPoint(self.c.copy(), node, node))
         self.factors = [f for f in self.factors if old not in (f.a, f.b)]
         del self.nodes[old]
 
 
-def _eliminated(
+def _eliminate(
     linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
-    """The variables of `ordering` as conditionals, and what is left of the graph without them."""
+    """The variables of `ordering` as conditionals, and the remaining graph without them."""
     try:
-        net, rest = linear.eliminatePartialSequential(ordering)
+        net, remaining = linear.eliminatePartialSequential(ordering)
     except RuntimeError as error:
-        raise _singular(error) from error
-    return net, rest
+        raise _singular_error(error) from error
+    return net, remaining
 
 
-def _information(rest: gtsam.GaussianFactorGraph) -> tuple[Array, Array]:
-    """H and gradient (SIZE) on [c, one node] of what an elimination left."""
-    hessian = gtsam.HessianFactor(rest)
+def _information_of(remaining: gtsam.GaussianFactorGraph) -> tuple[Array, Array]:
+    """H and gradient (SIZE) on [c, one node] of the graph that an elimination left."""
+    hessian = gtsam.HessianFactor(remaining)
     augmented = np.array(hessian.augmentedInformation())
     keys: list[int] = list(hessian.keys())
     rows = np.concatenate([np.arange(9) if k == _C else np.arange(9, 9 + NODE) for k in keys])
@@ -583,7 +591,9 @@ def sigmas(step: Array, information: Array) -> float:
 
 
 def whitening(covariance: Array) -> Array:
-    """W with W P W^T = I that mixes the numbers as little as it can: R^(-1/2) D^-1 of P = D R D."""
+    """W with W P W^T = I that mixes the numbers as little as possible: R^(-1/2) D^-1 of
+    P = D R D.
+    """
     sigma = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
     return np.asarray((vectors / np.sqrt(values)) @ vectors.T / sigma)

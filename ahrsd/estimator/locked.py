@@ -1,9 +1,9 @@
-"""What real instruments and places leave over, as columns: locked to attitude, rate and time.
+"""Residuals of real instruments and places as columns that follow attitude, rate or time.
 
-A sensor is not quite linear, a gyro not quite straight, a room differs from place to place and its
+A sensor is not quite linear, a gyro not quite straight, a room differs from place to place, and its
 field from time to time. `diagnose` has these functions in its model of a recording (its ordinary
-remainder), and the estimator watches with them what its epochs leave (`model_checks`). Pure
-functions of directions, rates and times; sizes are those of untouched real recordings.
+remainder), and the estimator tests the residuals of its epochs for them (`model_checks`). Pure
+functions of directions, rates and times; the sizes are those of untouched real recordings.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ for _at, (_i, _j) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
     TRACELESS[_at, _i, _j] = TRACELESS[_at, _j, _i] = 1.0
 TRACELESS.flags.writeable = False
 
-#: middle ordinary deviation of a coefficient, of functions of unit size, of untouched recordings
-#: (`python tests/benchmarks/diagnosis/bench_remainder_priors.py`; their spread is in the diagnosis'
-#: `priors.py`). Gauss; gauss and rad/s at 1 rad/s; s; gauss
+#: median deviation of a coefficient in untouched recordings, for functions of unit size (`python
+#: tests/benchmarks/diagnosis/bench_remainder_priors.py`; their spread is in `priors.py` of the
+#: diagnosis). Gauss; gauss and rad/s at 1 rad/s; s; gauss
 BY_DIRECTION, FIELD_BY_RATE, BY_RATE_SQUARED, BY_CHANGE = 2.90e-3, 7.4e-4, 1.42e-3, 1.23e-3
 COURSE = 7.75e-3
 
@@ -45,26 +45,29 @@ def harmonics(field_b: Array) -> Array:
     )
 
 
-def squares(rate: Array) -> Array:
-    """(N, 6) products of the rates, less nothing: a mean is a bias, which the calibration has."""
+def rate_products(rate: Array) -> Array:
+    """(N, 6) products of the rates. Their mean is not subtracted: it is a bias, which the
+    calibration has.
+    """
     x, y, z = rate.T
     return np.column_stack([x * x, y * y, z * z, x * y, y * z, z * x])
 
 
-def of_change(change_b: Array) -> Array:
-    """(N, 3, 8) a matrix on the field's change (N, 3), without what is alike on all axes: that is
-    a delay."""
+def change_columns(change_b: Array) -> Array:
+    """(N, 3, 8) columns of a matrix on the field's change (N, 3), without the part common to all
+    axes, which is a delay.
+    """
     matrix = np.concatenate([TRACELESS, so3.skew(np.eye(3))])
     return np.asarray(np.einsum("aij,nj->nia", matrix, change_b))
 
 
 def on_each_axis(functions: Array) -> Array:
-    """(N, 3, 3 k) each of functions (N, k) along each axis of the sensor."""
+    """(N, 3, 3 k) columns: each of the functions (N, k) along each axis of the sensor."""
     flat = np.einsum("nk,ia->nika", functions, np.eye(3))
     return np.asarray(flat.reshape(len(functions), 3, -1))
 
 
-def courses(time_s: Array, modes: int) -> Array:
+def cosine_modes(time_s: Array, modes: int) -> Array:
     """(N, modes) cosines of mean square 1 over the times, of 1 half wave, 2 and so on."""
     since = (time_s - time_s.min()) / max(float(np.ptp(time_s)), 1e-9)
     return np.asarray(np.sqrt(2.0) * np.cos(np.pi * since[:, None] * np.arange(1, modes + 1)))

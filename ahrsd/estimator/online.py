@@ -1,11 +1,11 @@
-"""The estimator: samples in, estimates out, at a cost that does not grow.
+"""The estimator: samples in, estimates out, at a bounded cost per sample.
 
-Samples become steps, steps become epochs of constant size, each epoch becomes one factor of the
-graph. While the window of epochs holds everything, the answer is that of the batch smoother; what
-falls out of it is folded into the prior.
+Samples become steps, steps become epochs of constant size, and each epoch becomes one factor of the
+graph. While the window holds all epochs, the answer is that of the batch smoother; epochs that
+leave it are folded into the prior.
 
-An `Estimate` comes from the graph's numbers: scale as a gauge, sigmas, heading and what would make
-it better known, observability.
+An `Estimate` is derived from the graph: scale as a convention, sigmas, the heading and what would
+improve it, observability.
 """
 
 from __future__ import annotations
@@ -23,38 +23,44 @@ from ahrsd import so3
 from ahrsd.calibration import Affine, Estimate, Observability
 from ahrsd.estimator import chain, noise
 from ahrsd.estimator.epoch import (
-    GYRO_OF_ALL,
-    TOLD,
-    Considered,
+    GYRO_AMONG_IMPERFECTIONS,
+    REQUIRED_NATS,
+    ImperfectionLikelihood,
     Instrument,
-    TakenOut,
-    Weighed,
+    InstrumentCorrection,
+    InstrumentPosterior,
     Widening,
-    considered,
-    gyro_asked,
-    informations,
-    instrument,
+    estimate_instrument,
+    full_instrument_quadratics,
+    instrument_quadratics,
     linearise_locked,
-    of_rests,
-    walk_asked,
-    whole_informations,
+    required_bias_walk,
+    required_gyro_correction,
+    rest_quadratics,
+    widening_by_imperfections,
 )
 from ahrsd.estimator.epoch_data import EpochBuilder, check_samples, with_border
-from ahrsd.estimator.graph import BLIND, Node, SingularError, curvature, whitening
-from ahrsd.estimator.model_checks import (
-    LeftOver,
-    Misalignment,
-    change_message,
-    divided,
-    left_over,
-    misalignment,
-    widened,
+from ahrsd.estimator.graph import (
+    UNDETERMINED_RATIO,
+    Node,
+    SingularError,
+    curvature_covariance,
+    whitening,
 )
-from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters, instruments
+from ahrsd.estimator.model_checks import (
+    Misalignment,
+    ResidualComponent,
+    change_message,
+    estimate_misalignment,
+    find_iron_change,
+    find_residual_component,
+    widen_covariance,
+)
+from ahrsd.estimator.parameters import MIN_EPOCH_STEPS, EstimatorParameters, possible_instruments
 from ahrsd.estimator.window import Window, search
 from ahrsd.samples import Array, SampleBlock
 
-# -- What an estimate is worth ---------------------------------------------------------------------
+# -- Accuracy of an estimate -----------------------------------------------------------------------
 
 
 _NAMES = (
@@ -91,7 +97,7 @@ def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float
     direction u is the tangential part of M^-1 (dM u + db); its part along (down x u) turns the
     heading by that over cos(dip).
     """
-    u, across = _headings(down_b, dip_rad)
+    u, across = _headings_at_tilts(down_b, dip_rad)
     along = across @ np.linalg.inv(chain.symmetric(c[:6]))
     J = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], axis=2)
     row = (along[:, None, :] @ J)[:, 0]
@@ -99,14 +105,16 @@ def heading_sigma_deg(c: Array, covariance: Array, down_b: Array, dip_rad: float
     return float(np.degrees(np.sqrt(np.maximum(np.max(variance), 0.0))))
 
 
-def turned_heading_deg(turn_rad: Array, down_b: Array, dip_rad: float) -> float:
-    """Worst heading error over the same headings where the magnetometer's axes are turned (3,)."""
-    u, across = _headings(down_b, dip_rad)
+def misalignment_heading_deg(turn_rad: Array, down_b: Array, dip_rad: float) -> float:
+    """Worst heading error over the same headings for a magnetometer turned by turn_rad (3,)."""
+    u, across = _headings_at_tilts(down_b, dip_rad)
     return float(np.degrees(np.max(np.abs(np.sum(np.cross(turn_rad, u) * across, axis=1)))))
 
 
-def _headings(down_b: Array, dip_rad: float) -> tuple[Array, Array]:
-    """Field directions (n, 3) over 12 headings at each tilt, and what turns each heading (n, 3)."""
+def _headings_at_tilts(down_b: Array, dip_rad: float) -> tuple[Array, Array]:
+    """Field directions (n, 3) over 12 headings at each tilt, and the error directions (n, 3) that
+    turn the heading.
+    """
     psi = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
     helper = np.eye(3)[np.argmin(np.abs(down_b), axis=1)]
     north = np.cross(helper, down_b)
@@ -117,7 +125,7 @@ def _headings(down_b: Array, dip_rad: float) -> tuple[Array, Array]:
     return u, np.cross(down_b, level).reshape(-1, 3) / np.cos(dip_rad)
 
 
-_TELLS_DEG = 0.5  # a heading that is known better needs no advice
+_KNOWN_DEG = 0.5  # a better known heading needs no advice
 _MOTION = "the motion so far tells too little: {}"
 _WIDENED = {
     "misfit": "the field differs with place or attitude, or the iron changes meanwhile: repeat the "
@@ -132,34 +140,35 @@ _WIDENED = {
     "bias": "the gyro's bias may still follow its temperature: go on until it is warm",
 }
 _LEAN_RAD = float(np.radians(30.0))
-_AS_WELL = 1.5  # times the least sigma that counts as the same
-_SECONDS, _ROWS = 60.0, 20.0  # that a manoeuvre lasts, and readings at each of its attitudes
+_SAME_SIGMA_RATIO = 1.5  # of two sigmas that count as equal
+_SECONDS, _ROWS = 60.0, 20.0  # duration of a manoeuvre, and readings at each of its attitudes
 
 
-def motion_and_misfit(plain: Array, answer: Array, W: Array) -> dict[str, Array]:
-    """The answer's covariance (12, 12) of [M, b, w_b] shared out between motion and misfit.
+def motion_and_misfit(explained: Array, answer: Array, W: Array) -> dict[str, Array]:
+    """Split of the answer's covariance (12, 12) of [M, b, w_b] between motion and misfit.
 
-    plain (12, 12): what it were if the model explained the data; W whitens the prior. What misfit
-    does to a direction that is left undetermined is the motion's doing: the data say too little of
-    it to outweigh what they always leave over, and another place would change nothing.
+    explained (12, 12): the covariance if the model explained the data; W whitens the prior. In
+    directions that stay undetermined, the effect of misfit counts as motion: the data have too
+    little information there to outweigh the misfit, and another place would change nothing.
     """
     scaled = W @ answer @ W.T
     values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
-    blind = vectors[:, values > BLIND**2]
-    at_blind = np.linalg.solve(W, blind @ blind.T @ W)
-    others = np.eye(len(W)) - at_blind
-    more = answer - plain
+    undetermined = vectors[:, values > UNDETERMINED_RATIO**2]
+    onto_undetermined = np.linalg.solve(W, undetermined @ undetermined.T @ W)
+    onto_determined = np.eye(len(W)) - onto_undetermined
+    additional = answer - explained
     return {
-        "motion": plain + at_blind @ more @ at_blind.T,
-        "misfit": others @ more @ others.T,
+        "motion": explained + onto_undetermined @ additional @ onto_undetermined.T,
+        "misfit": onto_determined @ additional @ onto_determined.T,
     }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadingAdvice:
-    """What `widened_by` asks: the calibration c (9,) = [M, b], attitudes and dip that were driven.
+    """Advice on what would improve the heading.
 
-    down, dip_rad: as for `heading_sigma_deg`; noise_gauss: of one reading
+    c (9,) = [M, b]: the calibration; down, dip_rad: attitudes and dip that were driven, as for
+    `heading_sigma_deg`; noise_gauss: of one reading.
     """
 
     c: Array
@@ -167,58 +176,64 @@ class HeadingAdvice:
     dip_rad: float
     noise_gauss: float
 
-    def widened_by(
+    def main_cause(
         self,
         parts: Mapping[str, Array],
         covariance: Array,
-        turned_deg: float = 0.0,
-        left: Callable[[], str] = str,
+        misaligned_deg: float = 0.0,
+        misfit_cause: Callable[[], str] = str,
     ) -> str:
-        """What makes more than half of the heading's variance, in words; empty: it is known well.
+        """The cause of more than half of the heading's variance, in words; empty if the heading is
+        well known.
 
-        covariance (12, 12): the answer's; parts: covariances (12, 12) by "motion" and the names of
-        `_WIDENED`, which add up to it but for what they have in common; turned_deg: what axes that
-        were found to be turned make of the heading; left: what is known of misfit, in words, or
-        empty
+        covariance (12, 12): the answer's; parts: covariances (12, 12) by "motion" and the keys of
+        `_WIDENED`, which add up to it apart from correlations; misaligned_deg: heading error by
+        axes that were found to be turned; misfit_cause: returns the known cause of misfit in words,
+        or an empty text.
         """
-        if not np.hypot(self._sigma_deg(covariance), turned_deg) > _TELLS_DEG:
+        if not np.hypot(self._sigma_deg(covariance), misaligned_deg) > _KNOWN_DEG:
             return ""
         variances = {name: self._sigma_deg(one) ** 2 for name, one in parts.items()}
-        variances["turned"] = turned_deg**2
+        variances["turned"] = misaligned_deg**2
         most = max(variances, key=lambda name: variances[name])
         if not variances[most] > 0.5 * sum(variances.values()):
             return ""
         if most == "motion":
-            return _MOTION.format(self.manoeuvre(covariance))
-        return (left() if most == "misfit" else "") or _WIDENED[most]
+            return _MOTION.format(self.best_manoeuvre(covariance))
+        return (misfit_cause() if most == "misfit" else "") or _WIDENED[most]
 
-    def by_place_deg(self, parts: Mapping[str, Array]) -> float:
-        """What a field that differs by place makes of the heading, 1 sigma; nan: unknown.
+    def place_heading_deg(self, parts: Mapping[str, Array]) -> float:
+        """1-sigma heading error by a field that differs by place; nan if unknown.
 
-        Where it does not differ with the heading it is misfit.
+        A field that differs by place but not with the heading is part of misfit.
         """
         return self._sigma_deg(parts["place"] + parts["misfit"]) if "place" in parts else np.nan
 
-    def manoeuvre(self, covariance: Array) -> str:
-        """The easiest of a turn, a roll and a pitch after which the heading is known as well as
-        after any of them."""
+    def best_manoeuvre(self, covariance: Array) -> str:
+        """The easiest of a turn, a roll and a pitch after which the heading sigma is close to the
+        least of the three.
+        """
         sigma = np.sqrt(np.diag(covariance))
         size = np.outer(sigma, sigma)
-        known = np.linalg.inv(covariance / size)
+        information = np.linalg.inv(covariance / size)
         after = {
-            name: self._sigma_deg(size * np.linalg.inv(known + self._told(attitudes) * size))
+            name: self._sigma_deg(
+                size * np.linalg.inv(information + self._manoeuvre_information(attitudes) * size)
+            )
             for name, attitudes in self._manoeuvres().items()
         }
         least = min(after.values())
-        return next((name for name in after if after[name] <= _AS_WELL * least), "turn and lean")
+        return next(
+            (name for name in after if after[name] <= _SAME_SIGMA_RATIO * least), "turn and lean"
+        )
 
     def _sigma_deg(self, covariance: Array) -> float:
         return heading_sigma_deg(self.c, covariance, self.down, self.dip_rad)
 
     def _manoeuvres(self) -> dict[str, list[Array]]:
-        """Attitudes (n, 3, 3) from the level to the sensor, one after the other, in pieces."""
+        """Attitudes (n, 3, 3) from the level frame to the sensor, in order, in pieces."""
         mean = np.mean(self.down, axis=0)
-        level = _level(mean / np.linalg.norm(mean))
+        level = _level_frame(mean / np.linalg.norm(mean))
         headings = np.arange(_HEADINGS) * 2 * np.pi / _HEADINGS
         turned = so3.exp(headings[:, None] * level[:, 2]) @ level
         lean = _LEAN_RAD * np.sin(headings)[:, None]
@@ -230,10 +245,10 @@ class HeadingAdvice:
             ]
         return found
 
-    def _told(self, pieces: Sequence[Array]) -> Array:
-        """Information (12, 12) of a manoeuvre; where each piece begins to point is not known.
+    def _manoeuvre_information(self, pieces: Sequence[Array]) -> Array:
+        """Information (12, 12) of a manoeuvre; the direction at the start of each piece is unknown.
 
-        As much for a manoeuvre of several pieces as of one.
+        The total is the same for several pieces as for one.
         """
         M = chain.symmetric(self.c[:6])
         field = np.array([np.cos(self.dip_rad), 0.0, np.sin(self.dip_rad)])
@@ -241,8 +256,9 @@ class HeadingAdvice:
         total = np.zeros((12, 12))
         for R in pieces:
             columns = chain.symmetric_columns(R @ field)
-            gone = np.cumsum(np.swapaxes(R, 1, 2), axis=0) * (_SECONDS / len(pieces) / len(R))
-            bias = -M @ R @ so3.skew(field) @ gone  # the gyro's error in the level, by its bias
+            integral = np.cumsum(np.swapaxes(R, 1, 2), axis=0) * (_SECONDS / len(pieces) / len(R))
+            # rotation error in the level frame by the gyro bias
+            bias = -M @ R @ so3.skew(field) @ integral
             iron = np.concatenate([columns, np.tile(np.eye(3), (len(R), 1, 1)), bias], axis=2)
             J = np.concatenate([iron, M @ R @ across], axis=2).reshape(-1, 14)
             H = J.T @ J
@@ -251,18 +267,21 @@ class HeadingAdvice:
         return total * _ROWS / self.noise_gauss**2
 
 
-def _level(down: Array) -> Array:
-    """Columns north, east, down (3, 3) in the sensor's frame, north in some direction."""
+def _level_frame(down: Array) -> Array:
+    """Columns north, east, down (3, 3) in the sensor frame; north is arbitrary."""
     north = np.cross(np.eye(3)[np.argmin(np.abs(down))], down)
     north /= np.linalg.norm(north)
     return np.column_stack([north, np.cross(down, north), down])
 
 
-def attitude(tilts: Iterable[Array], epochs: Sequence[tuple[Array, Array]]) -> tuple[Array, float]:
-    """Tilts driven (K, 3) and the field's dip in rad, from gravity; level and steep without it.
+def tilts_and_dip(
+    tilts: Iterable[Array], epochs: Sequence[tuple[Array, Array]]
+) -> tuple[Array, float]:
+    """Tilts driven (K, 3) and the dip of the field in rad, from gravity; without it, level and a
+    steep dip.
 
-    tilts: unit vectors towards the earth, some nan; epochs: directions (n, 3) of the field and of
-    down.
+    tilts: unit vectors towards the earth, possibly nan; epochs: directions (n, 3) of the field and
+    of down.
     """
     down = np.array([d for d in tilts if np.isfinite(d).all()])
     if len(down) == 0:
@@ -288,17 +307,17 @@ def observability(covariance: Array, W: Array) -> Observability:
     ratio = np.sqrt(np.clip(values, 0.0, None))
     return Observability(
         prior_ratio=ratio,
-        unobservable=blind_names(vectors[:, ratio > BLIND]),
+        unobservable=undetermined_names(vectors[:, ratio > UNDETERMINED_RATIO]),
         score=float(_FLOOR / max(float(ratio[-1]), 1e-9)),
     )
 
 
-def blind_names(vectors: Array) -> tuple[str, ...]:
+def undetermined_names(vectors: Array) -> tuple[str, ...]:
     """One name for each dimension of the subspace that the orthonormal vectors (12, K) span.
 
-    Eigenvectors of equal eigenvalues are any basis, another on each processor. So the parameter
-    that lies nearest to the subspace is taken, then the nearest to what is left of it: with
-    |P_ij| <= sqrt(P_ii P_jj) it leads its own projection, and no two names begin alike.
+    Eigenvectors of equal eigenvalues are an arbitrary basis that depends on the processor. So the
+    parameter nearest to the subspace is taken first, then the nearest to the remaining subspace:
+    since |P_ij| <= sqrt(P_ii P_jj) it dominates its own projection, and no two names begin alike.
     """
     P = vectors @ vectors.T
     names = []
@@ -311,10 +330,10 @@ def blind_names(vectors: Array) -> tuple[str, ...]:
     return tuple(names)
 
 
-def misfit_words(left: LeftOver | None, window: Window) -> str:
-    """What is known of misfit; empty: nothing."""
-    if left is not None and left.words:
-        return left.cause
+def misfit_words(component: ResidualComponent | None, window: Window) -> str:
+    """The known cause of misfit in words; empty if unknown."""
+    if component is not None and component.words:
+        return component.cause
     slow = window.slow_residual()
     return "" if slow is None else slow.words
 
@@ -322,31 +341,34 @@ def misfit_words(left: LeftOver | None, window: Window) -> str:
 # -- The estimator ---------------------------------------------------------------------------------
 
 
-_FIRST_SEARCH = 2  # epochs with motion before other starts are tried; then at every half more
-_CHANGED = 2  # epochs one after the other that contradict the answer: the iron has changed
-_FEW = 6  # epochs up to which each new one is iterated to the end over all: cheap, and soon good
-# Sigmas from what a search found at which the answer goes there. Thinned data alone make about 1.
+_FIRST_SEARCH = 2  # epochs with motion before the first search; then at every half more
+_CHANGED_EPOCHS = 2  # contradicting epochs in a row after which the iron has changed
+_FEW_EPOCHS = 6  # epochs up to which each new one iterates over all to convergence
+# Sigmas from the result of a search at which the answer moves there. Thinned data alone make about
+# 1.
 _AWAY, _AWAY_UNSETTLED = 1.5, 0.5
-_LOOKS = 4  # of the first search
-_GAIN_FOLDED = 20.0  # of log likelihood, tempered, that is needed against data a search cannot see
-_HOPELESS_DEG = 5.0  # worst heading sigma beyond which nobody may call the estimate converged
-_SETTLED = 0.5  # sigmas: a larger last step means that the answer still moves
-_MOST_SIGMAS = 100.0  # of movement or disagreement that are counted
+_FIRST_LOOKS = 4  # of the first search
+_GAIN_FOLDED = 20.0  # tempered nats that outweigh folded data, which a search cannot use
+_HOPELESS_DEG = 5.0  # worst heading sigma of a converged estimate
+_SETTLED = 0.5  # sigmas of the last step of a settled answer
+_MOST_SIGMAS = 100.0  # limit on movement and disagreement
 _SCALE = 0.5  # 1-sigma of the field's magnitude over its size in the present calibration
-_LAG_SIGMAS, _LAG_SAME = 3.2, 0.3  # of a lag's sigma: evidence that there is one; settled
+_LAG_SIGMAS, _LAG_SAME = 3.2, 0.3  # sigmas of a lag that is corrected; of a settled lag
 _LAG_PASSES, _LONGEST_LAG_S = 3, 0.1
-_PASSES, _QUIETER = 8, 0.95  # over a gyro that is wrong; while the noise falls below that of itself
-_EXPLAINED = 1.5  # misfit of data that an instrument with imperfections explains
-_DOUBTFUL = -15.0  # nats from which a gyro that is wrong is tried where something is left over
-_MOST_OF_KIND = 4.0  # sigmas of an imperfection beyond which something else is wrong
-_SURE = 0.05  # of the field: hard-iron sigmas below which agreeing starts end the search
+_PASSES, _QUIETER = 8, 0.95  # of correcting the gyro; while the noise falls below this ratio
+_EXPLAINED_MISFIT = 1.5  # limit on the residual ratio of explained data
+_TRIED_NATS = -15.0  # log odds from which a gyro correction is tried if residuals remain
+_MOST_OF_KIND = 4.0  # sigmas of an imperfection beyond which the cause is another
+_KNOWN_SIGMA = 0.05  # of the field: hard-iron sigmas at which agreeing starts end the search
 
 
-WHOLE = 32  # `at_once` for a recording that is there as a whole: what a window holds
+WHOLE = 32  # `at_once` for a complete recording: the size of a window
 
 
 class Estimator:
-    """Streaming MAGYC.  Not thread-safe; deterministic: the same samples give the same numbers."""
+    """The streaming estimator. Not thread-safe. Deterministic: the same samples give the same
+    numbers.
+    """
 
     def __init__(
         self,
@@ -356,10 +378,10 @@ class Estimator:
         *,
         at_once: int = 1,
     ) -> None:
-        """`present` is the device's calibration (registers 23 and 84): the prior's centre.
+        """`present` is the device's calibration (registers 23 and 84): the mean of the prior.
 
-        at_once: epochs that are collected before the answer follows them; where nobody asks in
-        between, more are faster.
+        at_once: number of epochs after which the answer is updated; more is faster if no estimate
+        is needed in between.
         """
         self.parameters = parameters or EstimatorParameters()
         self._present = present or Affine.identity()
@@ -367,27 +389,27 @@ class Estimator:
             np.zeros(3) if present_gyro_bias_rad_s is None else present_gyro_bias_rad_s.copy()
         )
         self._at_once = at_once
-        self._new: list[chain.EpochData] = []  # epochs that are not in the window yet
+        self._new: list[chain.EpochData] = []  # not in the window yet
         self._last: chain.EpochData | None = None  # the newest one
         self._builder = EpochBuilder(self.parameters)
         self._window: Window | None = None
         self._whitening = np.eye(12)
-        self._down: deque[Array] = deque(maxlen=64)
-        self._searching, self._agreed, self._apart = True, False, 0.0
+        self._tilts: deque[Array] = deque(maxlen=64)
+        self._searching, self._agreed, self._agreement_sigmas = True, False, 0.0
         self._moving_epochs = 0
         self._next_search = _FIRST_SEARCH
-        self._strange = 0
-        self._is_copy = False  # made for one answer
-        self._doubted_s: float | None = None  # since when the newest motion contradicts the answer
-        self._parted = 1.0  # variance over the expected of what earlier and later data ask for
-        self._misscaled = 0.0  # share of themselves by which the gyro's angles are too small
+        self._contradictions = 0
+        self._is_copy = False  # made for one estimate
+        self._contradicted_s: float | None = None  # since when motion contradicts the answer
+        self._split_factor = 1.0  # `IronChange.variance_factor`
+        self._misscaled = 0.0  # `Instrument.misscaled`
         self.restarted_s: float | None = None  # when the iron changed, if it did
 
     def add(self, block: SampleBlock) -> bool:
-        """Take samples; true where they completed an epoch, so that `estimate` says something new.
+        """Take samples; true if they completed an epoch, so that `estimate` changes.
 
-        A block must not span a gap (`SampleBlock`). Raises ValueError, which names the row, where
-        a field, rate or step is not a finite number; nothing of the block is then taken.
+        A block must not span a gap (`SampleBlock`). Raises ValueError naming the row if a field,
+        rate or step is not a finite number; nothing of the block is then taken.
         """
         check_samples(block)
         gap = block.gap_before and len(block) > 0
@@ -398,14 +420,14 @@ class Estimator:
         return bool(closed)
 
     def interrupt(self) -> bool:
-        """Close the epoch with what is pending; what follows does not share one with it."""
+        """Close the epoch with the pending samples; later samples begin a new one."""
         data = self._builder.interrupt()
         if data is not None:
             self._append(data)
         return data is not None
 
     def finish(self) -> Estimate | None:
-        """End of the recording: use what is pending and iterate to the end."""
+        """End of the recording: use the pending samples and iterate to convergence."""
         self.interrupt()
         if self._new:
             self._grow()
@@ -415,96 +437,106 @@ class Estimator:
             else:
                 self._window.track(everything=True, exactly=True)
             settled = self._window.step_sigmas < _SETTLED
-            self._window = self._undivided(self._window)
+            self._window = self._split_at_change(self._window)
             self._window, changed = self._examine(self._window)
             if changed and self._searching:
                 self._search(self._window, exactly=True)
-            if not settled:  # nobody could be asked before
-                self._window = self._undivided(self._window)
-        return self._answer()
+            if not settled:  # the tests need a settled answer
+                self._window = self._split_at_change(self._window)
+        return self._current_estimate()
 
     def _append(self, data: chain.EpochData) -> None:
         if self._last is not None and not data.measures_first:
             data = with_border(data, self._last)
         self._last = data
-        self._down.append(data.down_b[len(data) // 2])
+        self._tilts.append(data.down_b[len(data) // 2])
         self._new.append(data)
         if len(self._new) >= self._at_once:
             self._follow(*self._grow())
 
     def _grow(self) -> tuple[Window, int]:
-        """The window with the new epochs in it, and how many they were."""
+        """The window with the new epochs queued, and their number."""
         new, self._new = self._new, []
-        window = self._window = self._window or self._begin(new[0])
-        self._moving_epochs += window.take(new)
-        return self._unchanged(window, len(new)), len(new)
+        window = self._window = self._window or self._create_window(new[0])
+        self._moving_epochs += window.queue(new)
+        return self._detect_change(window, len(new)), len(new)
 
     def _follow(self, window: Window, new: int) -> None:
-        """Let the answer follow the new epochs, unless the last one waits for the next."""
-        if self._strange > 0:
+        """Update the answer with the new epochs, unless the last one awaits confirmation of a
+        change.
+        """
+        if self._contradictions > 0:
             return
         due = self._moving_epochs >= self._next_search
-        if not (due and window.untried):  # else there is nothing yet to go on from
-            window.track(new, everything=self._searching and len(window.epochs) <= _FEW)
+        if not (due and window.never_moved):  # otherwise there is nothing yet to track from
+            window.track(new, everything=self._searching and len(window.epochs) <= _FEW_EPOCHS)
         if due:
             self._next_search = self._moving_epochs + max(1, self._moving_epochs // 2)
             if self._searching:
                 self._search(window)
-            window, _ = self._examine(self._undivided(window))
+            window, _ = self._examine(self._split_at_change(window))
             self._window = window
         window.fold()
 
-    def _unchanged(self, window: Window, new: int) -> Window:
-        """The window, or a new one where two epochs one after the other contradict a sure answer.
+    def _detect_change(self, window: Window, new: int) -> Window:
+        """The window, or a new one if two epochs in a row contradict a well-known answer.
 
-        Then the iron has changed: everything before them is forgotten. One that does waits for the
-        next to do so too, and until motion agrees again the answer is in doubt.
+        Then the iron has changed and everything before them is forgotten. After a single
+        contradicting epoch the next one decides; until an epoch with motion agrees again the answer
+        is not converged.
         """
-        sure = not self._searching and window.step_sigmas < _SETTLED
-        if sure:
-            window.join()
+        is_sure = not self._searching and window.step_sigmas < _SETTLED
+        if is_sure:
+            window.attach_waiting()
         for k in range(-new, 0):
-            strange = sure and window.contradicted(k)
-            self._strange = self._strange + 1 if strange else 0
-            if not sure or (window.epochs[k].turned and not strange):
-                self._doubted_s = None
-            elif strange and self._doubted_s is None:
-                self._doubted_s = float(window.epochs[k].data.time_s[0])
-            if self._strange == _CHANGED:
-                window = self._window = self._anew(window, _CHANGED - 1 - k)
+            contradicts = is_sure and window.epoch_contradicts(k)
+            self._contradictions = self._contradictions + 1 if contradicts else 0
+            if not is_sure or (window.epochs[k].has_motion and not contradicts):
+                self._contradicted_s = None
+            elif contradicts and self._contradicted_s is None:
+                self._contradicted_s = float(window.epochs[k].data.time_s[0])
+            if self._contradictions == _CHANGED_EPOCHS:
+                window = self._window = self._restart_after_change(window, _CHANGED_EPOCHS - 1 - k)
                 break
         return window
 
-    def _anew(self, window: Window, count: int) -> Window:
-        """The iron changed before the last `count` epochs: what was before is forgotten."""
+    def _restart_after_change(self, window: Window, count: int) -> Window:
+        """Forget everything before the last `count` epochs, at whose beginning the iron changed."""
         self.restarted_s = float(window.epochs[-count].data.time_s[0])
-        self._searching, self._agreed, self._strange, self._doubted_s = True, False, 0, None
-        self._moving_epochs = sum(epoch.turned for epoch in window.epochs[-count:])
-        self._next_search, self._parted = _FIRST_SEARCH, 1.0
-        return window.anew(count)
+        self._searching, self._agreed, self._contradictions, self._contradicted_s = (
+            True,
+            False,
+            0,
+            None,
+        )
+        self._moving_epochs = sum(epoch.has_motion for epoch in window.epochs[-count:])
+        self._next_search, self._split_factor = _FIRST_SEARCH, 1.0
+        return window.restart_with_last(count)
 
-    def _undivided(self, window: Window) -> Window:
-        """The window, or a new one from where the iron changed before the answer was sure."""
+    def _split_at_change(self, window: Window) -> Window:
+        """The window, or a new one from a change of the iron before the answer was well known."""
         if not window.step_sigmas < _SETTLED:
             return window
         p = self.parameters
         try:
-            told = informations(window.epochs, window.graph)
-            found = divided(told, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss)
+            quadratics = instrument_quadratics(window.epochs, window.graph)
+            change = find_iron_change(
+                quadratics, window.graph, p.prior_gyro_bias_rad_s, p.prior_hard_iron_gauss
+            )
         except np.linalg.LinAlgError:
             return window
-        self._parted = 1.0 if found is None else found.parted
-        if found is None or found.first is None:
+        self._split_factor = 1.0 if change is None else change.variance_factor
+        if change is None or change.first is None:
             return window
-        turned = [k for k, epoch in enumerate(window.epochs) if epoch.turned]
-        window = self._anew(window, len(window.epochs) - turned[found.first])
+        moving = [k for k, epoch in enumerate(window.epochs) if epoch.has_motion]
+        window = self._restart_after_change(window, len(window.epochs) - moving[change.first])
         window.track(everything=True)
         self._search(window, exactly=True)
         return window
 
-    def _begin(self, data: chain.EpochData) -> Window:
+    def _create_window(self, data: chain.EpochData) -> Window:
         A0 = np.linalg.inv(self._present.matrix)
-        A0 = (A0 + A0.T) / 2  # what is not symmetric in the device's register cannot be held here
+        A0 = (A0 + A0.T) / 2  # the model has no antisymmetric part
         size = float(np.median(np.linalg.norm(self._present.apply(data.field_b_gauss), axis=1)))
         c = np.r_[chain.upper_triangle(A0 * max(size, 1e-3)), self._present.offset]
         p = self.parameters
@@ -519,14 +551,15 @@ class Estimator:
         return Window(p, c, belief, first, noise.first_guess(data, p))
 
     def _search(self, window: Window, *, exactly: bool = False, looks: int = 1) -> None:
-        """Other starts compete with the present answer, until they agree on good data.
+        """Let other starts compete with the present answer, until they agree on good data.
 
-        With `exactly` the answer is then iterated to the end over all. A first look at many epochs
-        cannot know what is held and how loud the residuals are, so that it is given more looks.
+        With `exactly` the answer then iterates over all epochs to convergence. The first search
+        over many epochs knows neither the held directions nor the residual level, so it may be
+        repeated.
         """
-        looks = _LOOKS if window.untried else looks
+        looks = _FIRST_LOOKS if window.never_moved else looks
         found = search(self.parameters, window, self._present_bias, window.data)
-        window.loud = found.loud
+        window.search_residual_ratio = found.search_residual_ratio
         unsettled = window.step_sigmas > _SETTLED
         better = found.gain > _GAIN_FOLDED * window.graph.temper
         if (
@@ -536,184 +569,220 @@ class Estimator:
         ):
             window.restart_at(found.c, found.bias)
             window.track(everything=True, exactly=exactly, here=True)
-        elif exactly or window.untried:
+        elif exactly or window.never_moved:
             window.track(everything=True, exactly=exactly)
-        self._agreed, self._apart = found.agreed, 0.0 if found.agreed else found.apart
+        self._agreed, self._agreement_sigmas = found.agreed, 0.0 if found.agreed else found.apart
         settled = window.step_sigmas < _SETTLED
-        self._searching = not (found.agreed and settled and self._sure(window))
-        if looks > 1 and not (found.agreed or window.untried):
+        self._searching = not (found.agreed and settled and self._is_iron_known(window))
+        if looks > 1 and not (found.agreed or window.never_moved):
             self._search(window, exactly=exactly, looks=looks - 1)
 
     def _examine(self, window: Window) -> tuple[Window, bool]:
-        """See whether the gyro's angles are the field's, and take out a lag, and what is wrong with
-        the gyro, where the epochs ask for it; the window then, and whether they did.
+        """Check the gyro's scale, and correct a lag and a gyro error if the epochs support it;
+        returns the window and whether anything was corrected.
 
-        What is wrong with a gyro is taken out only if the data are then explained: a field that
-        differs by place asks for it too, and is not.
+        A gyro error is corrected only if the data are then explained: a field that differs by place
+        looks like one, but is not explained by it.
         """
-        late = self._take_out(window)
+        changed = self._correct_until_settled(window)
         if self.parameters.imperfections:
-            for told in (TOLD, _DOUBTFUL):
+            for required_nats in (REQUIRED_NATS, _TRIED_NATS):
                 trial, misscaled = window.copy(), self._misscaled
-                if self._take_out(trial, gyro_told=told) and self._explained(trial, window, told):
-                    window, late = trial, True
+                if self._correct_until_settled(
+                    trial, gyro_nats=required_nats
+                ) and self._correction_explains(trial, window, required_nats):
+                    window, changed = trial, True
                     break
                 self._misscaled = misscaled
-                if not window.left_over:
+                if not window.has_unmodelled_residual:
                     break
-        return window, late
+        return window, changed
 
-    def _explained(self, trial: Window, before: Window, told: float) -> bool:
-        """Whether the data are explained once that is taken out; and, where the gyro was not likely
-        to be wrong before, likely to be."""
-        most = np.max(instruments(*self.parameters.kinds).sigmas, axis=0)
-        limit = _MOST_OF_KIND * most[GYRO_OF_ALL]
-        within = bool(np.all(np.abs(trial.taken.numbers) < limit))
-        if not within or trial.unexplained >= _EXPLAINED or told == TOLD:
-            return within and trial.unexplained < _EXPLAINED
-        weighed = self._weighed(trial)
-        if weighed is None:
-            return False
-        # what it left over passed for noise of the gyro, which is less likely by this
-        quieter = np.log(before.usual.gyro_rad_s / trial.usual.gyro_rad_s)
-        gain = weighed.against_plain(GYRO_OF_ALL)[1] + trial.gyro_freedom * quieter
-        return bool(gain > TOLD)
-
-    def _take_out(self, window: Window, *, gyro_told: float | None = None) -> bool:
-        """Take out what is asked for until no more is; whether anything was.
-
-        gyro_told: nats by which what is wrong with it must be told to be taken out too, None: it is
-        not; then the noise that it passed for has to settle as well.
+    def _correction_explains(self, trial: Window, before: Window, required_nats: float) -> bool:
+        """Whether the data are explained by a correction; a gyro error that was improbable before
+        must also become probable.
         """
-        gyro = gyro_told is not None
-        least, changed, quiet = _LAG_SIGMAS if window.taken.lag_s == 0.0 else 1.0, False, False
+        largest = np.max(possible_instruments(*self.parameters.kinds).sigmas, axis=0)
+        limit = _MOST_OF_KIND * largest[GYRO_AMONG_IMPERFECTIONS]
+        within = bool(np.all(np.abs(trial.correction.gyro_parameters) < limit))
+        if (
+            not within
+            or trial.residual_ratio >= _EXPLAINED_MISFIT
+            or required_nats == REQUIRED_NATS
+        ):
+            return within and trial.residual_ratio < _EXPLAINED_MISFIT
+        posterior = self._instrument_posterior(trial)
+        if posterior is None:
+            return False
+        # the residuals of the error inflated the gyro's noise, which is less probable by this
+        log_noise_ratio = np.log(before.usual.gyro_rad_s / trial.usual.gyro_rad_s)
+        gain = (
+            posterior.log_odds_against_smallest(GYRO_AMONG_IMPERFECTIONS)[1]
+            + trial.gyro_freedom * log_noise_ratio
+        )
+        return bool(gain > REQUIRED_NATS)
+
+    def _correct_until_settled(self, window: Window, *, gyro_nats: float | None = None) -> bool:
+        """Correct what the epochs support until nothing remains; whether anything was corrected.
+
+        gyro_nats: log odds from which a gyro error is corrected too, None for never. The noise that
+        it inflated then has to settle as well.
+        """
+        gyro = gyro_nats is not None
+        least, changed, noise_settled = (
+            _LAG_SIGMAS if window.correction.lag_s == 0.0 else 1.0,
+            False,
+            False,
+        )
         for _ in range(_PASSES if gyro else _LAG_PASSES):
-            found = self._instrument(window)
+            found = self._estimate_instrument(window)
             if found is None:
                 break
             self._misscaled = found.misscaled
-            more, sigma = found.lag_s
-            taken = window.taken if gyro_told is None else self._gyro_out(window, gyro_told)
-            if gyro and taken is window.taken and not changed:
+            more_lag_s, sigma = found.lag_s
+            correction = (
+                window.correction
+                if gyro_nats is None
+                else self._add_gyro_correction(window, gyro_nats)
+            )
+            if gyro and correction is window.correction and not changed:
                 break
-            if abs(more) >= least * sigma:
-                lag_s = np.clip(taken.lag_s + more, -_LONGEST_LAG_S, _LONGEST_LAG_S)
-                taken, least = replace(taken, lag_s=float(lag_s)), _LAG_SAME
+            if abs(more_lag_s) >= least * sigma:
+                lag_s = np.clip(correction.lag_s + more_lag_s, -_LONGEST_LAG_S, _LONGEST_LAG_S)
+                correction, least = replace(correction, lag_s=float(lag_s)), _LAG_SAME
             noise_gauss = window.usual.mag_gauss
-            if taken is not window.taken:
-                window.take_out(taken)
-            elif not gyro or quiet:
+            if correction is not window.correction:
+                window.correct_instrument(correction)
+            elif not gyro or noise_settled:
                 break
             window.track(everything=True, here=True)
-            changed, quiet = True, window.usual.mag_gauss > _QUIETER * noise_gauss
+            changed, noise_settled = True, window.usual.mag_gauss > _QUIETER * noise_gauss
         return changed
 
-    def _instrument(self, window: Window) -> Instrument | None:
+    def _estimate_instrument(self, window: Window) -> Instrument | None:
         try:
-            told = informations(window.epochs, window.graph)
-            before = window.past.at(window.graph.c, window.taken)
-            sigma_bias, scaled = self.parameters.prior_gyro_bias_rad_s, window.taken.numbers[3]
-            return instrument(told, window.graph, sigma_bias, before, scaled)
+            quadratics = instrument_quadratics(window.epochs, window.graph)
+            before = window.folded_since_correction.at(window.graph.c, window.correction)
+            sigma_bias, scaled = (
+                self.parameters.prior_gyro_bias_rad_s,
+                window.correction.gyro_parameters[3],
+            )
+            return estimate_instrument(quadratics, window.graph, sigma_bias, before, scaled)
         except np.linalg.LinAlgError:
             return None
 
-    def _weighed(self, window: Window) -> Weighed | None:
-        """What is known of the instrument and the place; None where they are not to be asked."""
+    def _instrument_posterior(self, window: Window) -> InstrumentPosterior | None:
+        """Posterior of the instrument and the place; None if they are not considered or not
+        determined.
+        """
         if not self.parameters.imperfections:
             return None
-        before = window.folded_information.at(window.graph.c, window.taken)
+        before = window.folded_information.at(window.graph.c, window.correction)
         try:
-            moving = whole_informations(window.epochs, window.graph)
-            rests = of_rests(window.epochs, window.graph)
-            said = np.concatenate([moving[0], rests[0]]), np.concatenate([moving[1], rests[1]])
-            apart = sorted(window.epochs, key=lambda e: not e.turned)
-            times_s = np.array([float(e.data.time_s[[0, -1]].mean()) for e in apart])
+            moving = full_instrument_quadratics(window.epochs, window.graph)
+            rests = rest_quadratics(window.epochs, window.graph)
+            quadratics = (
+                np.concatenate([moving[0], rests[0]]),
+                np.concatenate([moving[1], rests[1]]),
+            )
+            moving_first = sorted(window.epochs, key=lambda e: not e.has_motion)
+            times_s = np.array([float(e.data.time_s[[0, -1]].mean()) for e in moving_first])
             sigma_bias = self.parameters.prior_gyro_bias_rad_s
-            known = Considered.of(said, times_s, window.graph, sigma_bias, before, window.taken)
-            return Weighed.of(known, window.graph, self.parameters.kinds)
+            likelihood = ImperfectionLikelihood.of(
+                quadratics, times_s, window.graph, sigma_bias, before, window.correction
+            )
+            return InstrumentPosterior.of(likelihood, window.graph, self.parameters.kinds)
         except np.linalg.LinAlgError:
             return None
 
-    def _gyro_out(self, window: Window, told: float) -> TakenOut:
-        """What is to be taken out, with what else the gyro's axes and scales are asked for."""
-        weighed = self._weighed(window)
-        if weighed is None:
-            return window.taken
-        taken, first, last = window.taken, window.epochs[0].data, window.epochs[-1].data
+    def _add_gyro_correction(self, window: Window, required_nats: float) -> InstrumentCorrection:
+        """The correction, with a further one of the gyro's axes and scales if the data
+        support it.
+        """
+        posterior = self._instrument_posterior(window)
+        if posterior is None:
+            return window.correction
+        correction, first, last = window.correction, window.epochs[0].data, window.epochs[-1].data
         try:
-            more = gyro_asked(weighed, told)
+            more = required_gyro_correction(posterior, required_nats)
         except np.linalg.LinAlgError:
-            return window.taken
+            return window.correction
         if more is not None:
-            taken = taken.with_gyro(more)
-        walk = walk_asked(weighed, float(last.time_s[-1] - first.time_s[0]))
-        return taken if walk == 0.0 else replace(taken, walk=float(np.hypot(taken.walk, walk)))
+            correction = correction.with_gyro(more)
+        walk = required_bias_walk(posterior, float(last.time_s[-1] - first.time_s[0]))
+        return (
+            correction
+            if walk == 0.0
+            else replace(correction, walk=float(np.hypot(correction.walk, walk)))
+        )
 
     @staticmethod
-    def _sure(window: Window) -> bool:
+    def _is_iron_known(window: Window) -> bool:
         try:
             sigma = np.sqrt(window.graph.temper * np.diag(window.graph.covariance())[6:9])
         except SingularError:
             return False
         size = np.cbrt(np.linalg.det(chain.symmetric(window.graph.c[:6])))
-        return bool(np.all(sigma < _SURE * size))
+        return bool(np.all(sigma < _KNOWN_SIGMA * size))
 
     def estimate(self) -> Estimate | None:
-        """The present answer, None before the first epoch or where nothing at all is determined.
+        """The present estimate; None before the first epoch or if nothing is determined.
 
-        An epoch that is under way counts as far as it is, if it is long enough to be one.
+        A pending epoch counts as far as it goes, if it is long enough to be one.
         """
         if self._new or (self._window and self._builder.pending >= MIN_EPOCH_STEPS):
-            self._watch()
+            self._linearise_locked()
             return self._copy().finish()
-        return self._answer()
+        return self._current_estimate()
 
     @staticmethod
-    def _by_lag(window: Window) -> Array:
-        """What doubt about the lag, by all data so far, adds to the covariance (12, 12)."""
-        known = window.lag_known() if window.taken.lag_s != 0.0 else None
+    def _lag_covariance(window: Window) -> Array:
+        """Addition to the covariance (12, 12) by the uncertainty of the lag, from all
+        data so far.
+        """
+        known = window.lag_uncertainty() if window.correction.lag_s != 0.0 else None
         return np.zeros((12, 12)) if known is None else np.outer(known.spread, known.spread)
 
-    def _by_imperfections(self, window: Window) -> Widening:
-        """What an instrument that is not perfect does to the answer."""
-        weighed = self._weighed(window)
-        return Widening.nothing() if weighed is None else considered(weighed)
+    def _imperfection_widening(self, window: Window) -> Widening:
+        """Effect of the instrument's imperfections on the answer."""
+        posterior = self._instrument_posterior(window)
+        return Widening.zero() if posterior is None else widening_by_imperfections(posterior)
 
-    def _left_over(self, window: Window) -> LeftOver | None:
-        """What the epochs of the window leave that is locked to attitude, rate or time.
+    def _residual_component(self, window: Window) -> ResidualComponent | None:
+        """The component of the residuals in the window that follows attitude, rate or time.
 
-        What an answer leaves that is not the best yet is its own.
+        Residuals of an answer that is not settled are due to the answer itself.
         """
-        if not self._is_watched(window):
+        if not self._is_residual_tested(window):
             return None
         if not self._is_copy:
-            self._watch()
-        most = np.max(instruments(*self.parameters.kinds).sigmas, axis=0)[:16]
+            self._linearise_locked()
+        largest = np.max(possible_instruments(*self.parameters.kinds).sigmas, axis=0)[:16]
         try:
-            return left_over(
+            return find_residual_component(
                 window.epochs,
                 window.graph,
-                (self.parameters.prior_gyro_bias_rad_s, most),
-                window.taken,
+                (self.parameters.prior_gyro_bias_rad_s, largest),
+                window.correction,
                 window.usual.mag_gauss,
             )
         except np.linalg.LinAlgError:
             return None
 
-    def _watch(self) -> None:
-        """Ask the epochs what is locked, each once: what is made for one answer keeps it."""
-        if self._window is None or not self._is_watched(self._window):
+    def _linearise_locked(self) -> None:
+        """Linearise the locked columns, once per epoch: a copy for one estimate can reuse them."""
+        if self._window is None or not self._is_residual_tested(self._window):
             return
         with suppress(np.linalg.LinAlgError):
             linearise_locked(self._window.epochs)
 
-    def _is_watched(self, window: Window) -> bool:
+    def _is_residual_tested(self, window: Window) -> bool:
         settled = self._agreed and window.step_sigmas < _SETTLED
         return bool(self.parameters.imperfections) and settled
 
-    def _warnings(self, left: LeftOver | None) -> tuple[str, ...]:
+    def _warnings(self, component: ResidualComponent | None) -> tuple[str, ...]:
         changed = () if self.restarted_s is None else (change_message(self.restarted_s),)
-        return (*changed, left.words) if left is not None and left.words else changed
+        return (*changed, component.words) if component is not None and component.words else changed
 
     def misalignment(self) -> Misalignment | None:
         """Whether the magnetometer is turned against the gyro, after `finish`; None if unknown."""
@@ -721,21 +790,24 @@ class Estimator:
         if window is None or not self._agreed:
             return None
         try:
-            told = informations(window.epochs, window.graph)
-            sigma_bias, taken = self.parameters.prior_gyro_bias_rad_s, window.taken.numbers[:3]
-            return misalignment(told, window.graph, sigma_bias, taken)
+            information = instrument_quadratics(window.epochs, window.graph)
+            sigma_bias, corrected_rad = (
+                self.parameters.prior_gyro_bias_rad_s,
+                window.correction.gyro_parameters[:3],
+            )
+            return estimate_misalignment(information, window.graph, sigma_bias, corrected_rad)
         except np.linalg.LinAlgError:
             return None
 
     def _copy(self) -> Estimator:
         other = copy(self)
         other._is_copy = True
-        other._builder, other._down = self._builder.copy(), self._down.copy()
+        other._builder, other._tilts = self._builder.copy(), self._tilts.copy()
         other._new = list(self._new)
         other._window = None if self._window is None else self._window.copy()
         return other
 
-    def _answer(self) -> Estimate | None:
+    def _current_estimate(self) -> Estimate | None:
         window = self._window
         if window is None or not window.epochs:
             return None
@@ -745,22 +817,23 @@ class Estimator:
         except SingularError:
             return None
         observed = observability(covariance * graph.temper, self._whitening)
-        # An answer that moves, or that other starts do not reach, is no better known than that.
-        doubt = min(max(window.step_sigmas, self._apart), _MOST_SIGMAS)
-        widening = self._by_imperfections(window)
-        plain, left = window.explained_covariance(), self._left_over(window)
-        divided = widened(window.covariance() * self._parted, plain, left)
-        parts = widening.parts | motion_and_misfit(plain, divided, self._whitening)
-        covariance = divided * (1.0 + doubt**2)
-        covariance = covariance + self._by_lag(window) + widening.added
-        covariance[:9, :9] += curvature(graph.c, covariance[:9, :9], graph.moments)
+        # An answer that still moves, or that other starts do not reach, is known no better than
+        # that.
+        doubt = min(max(window.step_sigmas, self._agreement_sigmas), _MOST_SIGMAS)
+        widening = self._imperfection_widening(window)
+        explained, component = window.explained_covariance(), self._residual_component(window)
+        tempered = widen_covariance(window.covariance() * self._split_factor, explained, component)
+        parts = widening.parts | motion_and_misfit(explained, tempered, self._whitening)
+        covariance = tempered * (1.0 + doubt**2)
+        covariance = covariance + self._lag_covariance(window) + widening.added
+        covariance[:9, :9] += curvature_covariance(graph.c, covariance[:9, :9], graph.moments)
         A, b, size, J = unit_volume(graph.c)
         K = np.eye(12)
-        K[:9, :9], K[9:, 9:] = J, np.linalg.inv(window.taken.gyro)
-        down, dip = attitude(self._down, [(e.u, e.data.down_b) for e in window.epochs])
-        turned = turned_heading_deg(window.taken.numbers[:3], down, dip)
-        heading = float(np.hypot(heading_sigma_deg(graph.c, covariance, down, dip), turned))
-        words = partial(misfit_words, left, window)
+        K[:9, :9], K[9:, 9:] = J, np.linalg.inv(window.correction.gyro)
+        down, dip = tilts_and_dip(self._tilts, [(e.u, e.data.down_b) for e in window.epochs])
+        misaligned_deg = misalignment_heading_deg(window.correction.gyro_parameters[:3], down, dip)
+        heading = float(np.hypot(heading_sigma_deg(graph.c, covariance, down, dip), misaligned_deg))
+        words = partial(misfit_words, component, window)
         advice = HeadingAdvice(graph.c, down, dip, window.usual.mag_gauss)
         averaged = self._builder.averaged
         return Estimate(
@@ -782,15 +855,15 @@ class Estimator:
                 and window.step_sigmas < _SETTLED
                 and heading < _HOPELESS_DEG
                 and self._misscaled == 0.0
-                and self._doubted_s is None
+                and self._contradicted_s is None
             ),
-            warnings=self._warnings(left),
-            mag_lag_s=window.taken.lag_s,
+            warnings=self._warnings(component),
+            mag_lag_s=window.correction.lag_s,
             gyro_misscaled=self._misscaled,
-            contradicted_s=self._doubted_s,
-            widened_by=advice.widened_by(parts, covariance, turned, words),
+            contradicted_s=self._contradicted_s,
+            widened_by=advice.main_cause(parts, covariance, misaligned_deg, words),
             place_gauss=widening.place_gauss,
-            place_deg=advice.by_place_deg(parts),
-            gyro_correction=window.taken.gyro,
+            place_deg=advice.place_heading_deg(parts),
+            gyro_correction=window.correction.gyro,
             gyro_covariance=widening.joint(K @ covariance @ K.T, K),
         )

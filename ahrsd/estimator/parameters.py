@@ -1,4 +1,4 @@
-"""What a person may set about the estimator; every number with its unit, effect and default."""
+"""Settings of the estimator; every number with its unit, effect and default."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ MIN_EPOCH_STEPS = 64  # a shorter piece before a gap is not worth a factor
 
 @dataclass(frozen=True, slots=True)
 class Imperfections:
-    """What a kind of instrument has besides iron and bias, 1 sigma each.
+    """Imperfections of a kind of instrument besides iron and bias, 1 sigma each.
 
     turn_rad: the magnetometer's axes against the gyro's, about each axis [rad]
-    lag_s:    the field's reading against the gyro's [s]
-    scale:    the gyro's angles, all axes alike, over themselves [1]
-    shape:    each of the five ways in which the gyro's scales differ and its axes are not at right
-              angles [1]
-    bias_rad_s: by how much the gyro's bias moves while the window was measured, each axis [rad/s]
-    iron_gauss: by how much the magnetometer's offset moves meanwhile, each axis [gauss]
+    lag_s: the field's reading against the gyro's [s]
+    scale: the gyro's angles, common to all axes, relative [1]
+    shape: each of the five numbers for differences of the gyro's scales and angles between its axes
+        [1]
+    bias_rad_s: change of the gyro bias over the window, each axis [rad/s]
+    iron_gauss: change of the magnetometer's offset over the window, each axis [gauss]
     """
 
     turn_rad: float
@@ -35,12 +35,13 @@ class Imperfections:
     iron_gauss: float
 
 
-#: as its maker calibrated it. Chosen, and not checked against a data sheet: axes within some .05
-#: deg, half a sample at 800 Hz, what is left of a scale; a bias that moves less than any walks
+#: as calibrated by its maker. Chosen, and not checked against a data sheet: axes within some .05
+#: deg, half a sample at 800 Hz, the remainder of a scale; a bias that changes less than any bias
+#: walks
 AS_SPECIFIED = Imperfections(
     turn_rad=8e-4, lag_s=6e-4, scale=3e-4, shape=3e-4, bias_rad_s=1e-5, iron_gauss=1e-4
 )
-#: put together from parts, and just switched on. Chosen: a degree between two boards, filters and
+#: assembled from parts, and just switched on. Chosen: a degree between two boards, filters and
 #: buses, a gyro's 1 %, offsets that follow the temperature: a tenth of a degree per second, 3 mG
 ASSEMBLED = Imperfections(
     turn_rad=0.02, lag_s=0.015, scale=0.01, shape=0.01, bias_rad_s=2e-3, iron_gauss=3e-3
@@ -49,14 +50,15 @@ ASSEMBLED = Imperfections(
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What is not of one instrument and yet on every recording, 1 sigma each.
+    """Disturbances on every recording that are not due to the instrument, 1 sigma each.
 
-    Both are courses: a value of its own every `knot_s` seconds, straight in between. The estimator
-    does not take their sizes from here: it finds them, as misfit.
+    Both are time series with an independent value every `knot_s` seconds, linear in between. The
+    estimator does not use these sizes: it finds them, as misfit.
 
-    place_gauss: the field in the world over its mean, each axis: it differs by place [gauss]
-    coloured:    noise of the magnetometer that is not white, each axis, over the white one [1]
-    knot_s:      time after which they are others [s]
+    place_gauss: deviation of the field in the world from its mean, each axis: it differs by place
+        [gauss]
+    coloured: coloured noise of the magnetometer, each axis, over the white noise [1]
+    knot_s: time between independent values [s]
     """
 
     place_gauss: float
@@ -64,34 +66,33 @@ class Surroundings:
     knot_s: float
 
 
-#: a yard or a hall's middle, driven through; noise that is as large as the white one. Chosen
+#: driven through a yard or the middle of a hall; coloured noise as large as the white noise. Chosen
 ORDINARY = Surroundings(place_gauss=2e-3, coloured=1.0, knot_s=10.0)
 
 
-#: gauss, 1 sigma of each of six numbers: by how much the field differs with the heading, for where
-#: the sensor is goes with where it heads. Nothing in the open; where real recordings were made a
-#: field that differs by place is of 8 mG in the median and above 0.6 mG in 19 of 20
-#: (`diagnosis/priors.py: ORDINARY`). So that nothing was seen is no proof that
-#: nothing is
+#: gauss, 1 sigma of each of six numbers: dependence of the field on the heading, because position
+#: goes with heading. Zero in the open; where real recordings were made, the field that differs by
+#: place is 8 mG in the median and above 0.6 mG in 19 of 20 (`diagnosis/priors.py: ORDINARY`). So no
+#: visible effect is no proof of a uniform field
 PLACES = (1e-6, 1e-3, 5e-3, 2e-2)
 
 Kinds = tuple[tuple[Imperfections, ...], tuple[float, ...]]
-"""Of instruments, and of places by the size of what differs there."""
+"""Kinds of instruments, and sizes of places (`PLACES`)."""
 
 
-#: by how much likelier than each of the others a gyro is, before the data, of which scales and axes
-#: are both of the worst of the kinds. Chosen on motions in sight: the size of a handful of numbers
-#: of which some are told is badly known itself, and a lucky draw must not pass for a better kind;
-#: where the motion tells nothing the mean variance is that of the worst kind, but for a twentieth
+#: prior odds, against each of the others, of a gyro whose scales and axes are both of the worst
+#: kind. Chosen on known motions: a handful of partly determined numbers determines their own size
+#: badly, and chance must not make a better kind probable. If the motion determines nothing, the
+#: mean variance is that of the worst kind, within a twentieth
 _WORST_GYRO = 40.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instruments:
-    """Instruments that may be, each at each of the places.
+    """Possible instruments, each at each of the places.
 
     sigmas (K, 19): of turn (3), lag, scale, shape (5), place (6), bias (3)
-    log_prior (K,): of how likely each is before the data, up to a constant
+    log_prior (K,): log prior probability, up to a constant
     """
 
     sigmas: Array
@@ -99,16 +100,19 @@ class Instruments:
 
 
 @lru_cache
-def instruments(kinds: tuple[Imperfections, ...], places: tuple[float, ...]) -> Instruments:
-    """All instruments that may be.
+def possible_instruments(
+    kinds: tuple[Imperfections, ...], places: tuple[float, ...]
+) -> Instruments:
+    """All possible instruments.
 
-    Its axes are of one of the kinds, its lag is, its gyro's scales and its gyro's bias are, each
-    whatever the others are: a sensor that was mounted askew need not be late. And so is the place
-    where it was driven. The angles between its gyro's axes are of the kind of its scales, or of a
-    better one (`_gyros`).
+    The kinds of its axes, of its lag, of its gyro's scales and of its gyro's bias are independent:
+    a sensor that was mounted askew need not be late. So is the size of the place. The angles
+    between the gyro's axes are of the kind of its scales or of a better one (`_gyro_kinds`).
     """
     every, prior = [], []
-    for (axes, late, bias), gyro, place in product(product(kinds, repeat=3), _gyros(kinds), places):
+    for (axes, late, bias), gyro, place in product(
+        product(kinds, repeat=3), _gyro_kinds(kinds), places
+    ):
         (scale, apart, askew), odds = gyro
         every.append(
             (
@@ -127,12 +131,12 @@ def instruments(kinds: tuple[Imperfections, ...], places: tuple[float, ...]) -> 
     return found
 
 
-def _gyros(kinds: tuple[Imperfections, ...]) -> list[tuple[tuple[float, float, float], float]]:
-    """Sigmas of a gyro's scale, of how its scales differ and of the angles between its axes, and
-    how likely it is.
+def _gyro_kinds(kinds: tuple[Imperfections, ...]) -> list[tuple[tuple[float, float, float], float]]:
+    """Sigmas of a gyro's scale, of the differences of its scales and of the angles between its
+    axes, with prior odds.
 
-    A gyro whose axes are at right angles may have wrong scales; one that was calibrated, so that
-    its scales are right, has no axes that are not.
+    A gyro with orthogonal axes may have wrong scales; one that was calibrated, so that its scales
+    are right, has orthogonal axes.
     """
     worst = max((kind.scale for kind in kinds), default=0.0)
     return [
@@ -163,12 +167,11 @@ class EstimatorParameters:
     prior_gyro_bias_rad_s: the same for the gyro bias [0.05 rad/s]
     outlier_sigma:     field residuals beyond this many sigmas lose weight quadratically [4.6, which
                        Gaussian noise exceeds once in 10^4 samples]
-    mag_noise_floor_gauss, gyro_noise_floor_rad_s: never believe less noise than this
-    imperfections:     kinds that each of its imperfections may be of; the answer is widened for
-                       what they are and the data leave open. None: it is perfect, as a simulated
-                       one
-    places:            sizes of a field that differs with the heading, of which one is at the place;
-                       asked where there are imperfections [gauss]
+    mag_noise_floor_gauss, gyro_noise_floor_rad_s: lower limits of the noise levels
+    imperfections:     kinds that each imperfection of the instrument may be of; their posterior
+                       widens the answer. Empty: a perfect instrument, such as a simulated one
+    places:            possible sizes of a field that depends on the heading by place;
+                       used only if there are imperfections [gauss]
     """
 
     step_rate_hz: float = 33.0
@@ -186,7 +189,7 @@ class EstimatorParameters:
 
     @property
     def kinds(self) -> Kinds:
-        """What the instrument and the place may be."""
+        """Possible kinds of the instrument and sizes of the place."""
         return self.imperfections, self.places
 
     def __post_init__(self) -> None:

@@ -1,32 +1,32 @@
-"""Beside the running estimator: did hard iron or gyro bias step since the calibration was made?
+"""Detector of a step in hard iron or gyro bias since the calibration was made, next to the
+estimator.
 
-Every ten seconds of the stream give one small Gram, scored against the newest converged estimate of
-that moment. The newest blocks that show motion are tested together against the estimate as it stood
-before the first of them, its covariance taken into account:
+Every ten seconds of the stream give one small Gram matrix, scored against the newest converged
+estimate of that time. The newest blocks that show motion are tested together against the estimate
+from before the first of them, including its covariance:
 
     T = 2 max over D of the gain in log likelihood by a step D of the hard iron (or the gyro bias)
 
-T is measured by what such blocks usually give in this stream (lag, gradients, coloured noise), and
-a step is told only if one D explains two blocks or more, each of them by itself, and better than
-the other sensor and than a field that changes in the world. Then the time is looked for.
+T is compared with the usual gain of such blocks in this stream (lag, gradients, coloured noise). A
+step is reported only if one D explains two blocks or more, each of them on its own, and better than
+a step of the other sensor or a field that changes in the world. Then the time of the step is
+estimated.
 
-A step is told once; `restart` begins anew, with data from after it.
+A step is reported once; `restart` begins again, with data from after it.
 
-What one block of ten seconds says against a calibration costs a few small matrices. A recording's
-filter (`innovation`) takes a loop over samples; beside a running estimator that is too dear. Within
-a block the same whitened innovations come without one: the gyro carries every reading into the
-frame of the block's first one, where the field stands still,
+A recording's filter (`innovation`) loops over samples; next to a running estimator that is too
+expensive. Within a block the same whitened innovations follow without a loop: the gyro rotates
+every reading into the frame of the first one, where the field is constant,
 
     y_k = R_k C (m_k - b) = h + noise,   R_k = R_k-1 Exp(G (w_k - w_b) dt)
 
 and the noise is white (magnetometer) plus, across the field, a random walk (gyro). The inverse of
-the Cholesky factor of its covariance gives the innovations of the filter that starts knowing
-nothing of h; it is the same for every block. The field h of the block is projected out, so a block
-says nothing while the vehicle stands, whatever is the matter with the field around it; so is a lag
-between the two sensors, which nearly every stream has and no calibration knows of. G is what the
-estimator takes out of the gyro's angles (`Estimate.gyro_correction`): wrong scales are a bias that
-changes with the sense of turning. What is not known of it yet is considered, as an error of the
-calibration.
+the Cholesky factor of its covariance gives the innovations of a filter without prior knowledge of
+h; it is the same for every block. The field h of the block is projected out, so a block at rest has
+no information, whatever happens to the field around it. So is a lag between the two sensors, which
+nearly every stream has and no calibration contains. G is the estimator's correction of the gyro's
+angles (`Estimate.gyro_correction`): wrong scales are a bias that changes with the sense of turning.
+The remaining uncertainty of G is considered as an error of the calibration.
 """
 
 from __future__ import annotations
@@ -38,28 +38,30 @@ import numpy as np
 
 from ahrsd import so3
 from ahrsd.calibration import Estimate
-from ahrsd.estimator.epoch import GYRO_WAYS, TakenOut
+from ahrsd.estimator.chain import symmetric_columns
+from ahrsd.estimator.epoch import GYRO_BASIS, InstrumentCorrection
 from ahrsd.samples import Array, SampleBlock
 
-ROWS = 128  # thinned samples in a block
+ROWS = 128  # thinned samples per block
 LAG_S = 0.05  # 1-sigma of a lag between magnetometer and gyro
-LEAST_ROWS = 64  # in a piece before a gap that is worth scoring
+LEAST_ROWS = 64  # least rows of a piece before a gap that is scored
 #: columns of a block: those of `Estimate.gyro_covariance`, then a drift of the field in the world
 SOFT, IRON, GYRO, MATRIX = slice(0, 6), slice(6, 9), slice(9, 12), slice(12, 21)
 DRIFT, _LAG, _RESIDUAL = slice(21, 24), 27, 28
-_KNOWN, _OWN = 21, slice(24, 28)  # and a block's own field (3) and lag
+# and the nuisance parameters of a block: field (3) and lag
+_CALIBRATION_COLUMNS, _OWN = 21, slice(24, 28)
 _ENTRIES = np.triu_indices(3)
-# 1-sigma that no calibration is believed to fall below: what moves by itself from minute to minute
+# least 1-sigma of a calibration: its own changes from minute to minute
 _FLOOR = np.r_[np.full(6, 1e-3), np.full(3, 5e-4), np.full(3, 2e-4)]
-_KEEP_ROOT = 1.2  # the whitening is kept while the ratio of the noises is within this factor
+_KEEP_ROOT = 1.2  # change of the noise ratio up to which the whitening is kept
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceCalibration:
-    """A calibration to test: theta (21,) and a root (21, 21) of its covariance, and the noises.
+    """A calibration to test: theta (21,), a root (21, 21) of its covariance, and the noise levels.
 
-    theta: as `Estimate.covariance` has them, then turn, scale and shape of the gyro's correction
-    gyro_correction (3, 3): on the gyro's reading less its bias
+    theta: in the order of `Estimate.covariance`, then turn, scale and shape of the gyro's
+    correction; gyro_correction (3, 3): acts on the gyro's reading less its bias.
     """
 
     theta: Array
@@ -73,19 +75,24 @@ class ReferenceCalibration:
 
     @staticmethod
     def of(estimate: Estimate) -> ReferenceCalibration:
-        """The estimate, in the order of its covariance."""
+        """From an estimate."""
         A = estimate.soft_iron
-        covariance = np.zeros((_KNOWN, _KNOWN))
+        covariance = np.zeros((_CALIBRATION_COLUMNS, _CALIBRATION_COLUMNS))
         covariance[:12, :12] = estimate.covariance
         if estimate.gyro_covariance is not None:
             covariance = estimate.gyro_covariance.copy()
         covariance[:12, :12] += np.diag(_FLOOR**2)
-        # so different are their units that the small ones would be lost
+        # the units differ so much that small variances would be lost
         size = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
         values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
-        gyro = replace(TakenOut.nothing(), gyro=estimate.gyro_correction)
+        gyro = replace(InstrumentCorrection.identity(), gyro=estimate.gyro_correction)
         return ReferenceCalibration(
-            np.r_[A[_ENTRIES], estimate.hard_iron_gauss, estimate.gyro_bias_rad_s, gyro.numbers],
+            np.r_[
+                A[_ENTRIES],
+                estimate.hard_iron_gauss,
+                estimate.gyro_bias_rad_s,
+                gyro.gyro_parameters,
+            ],
             size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)),
             np.asarray(np.linalg.inv(A), float),
             estimate.hard_iron_gauss,
@@ -98,7 +105,9 @@ class ReferenceCalibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thinned:
-    """Rows of a block: means of `averaged` samples; angle_b_rad is the gyro's integral."""
+    """Rows of a block: means of `averaged` samples; angle_b_rad is the integral of the
+    gyro's rate.
+    """
 
     time_s: Array
     raw_b_gauss: Array
@@ -110,8 +119,9 @@ class Thinned:
 class ScoredBlock:
     """A scored block.
 
-    information (24, 24), score (24,): of the columns, the block's own field and lag projected out
-    residual (n, 3), lever (n, 3, 3): y - h and how it moves with the hard iron, carried frame
+    information (24, 24), score (24,): of the columns, marginalised over the block's own field and
+    lag. residual (n, 3), lever (n, 3, 3): y - h and its derivative by the hard iron, in the frame
+    of the first row.
     """
 
     reference: ReferenceCalibration
@@ -123,7 +133,7 @@ class ScoredBlock:
 
 
 class Scorer:
-    """Scores blocks; keeps the whitening, which changes with the noise only."""
+    """Scores blocks; caches the whitening, which depends on the noise only."""
 
     def __init__(self) -> None:
         self._ratio = 0.0
@@ -136,21 +146,21 @@ class Scorer:
         turn = np.diff(rows.angle_b_rad, axis=0, prepend=rows.angle_b_rad[:1])
         turn -= dt_s[:, None] * reference.gyro_bias_rad_s
         turn = turn @ reference.gyro_correction.T
-        R = carried(so3.exp(turn))
+        R = accumulate_rotations(so3.exp(turn))
         lever = R @ reference.correction
         y = (lever @ (rows.raw_b_gauss - reference.offset)[:, :, None])[:, :, 0]
         h = y.mean(axis=0)
         Z = np.zeros((n, 3, _RESIDUAL + 1))
         across = so3.skew(h)
-        Z[:, :, SOFT] = lever @ _soft(h @ R)
+        Z[:, :, SOFT] = lever @ symmetric_columns(h @ R)
         Z[:, :, IRON] = lever
-        gone = np.cumsum(R * dt_s[:, None, None], axis=0) @ reference.gyro_correction
-        Z[:, :, GYRO] = -across @ gone
-        ways = np.einsum("nij,kjl,nl->nik", R, GYRO_WAYS, turn, optimize=True)
-        Z[:, :, MATRIX] = across @ np.cumsum(ways, axis=0)
+        bias_integral = np.cumsum(R * dt_s[:, None, None], axis=0) @ reference.gyro_correction
+        Z[:, :, GYRO] = -across @ bias_integral
+        unit_matrices = np.einsum("nij,kjl,nl->nik", R, GYRO_BASIS, turn, optimize=True)
+        Z[:, :, MATRIX] = across @ np.cumsum(unit_matrices, axis=0)
         Z[:, [0, 1, 2], [21, 22, 23]] = np.linspace(-1.0, 1.0, n)[:, None]
         Z[:, [0, 1, 2], [24, 25, 26]] = 1.0
-        Z[:, :, _LAG] = np.cross(h, (R @ _rate(turn, dt_s)[:, :, None])[:, :, 0])
+        Z[:, :, _LAG] = np.cross(h, (R @ _rates_at_rows(turn, dt_s)[:, :, None])[:, :, 0])
         Z[:, :, _RESIDUAL] = y - h
         G = self._gram(Z, h, reference, float(dt_s[1:].mean()), rows.averaged)
         own = G[_OWN, _OWN] + np.diag([0.0, 0.0, 0.0, LAG_S**-2])
@@ -160,7 +170,7 @@ class Scorer:
     def _gram(
         self, Z: Array, h: Array, reference: ReferenceCalibration, dt_s: float, averaged: int
     ) -> Array:
-        """Along the field nothing but the magnetometer's noise, across it the gyro's walk too."""
+        """Along the field only the magnetometer's noise, across it also the gyro's random walk."""
         size = float(np.linalg.norm(h))
         sigma = reference.noise_mag_gauss / np.sqrt(averaged)
         walk = size * reference.noise_gyro_rad_s * dt_s / np.sqrt(averaged)
@@ -174,7 +184,7 @@ class Scorer:
         return np.asarray(rows.T @ rows)
 
     def _whitening(self, ratio: float) -> Array:
-        """L^-1 of I + ratio^2 min(i, j) = L L^T; that of fewer rows is its upper left corner."""
+        """L^-1 of I + ratio^2 min(i, j) = L L^T; for fewer rows it is the upper left corner."""
         if not self._ratio / _KEEP_ROOT <= ratio <= self._ratio * _KEEP_ROOT:
             steps = np.arange(ROWS, dtype=np.float64)
             noise = np.eye(ROWS) + ratio**2 * np.minimum(steps[:, None], steps)
@@ -182,7 +192,7 @@ class Scorer:
         return self._root
 
 
-def carried(turns: Array) -> Array:
+def accumulate_rotations(turns: Array) -> Array:
     """R_k = turns_0 ... turns_k, (n, 3, 3), in log2(n) passes."""
     out, step = turns, 1
     while step < len(out):
@@ -191,35 +201,27 @@ def carried(turns: Array) -> Array:
     return out
 
 
-def _rate(turn: Array, dt_s: Array) -> Array:
-    """Rate (n, 3) at the rows' instants, of the turns between them."""
+def _rates_at_rows(turn: Array, dt_s: Array) -> Array:
+    """Rates (n, 3) at the times of the rows, from the rotations between them."""
     rate = turn[1:] / dt_s[1:, None]
     out = np.concatenate([rate[:1], rate])
     out[1:-1] = (rate[:-1] + rate[1:]) / 2
     return out
 
 
-def _soft(field_b: Array) -> Array:
-    """d(A h)/d entries of the symmetric A, (n, 3, 6)."""
-    out = np.zeros((len(field_b), 3, 6))
-    for column, (i, j) in enumerate(zip(*_ENTRIES, strict=True)):
-        out[:, i, column] = field_b[:, j]
-        out[:, j, column] = field_b[:, i]
-    return out
-
-
-RATE_HZ = 12.5  # of the thinned samples: larger follows faster motion and costs more
+RATE_HZ = 12.5  # of the thinned samples: a higher rate follows faster motion and costs more
 KEPT = 16  # blocks
-_MOST = 100.0  # gauss or rad/s: more than any of these sensors reads
-_RATE_ROWS = 9  # from which a piece's rate is measured, whatever blocks they came in
-_WINDOWS = (1, 2, 4, 8)  # informative blocks that are tested together; 1: for the usual size only
-_LEAST_USUAL, _MOST_USUAL = 4, 24  # blocks that say what is usual
-_LIMIT = 40.0  # T over what is usual; in a simulated week 17, with coloured noise 27
-_SHARE = 0.7  # of what each block could gain by a D of its own
-_CLEAR = 4.0  # sigmas from which a component counts
-_INFORMATIVE = 0.005  # gauss (rad/s): a block whose best-known direction is worse says nothing
-_BELIEF = {"hard iron": 0.5, "gyro bias": 0.1}  # 1-sigma of a step before anything is known
-_LEAST = {"hard iron": 0.005, "gyro bias": 0.002}  # smaller ones are nobody's business
+_LARGEST_READING = 100.0  # gauss or rad/s: beyond the range of these sensors
+_RATE_ROWS = 9  # that give the rate of a piece, independently of the blocks
+# numbers of informative blocks that are tested together; 1: for the baseline only
+_WINDOWS = (1, 2, 4, 8)
+_LEAST_BASELINE, _LONGEST_BASELINE = 4, 24  # number of blocks in the baseline
+_LEAST_GAIN_RATIO = 40.0  # T over the baseline; in a simulated week 17, with coloured noise 27
+_LEAST_GAIN_SHARE = 0.7  # of the gain of each block by a D of its own
+_SIGNIFICANT_SIGMAS = 4.0  # of a component of the step
+_INFORMATIVE_SIGMA = 0.005  # gauss: the best-known direction of an informative block
+_PRIOR_SIGMA = {"hard iron": 0.5, "gyro bias": 0.1}  # of a step
+_LEAST_STEP = {"hard iron": 0.005, "gyro bias": 0.002}  # smaller steps are not reported
 _COLUMNS = {"hard iron": IRON, "gyro bias": GYRO}
 _SHOWN = {"hard iron": (1e3, "mG"), "gyro bias": (1e3, "mrad/s")}
 _WHY = {
@@ -230,9 +232,9 @@ _WHY = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """What stepped ("hard iron" or "gyro bias"): by `size` +- `sigma`, (3,), gauss or rad/s.
+    """A step of `what` ("hard iron" or "gyro bias") by `size` +- `sigma`, (3,), gauss or rad/s.
 
-    at_s: when, device time; told_s: end of the block that decided it; blocks: how many agree.
+    at_s: its device time; told_s: end of the block that decided it; blocks: number that agree.
     """
 
     what: str
@@ -244,17 +246,17 @@ class Step:
 
     @property
     def frame(self) -> str:
-        """Where it sits."""
+        """The sensor that it concerns."""
         return "sensor" if self.what == "hard iron" else "gyro"
 
     @property
     def unit(self) -> str:
-        """Of size and sigma."""
+        """Unit of size and sigma."""
         return "gauss" if self.what == "hard iron" else "rad/s"
 
     @property
     def words(self) -> str:
-        """For the log: size, time, what it means."""
+        """For the log: size, time and meaning."""
         factor, unit = _SHOWN[self.what]
         size = ", ".join(f"{value:+.1f}" for value in self.size * factor)
         sigma = ", ".join(f"{value:.1f}" for value in self.sigma * factor)
@@ -276,84 +278,96 @@ class StepDetector:
         self.restart()
 
     def restart(self) -> None:
-        """Forget everything: what follows has another iron, or another calibration."""
+        """Forget everything, for another iron or another calibration."""
         self._estimate = self._reference = self.found = None
         self._blocks: deque[ScoredBlock] = deque(maxlen=KEPT)
-        self._single: deque[float] = deque(maxlen=_MOST_USUAL + max(_WINDOWS))
-        self._intake = _Intake()
+        self._single_gains: deque[float] = deque(maxlen=_LONGEST_BASELINE + max(_WINDOWS))
+        self._builder = _BlockBuilder()
 
     @property
     def armed(self) -> bool:
-        """Whether a step would be told."""
-        return self.found is None and self._usual() is not None
+        """Whether a step would be reported."""
+        return self.found is None and self._baseline_gain() is not None
 
     def add(self, block: SampleBlock, estimate: Estimate | None) -> Step | None:
-        """Take samples; the step, where they show one."""
+        """Take samples; the step, if they show one."""
         if self.found is not None:
             return None
         if estimate is not None and estimate is not self._estimate and estimate.converged:
             self._estimate = estimate
             if np.isfinite(estimate.covariance).all():
                 self._reference = ReferenceCalibration.of(estimate)
-        for rows in self._intake.add(block):
-            step = None if self._reference is None else self._judge(rows, self._reference)
+        for rows in self._builder.add(block):
+            step = None if self._reference is None else self._test_block(rows, self._reference)
             if step is not None:
                 self.found = step
                 return step
         return None
 
-    def _judge(self, rows: Thinned, reference: ReferenceCalibration) -> Step | None:
+    def _test_block(self, rows: Thinned, reference: ReferenceCalibration) -> Step | None:
         block = self._scorer.score(rows, reference)
         self._blocks.append(block)
         self.scored += 1
-        if not _informative(block):
+        if not _is_informative(block):
             return None
-        told = [b for b in self._blocks if _informative(b)]
-        usual = self._usual()
+        informative = [b for b in self._blocks if _is_informative(b)]
+        baseline = self._baseline_gain()
         step = None
         for count in _WINDOWS:
-            if count > len(told):
+            if count > len(informative):
                 break
-            newest = told[-count:]
-            gains = _gains(newest)
+            newest = informative[-count:]
+            gains = _step_gains(newest)
             if count == 1:
-                self._single.append(max(gain for gain, _, _ in gains.values()) / 3.0)
-            elif step is None and usual is not None:
-                step = self._decide(newest, gains, usual)
+                self._single_gains.append(max(gain for gain, _, _ in gains.values()) / 3.0)
+            elif step is None and baseline is not None:
+                step = self._decide(newest, gains, baseline)
         return step
 
-    def _usual(self) -> float | None:
-        """What a block without a step gains, 1 if all is as modelled; the newest do not count."""
-        known = list(self._single)
-        older = known[: -min(max(_WINDOWS), max(2, len(known) - _LEAST_USUAL))]
-        return None if len(older) < _LEAST_USUAL else max(1.0, float(np.mean(older)))
+    def _baseline_gain(self) -> float | None:
+        """Usual gain of a block without a step, at least 1, its value under the model. The newest
+        blocks do not count.
+        """
+        known = list(self._single_gains)
+        older = known[: -min(max(_WINDOWS), max(2, len(known) - _LEAST_BASELINE))]
+        return None if len(older) < _LEAST_BASELINE else max(1.0, float(np.mean(older)))
 
     def _decide(
-        self, newest: list[ScoredBlock], gains: dict[str, tuple[float, Array, Array]], usual: float
+        self,
+        newest: list[ScoredBlock],
+        gains: dict[str, tuple[float, Array, Array]],
+        baseline: float,
     ) -> Step | None:
         what = max(gains, key=lambda name: gains[name][0])
         gain, size, information = gains[what]
-        if gain < _LIMIT * usual or _clear_size(size, information) < _LEAST[what]:
+        if (
+            gain < _LEAST_GAIN_RATIO * baseline
+            or _significant_size(size, information) < _LEAST_STEP[what]
+        ):
             return None
         if gain < sum(_drift_gain(block, newest[0].reference) for block in newest):
             return None
-        if any(_share(block, newest[0].reference, what, size) < _SHARE for block in newest):
+        if any(
+            _gain_share(block, newest[0].reference, what, size) < _LEAST_GAIN_SHARE
+            for block in newest
+        ):
             return None
         at_s = float(newest[0].time_s[0])
         if what == "hard iron":
-            # it may have come within the first block: then only the others have all of it
-            _, late, of_late = _gains(newest[1:], newest[0].reference)[what]
-            explained = [float(np.max(_onset_gains(newest[0], D))) for D in (size, late)]
-            at_s = self._when(newest[0], late if explained[1] > explained[0] else size)
+            # it may have occurred within the first block: then only the later ones contain all of
+            # it
+            _, later_size, later_information = _step_gains(newest[1:], newest[0].reference)[what]
+            explained = [float(np.max(_onset_gains(newest[0], D))) for D in (size, later_size)]
+            at_s = self._onset_time(newest[0], later_size if explained[1] > explained[0] else size)
             if at_s > newest[0].time_s[0]:
-                size, information = late, of_late
-        sigma = np.sqrt(usual * np.diag(np.linalg.inv(information)))
+                size, information = later_size, later_information
+        sigma = np.sqrt(baseline * np.diag(np.linalg.inv(information)))
         return Step(what, at_s, float(newest[-1].time_s[-1]), size, sigma, len(newest))
 
-    def _when(self, first: ScoredBlock, size: Array) -> float:
-        """The time from which on the step explains most, from the first block backwards.
+    def _onset_time(self, first: ScoredBlock, size: Array) -> float:
+        """The time from which the step explains most, searched backwards from the first block.
 
-        While the vehicle stands only the jump itself shows.
+        While the vehicle is at rest only the jump itself shows.
         """
         blocks = list(self._blocks)
         best, at_s, after = 0.0, float(first.time_s[0]), 0.0
@@ -367,8 +381,10 @@ class StepDetector:
         return at_s
 
 
-class _Intake:
-    """Samples to thinned blocks; a gap, a clock that falls or a change of registers ends one."""
+class _BlockBuilder:
+    """Samples to thinned blocks; a gap, a clock that runs back or a change of registers ends a
+    block.
+    """
 
     def __init__(self) -> None:
         self._waiting: list[SampleBlock] = []
@@ -378,7 +394,7 @@ class _Intake:
     def add(self, block: SampleBlock) -> list[Thinned]:
         if len(block) == 0:
             return []
-        out = self._close() if self._breaks(block) else []
+        out = self._close() if self._is_break(block) else []
         self._waiting.append(block)
         self._count += len(block)
         if not self._averaged and self._count >= _RATE_ROWS:
@@ -386,10 +402,10 @@ class _Intake:
             usual_s = max(1e-4, float(np.median(np.diff(first))))
             self._averaged = max(1, round(1.0 / (usual_s * RATE_HZ)))
         while self._averaged and self._count >= ROWS * self._averaged:
-            out += self._cut(ROWS)
+            out += self._take_rows(ROWS)
         return out
 
-    def _breaks(self, block: SampleBlock) -> bool:
+    def _is_break(self, block: SampleBlock) -> bool:
         if not self._waiting:
             return False
         last = self._waiting[-1]
@@ -397,23 +413,23 @@ class _Intake:
 
     def _close(self) -> list[Thinned]:
         rows = self._count // self._averaged if self._averaged else 0
-        out = self._cut(rows) if rows >= LEAST_ROWS else []
+        out = self._take_rows(rows) if rows >= LEAST_ROWS else []
         self._waiting, self._count, self._averaged = [], 0, 0
         return out
 
-    def _cut(self, rows: int) -> list[Thinned]:
-        """The first `rows` thinned rows; none where a number is not one that a sensor reads."""
+    def _take_rows(self, rows: int) -> list[Thinned]:
+        """The first `rows` thinned rows; none if a number is beyond the range of the sensor."""
         m, used = self._averaged, rows * self._averaged
         time_s = np.concatenate([b.time_s for b in self._waiting])
         table = np.concatenate(
             [np.column_stack([b.raw_b_gauss, b.gyro_b_rad_s]) for b in self._waiting]
         )
         last = self._waiting[-1]
-        left = len(time_s) - used
-        self._waiting = [_tail(last, left)] if left else []
-        self._count = left
+        remaining = len(time_s) - used
+        self._waiting = [_last_rows(last, remaining)] if remaining else []
+        self._count = remaining
         dt_s = np.diff(time_s[:used], prepend=time_s[:1])
-        if not ((np.abs(table) < _MOST).all() and (dt_s[1:] > 0).all()):
+        if not ((np.abs(table) < _LARGEST_READING).all() and (dt_s[1:] > 0).all()):
             return []
         table = table[:used]
         angle = np.cumsum(table[:, 3:] * dt_s[:, None], axis=0)
@@ -422,7 +438,7 @@ class _Intake:
         return [Thinned(mean[:, 0], mean[:, 1:4], mean[:, 4:], m)]
 
 
-def _tail(block: SampleBlock, rows: int) -> SampleBlock:
+def _last_rows(block: SampleBlock, rows: int) -> SampleBlock:
     return replace(
         block,
         time_s=block.time_s[-rows:],
@@ -433,71 +449,82 @@ def _tail(block: SampleBlock, rows: int) -> SampleBlock:
     )
 
 
-def _informative(block: ScoredBlock) -> bool:
-    """Whether the block alone knows the hard iron in some direction."""
-    return bool(np.linalg.eigvalsh(block.information[IRON, IRON])[-1] > _INFORMATIVE**-2)
+def _is_informative(block: ScoredBlock) -> bool:
+    """Whether the block alone determines the hard iron in some direction."""
+    return bool(np.linalg.eigvalsh(block.information[IRON, IRON])[-1] > _INFORMATIVE_SIGMA**-2)
 
 
-def _believed(blocks: list[ScoredBlock], reference: ReferenceCalibration) -> tuple[Array, Array]:
-    """Information (21, 21) and score (21,) of what departs from it, less its own error."""
-    known = slice(0, _KNOWN)
-    total = sum((b.information[known, known] for b in blocks), np.zeros((_KNOWN, _KNOWN)))
-    score = np.zeros(_KNOWN)
+def _gradient_given_reference(
+    blocks: list[ScoredBlock], reference: ReferenceCalibration
+) -> tuple[Array, Array]:
+    """Information (21, 21) and score (21,) of deviations from the reference, given its
+    covariance.
+    """
+    known = slice(0, _CALIBRATION_COLUMNS)
+    total = sum(
+        (b.information[known, known] for b in blocks),
+        np.zeros((_CALIBRATION_COLUMNS, _CALIBRATION_COLUMNS)),
+    )
+    score = np.zeros(_CALIBRATION_COLUMNS)
     for b in blocks:
-        moved = b.reference.theta - reference.theta
-        score += b.score[known] + b.information[known, known] @ moved
+        theta_change = b.reference.theta - reference.theta
+        score += b.score[known] + b.information[known, known] @ theta_change
     K = total @ reference.root
-    inner = np.eye(_KNOWN) + reference.root.T @ K
+    inner = np.eye(_CALIBRATION_COLUMNS) + reference.root.T @ K
     solved = np.linalg.solve(inner, np.column_stack([K.T, reference.root.T @ score]))
-    return total - K @ solved[:, known], score - K @ solved[:, _KNOWN]
+    return total - K @ solved[:, known], score - K @ solved[:, _CALIBRATION_COLUMNS]
 
 
-def _gains(
+def _step_gains(
     blocks: list[ScoredBlock], reference: ReferenceCalibration | None = None
 ) -> dict[str, tuple[float, Array, Array]]:
-    """By what steps: T, the step (3,), its information (3, 3), against the first's reference."""
-    information, score = _believed(blocks, reference or blocks[0].reference)
-    return {what: _gain(information, score, what) for what in _COLUMNS}
+    """By sensor: T, the step (3,) and its information (3, 3), relative to the first block's
+    reference.
+    """
+    information, score = _gradient_given_reference(blocks, reference or blocks[0].reference)
+    return {what: _step_gain(information, score, what) for what in _COLUMNS}
 
 
-def _gain(information: Array, score: Array, what: str) -> tuple[float, Array, Array]:
+def _step_gain(information: Array, score: Array, what: str) -> tuple[float, Array, Array]:
     columns = _COLUMNS[what]
-    J = information[columns, columns] + np.eye(3) / _BELIEF[what] ** 2
+    J = information[columns, columns] + np.eye(3) / _PRIOR_SIGMA[what] ** 2
     size = np.asarray(np.linalg.solve(J, score[columns]), float)
     return float(score[columns] @ size), size, J
 
 
-def _share(block: ScoredBlock, reference: ReferenceCalibration, what: str, size: Array) -> float:
-    """Of the gain that a step of its own gives the block, what this step gives."""
-    information, score = _believed([block], reference)
-    most, _, J = _gain(information, score, what)
+def _gain_share(
+    block: ScoredBlock, reference: ReferenceCalibration, what: str, size: Array
+) -> float:
+    """Gain of a block by this step, over its gain by the best step of its own."""
+    information, score = _gradient_given_reference([block], reference)
+    most, _, J = _step_gain(information, score, what)
     return float(2 * size @ score[_COLUMNS[what]] - size @ J @ size) / max(most, 1e-12)
 
 
 def _drift_gain(block: ScoredBlock, reference: ReferenceCalibration) -> float:
-    """T of a field that changes in the world during the block."""
-    known = slice(0, _KNOWN)
+    """T of a field that drifts in the world during the block."""
+    known = slice(0, _CALIBRATION_COLUMNS)
     score = block.score + block.information[:, known] @ (block.reference.theta - reference.theta)
     G, K = block.information, block.information[:, known] @ reference.root
-    inner = np.eye(_KNOWN) + reference.root.T @ K[known]
+    inner = np.eye(_CALIBRATION_COLUMNS) + reference.root.T @ K[known]
     solved = np.linalg.solve(inner, np.column_stack([K.T, reference.root.T @ score[known]]))
     J = (G - K @ solved[:, : len(G)])[DRIFT, DRIFT] + np.eye(3) * 1e-6
     s = (score - K @ solved[:, len(G)])[DRIFT]
     return float(s @ np.linalg.solve(J, s))
 
 
-def _clear_size(size: Array, information: Array) -> float:
-    """Length of the step along the directions in which it is clear."""
+def _significant_size(size: Array, information: Array) -> float:
+    """Length of the step along the directions in which it is significant."""
     values, vectors = np.linalg.eigh(information)
     along = vectors.T @ size
-    return float(np.linalg.norm(along[np.abs(along) * np.sqrt(values) > _CLEAR]))
+    return float(np.linalg.norm(along[np.abs(along) * np.sqrt(values) > _SIGNIFICANT_SIGMAS]))
 
 
 def _onset_gains(block: ScoredBlock, size: Array) -> Array:
-    """(n,) what a step that begins in row k gains in this block, its own field fitted."""
-    moved = block.lever @ size
+    """(n,) gains in this block of a step that begins in row k, with the block's field fitted."""
+    effect = block.lever @ size
     residual = block.residual
-    cross = np.cumsum(np.sum(moved * residual, axis=1)[::-1])[::-1]
-    square = np.cumsum(np.sum(moved**2, axis=1)[::-1])[::-1]
-    mean = np.cumsum(moved[::-1], axis=0)[::-1]
-    return np.asarray(2 * cross - square + np.sum(mean**2, axis=1) / len(moved))
+    cross = np.cumsum(np.sum(effect * residual, axis=1)[::-1])[::-1]
+    square = np.cumsum(np.sum(effect**2, axis=1)[::-1])[::-1]
+    mean = np.cumsum(effect[::-1], axis=0)[::-1]
+    return np.asarray(2 * cross - square + np.sum(mean**2, axis=1) / len(effect))

@@ -1,18 +1,19 @@
-"""What a heading is worth: its errors against a reference, and where dead reckoning leads.
+"""Accuracy of a heading: its errors against a reference, and the errors of dead reckoning with it.
 
-The reference is the course of fixes, an optical attitude, or another heading. Course at fix k is
-the direction from fix k-1 to fix k+1; it stands for the mean heading between them. Its frame is
-true north, that of an optical system has any yaw; the mount of the sensor has one, too. So one
-constant is removed from every comparison, and reported.
+The reference is the course over fixes, an optical attitude, or another heading. The course at fix k
+is the direction from fix k-1 to fix k+1; it represents the mean heading between them. Its frame is
+true north; the frame of an optical system has an arbitrary yaw, and so has the mount of the sensor.
+So one constant is removed from every comparison, and reported.
 
-**Dead reckoning**: velocity through heading to a position ([R] 2.3-2.4), beside a reference.
+**Dead reckoning**: velocity and heading integrated to a position ([R] 2.3-2.4), against a
+reference.
 
     p(t) = integral of R_nb v_b,   north and east only
 
-The velocity is a Doppler log's (columns velocity_{x,y,z}_m_s, sensor frame), a speed along the
-heading (column speed_m_s), or the fixes' own speed: that judges the heading alone. The one constant
-of the heading (mount, declination) is the rotation that lays the steps between fixes best onto the
-reference's; both begin at the first fix.
+The velocity is that of a Doppler log (columns velocity_{x,y,z}_m_s, sensor frame), a speed along
+the heading (column speed_m_s), or the speed of the fixes themselves, which then tests the heading
+alone. The one constant of the heading (mount, declination) is the rotation that best aligns the
+steps between fixes with those of the reference; both begin at the first fix.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ from ahrsd.samples import Array
 
 
 _EARTH_M = 6_371_000.0
-_UNBROKEN = 1.6  # times the usual distance of fixes; more is a gap that is not bridged
+_UNBROKEN = 1.6  # times the median time between fixes; a longer one is a gap
 _LEAST_FIXES = 10
-_LEAST_FORCE_M_S2 = 1.0  # of the mean in the world, below which it is no gravity
+_LEAST_FORCE_M_S2 = 1.0  # of the mean in world axes; a smaller one is not gravity
 _LEAST_INSTANTS = 10
-_OPINION = "its own filter's opinion, not the truth"
+_DEVICE_DETAIL = "its own filter's opinion, not the truth"
 QUATERNION = ("ref_qw", "ref_qx", "ref_qy", "ref_qz")
 POSITION = ("position_north_m", "position_east_m")
 
@@ -50,7 +51,8 @@ class Fixes:
     source: str
 
     def velocity(self) -> tuple[Array, Array, float]:
-        """Instants (K,), velocity north + i east (K,) in m/s, and half of the time it spans in s.
+        """Times (K,), velocity north + i east (K,) in m/s, and half of the time that each spans in
+        s.
 
         Central differences over two steps; none across a gap.
         """
@@ -66,11 +68,11 @@ class Fixes:
 class HeadingReference:
     """Headings to compare with.
 
-    name, detail: for titles; what else a reader must know
-    truth:        false where it is only another opinion, such as the device's own
-    time_s:       (M,) instants; each stands for the mean over time_s -+ half_width_s
-    heading_rad:  (M,) from any fixed direction, positive to the east
-    up_b:         (N, 3) the vertical in the sensor frame at the track's samples, or None
+    name, detail: for titles; further information for the reader
+    truth: false for another estimate, such as the device's own
+    time_s: (M,) instants; each represents the mean over time_s -+ half_width_s
+    heading_rad: (M,) from any fixed direction, positive to the east
+    up_b: (N, 3) the vertical in the sensor frame at the track's samples, or None
     """
 
     name: str
@@ -83,7 +85,9 @@ class HeadingReference:
 
 
 def fixes_from_degrees(time_s: Array, lat_deg: Array, lon_deg: Array, source: str) -> Fixes:
-    """Fixes of a receiver.  EvaluationError, naming `source`, where they cannot be that."""
+    """Fixes of a receiver. EvaluationError, naming `source`, if the arrays are not positions in
+    degrees.
+    """
     known = np.isfinite(time_s) & np.isfinite(lat_deg) & np.isfinite(lon_deg)
     time_s, lat_deg, lon_deg = time_s[known], lat_deg[known], lon_deg[known]
     if len(time_s) < _LEAST_FIXES:
@@ -102,7 +106,7 @@ def fixes_from_degrees(time_s: Array, lat_deg: Array, lon_deg: Array, source: st
 
 
 def fixes_of_track(track: EvaluationTrack) -> Fixes | None:
-    """Positions that the recording holds itself; None without."""
+    """Positions in the recording itself; None if there are none."""
     if not all(name in track.covariates for name in POSITION):
         return None
     north, east = (track.covariates[name] for name in POSITION)
@@ -117,8 +121,10 @@ def fixes_of_track(track: EvaluationTrack) -> Fixes | None:
     return Fixes(time_s[first], north, east, "position")
 
 
-def course(fixes: Fixes, least_speed_m_s: float) -> HeadingReference:
-    """Course over ground where it is faster than that.  EvaluationError where it hardly ever is."""
+def course_reference(fixes: Fixes, least_speed_m_s: float) -> HeadingReference:
+    """Course over ground at higher speeds than the least one. EvaluationError if there
+    are too few.
+    """
     time_s, velocity, half_width_s = fixes.velocity()
     fast = np.abs(velocity) > least_speed_m_s
     if np.count_nonzero(fast) < _LEAST_INSTANTS:
@@ -133,10 +139,10 @@ def course(fixes: Fixes, least_speed_m_s: float) -> HeadingReference:
     )
 
 
-def optical(track: EvaluationTrack) -> HeadingReference | None:
-    """The attitude columns ref_q*, sensor to world, scalar first; None without.
+def optical_reference(track: EvaluationTrack) -> HeadingReference | None:
+    """From the attitude columns ref_q*, sensor to world, scalar first; None without.
 
-    Which way is up in that world is measured: the mean specific force, or its z axis without one.
+    The vertical of that world is measured: the mean specific force, or its z axis if there is none.
     """
     if not all(name in track.covariates for name in QUATERNION):
         return None
@@ -152,8 +158,8 @@ def optical(track: EvaluationTrack) -> HeadingReference | None:
         if (size := float(np.linalg.norm(force_w))) > _LEAST_FORCE_M_S2:
             up_w = force_w / size
     x_w = R_wb[:, :, 0]
-    side = np.array([1.0, 0.0, 0.0]) if abs(up_w[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    ahead = side - up_w * (side @ up_w)
+    helper = np.array([1.0, 0.0, 0.0]) if abs(up_w[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    ahead = helper - up_w * (helper @ up_w)
     ahead /= np.linalg.norm(ahead)
     right = np.cross(-up_w, ahead)
     up_b = np.full((len(track), 3), np.nan)
@@ -163,18 +169,18 @@ def optical(track: EvaluationTrack) -> HeadingReference | None:
 
 
 def device_heading(track: EvaluationTrack) -> HeadingReference | None:
-    """The device's own yaw, which is no truth; None without."""
+    """The device's own yaw, which is not the truth; None without."""
     attitude = track.device_attitude()
     if attitude is None:
         return None
     known = np.isfinite(attitude[0])
     return HeadingReference(
-        "the device's yaw", False, track.time_s[known], attitude[0][known], detail=_OPINION
+        "the device's yaw", False, track.time_s[known], attitude[0][known], detail=_DEVICE_DETAIL
     )
 
 
-def column(track: EvaluationTrack, name: str) -> HeadingReference:
-    """A heading column in deg or rad, by its name's end.  EvaluationError where there is none."""
+def column_reference(track: EvaluationTrack, name: str) -> HeadingReference:
+    """A heading column in deg or rad, by its suffix. EvaluationError if there is none."""
     if name not in track.covariates:
         others = ", ".join(sorted(track.covariates)) or "none"
         raise EvaluationError(f"the recording has no column {name}; further columns: {others}")
@@ -185,7 +191,7 @@ def column(track: EvaluationTrack, name: str) -> HeadingReference:
     if np.count_nonzero(known) < _LEAST_INSTANTS:
         raise EvaluationError(f"column {name} holds {np.count_nonzero(known)} numbers only")
     device = name in ("vn_yaw_deg", "yaw_rad")
-    detail = _OPINION if device else ""
+    detail = _DEVICE_DETAIL if device else ""
     return HeadingReference(
         f"column {name}", not device, track.time_s[known], values[known], detail=detail
     )
@@ -195,9 +201,9 @@ def column(track: EvaluationTrack, name: str) -> HeadingReference:
 
 
 FOLDS = 5
-_LEVEL_ENOUGH = 0.3  # horizontal part of the x axis below which there is no heading
-_LEAST = 10
-_BLOCK_S, _LEAST_BLOCKS = 20.0, 5  # errors further apart are taken to be independent
+_LEVEL_ENOUGH = 0.3  # least horizontal part of the x axis for a heading
+_LEAST_OVERLAP = 10
+_BLOCK_S, _LEAST_BLOCKS = 20.0, 5  # errors in different blocks count as independent
 _DRAWS = 2000
 
 
@@ -205,7 +211,7 @@ _DRAWS = 2000
 class HeadingFigures:
     """Errors of one calibration at M instants.
 
-    offset_deg:  the constant that was removed: heading minus reference
+    offset_deg: the constant that was removed: heading minus reference
     fold_rms_deg: RMS in each fifth of the instants, in order of time
     fold_spread_deg: their standard deviation
     time_s, reference_deg, error_deg: (M,)
@@ -221,7 +227,7 @@ class HeadingFigures:
     error_deg: Array
 
 
-def compare(
+def heading_figures(
     time_s: Array,
     field_b: Array,
     up_b: Array,
@@ -230,7 +236,7 @@ def compare(
 ) -> HeadingFigures:
     """Errors of corrected fields (N, 3) at (N,) instants, levelled by up_b (N, 3).
 
-    Samples without a direction are left out. Raises EvaluationError where the reference and the
+    Samples without a direction are left out. Raises EvaluationError if the reference and the
     recording hardly overlap.
     """
     with np.errstate(invalid="ignore", divide="ignore"):  # what has no direction is left out
@@ -239,13 +245,13 @@ def compare(
         if reference.up_b is None:  # else the error is that of the field's azimuth, whatever x does
             level = np.linalg.norm(up_b[:, 1:], axis=1) / np.linalg.norm(up_b, axis=1)
             usable &= level > _LEVEL_ENOUGH
-    found, seen = _mean_at(time_s[usable], heading[usable], reference)
-    if np.count_nonzero(seen) < _LEAST:
+    headings, has_samples = _mean_heading_at(time_s[usable], heading[usable], reference)
+    if np.count_nonzero(has_samples) < _LEAST_OVERLAP:
         raise EvaluationError(
-            f"{reference.name}: {np.count_nonzero(seen)} instants within the recording, {_LEAST} "
-            "are needed; are both on the same clock?"
+            f"{reference.name}: {np.count_nonzero(has_samples)} instants within the recording, "
+            f"{_LEAST_OVERLAP} are needed; are both on the same clock?"
         )
-    raw = found[seen] - reference.heading_rad[seen]
+    raw = headings[has_samples] - reference.heading_rad[has_samples]
     offset = float(np.angle(np.mean(np.exp(1j * raw))))
     error_deg = np.degrees(wrapped(raw - offset))
     folds = tuple(_rms(part) for part in np.array_split(error_deg, FOLDS))
@@ -255,8 +261,8 @@ def compare(
         offset_deg=float(np.degrees(offset)),
         fold_rms_deg=folds,
         fold_spread_deg=float(np.std(folds)),
-        time_s=reference.time_s[seen],
-        reference_deg=np.mod(np.degrees(reference.heading_rad[seen]), 360.0),
+        time_s=reference.time_s[has_samples],
+        reference_deg=np.mod(np.degrees(reference.heading_rad[has_samples]), 360.0),
         error_deg=error_deg,
     )
 
@@ -264,9 +270,8 @@ def compare(
 def rms_difference(one: HeadingFigures, other: HeadingFigures) -> tuple[float, float] | None:
     """95 % interval of the RMS of one less that of the other, deg; at the same instants.
 
-    Their squares in stretches of 20 s are drawn again and again, both in the same ones: what the
-    recording's places and turns do to both is no difference. None where the instants are others
-    or cover too little.
+    A paired block bootstrap: blocks of 20 s are resampled, the same ones for both, so that effects
+    of places and turns common to both cancel. None if the instants differ or cover too little.
     """
     if not np.array_equal(one.time_s, other.time_s):
         return None
@@ -281,7 +286,7 @@ def rms_difference(one: HeadingFigures, other: HeadingFigures) -> tuple[float, f
     return float(low), float(high)
 
 
-def _mean_at(
+def _mean_heading_at(
     time_s: Array, heading_rad: Array, reference: HeadingReference
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Circular mean heading (M,) around each instant, and which of them have samples there."""
@@ -311,15 +316,15 @@ def _rms(values: Array) -> float:
 
 DOPPLER = ("velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s")
 SPEED = "speed_m_s"
-_LEAST_M = 20.0  # of way, below which a percentage says nothing
+_LEAST_M = 20.0  # least distance for a percentage
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReckoningFigures:
-    """XY position errors of one calibration over the distance travelled.
+    """Horizontal position errors of one calibration, relative to the distance travelled.
 
-    rms_percent, final_percent: of the distance; worst_m
-    north_m, east_m: (M,) the reckoned position at the fixes
+    rms_percent, final_percent: of the distance; worst_m. north_m, east_m: (M,) the reckoned
+    position at the fixes.
     """
 
     rms_percent: float
@@ -332,7 +337,7 @@ class ReckoningFigures:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Velocity:
-    """Where the velocity comes from: v_b (N, 3) in the sensor frame, or speed (N,) along x."""
+    """Velocity for dead reckoning: v_b (N, 3) in the sensor frame, or speed (N,) along x."""
 
     source: str
     v_b_m_s: Array | None
@@ -340,7 +345,7 @@ class Velocity:
 
 
 def velocity_of(track: EvaluationTrack, fixes: Fixes) -> Velocity:
-    """The best that the recording has."""
+    """The best velocity that the recording has."""
     if all(name in track.covariates for name in DOPPLER):
         v_b = np.column_stack([track.covariates[name] for name in DOPPLER])
         return Velocity("Doppler velocity (velocity_{x,y,z}_m_s)", np.nan_to_num(v_b), None)
@@ -351,8 +356,8 @@ def velocity_of(track: EvaluationTrack, fixes: Fixes) -> Velocity:
     return Velocity(f"speed of {fixes.source}", None, speed)
 
 
-def within(track: EvaluationTrack, fixes: Fixes) -> Fixes | None:
-    """The fixes during the recording, from the first one; None where they are too few."""
+def fixes_within(track: EvaluationTrack, fixes: Fixes) -> Fixes | None:
+    """The fixes during the recording, relative to the first of them; None if there are too few."""
     inside = (fixes.time_s >= track.time_s[0]) & (fixes.time_s <= track.time_s[-1])
     if np.count_nonzero(inside) < _LEAST_FIXES:
         return None
@@ -360,8 +365,8 @@ def within(track: EvaluationTrack, fixes: Fixes) -> Fixes | None:
     return Fixes(fixes.time_s[inside], north - north[0], east - east[0], fixes.source)
 
 
-def distance_m(track: EvaluationTrack, velocity: Velocity, fixes: Fixes) -> float | None:
-    """Way travelled between the first and the last fix; None where it is next to nothing."""
+def distance_travelled(track: EvaluationTrack, velocity: Velocity, fixes: Fixes) -> float | None:
+    """Distance between the first and the last fix, m; None if it is too short."""
     speed = velocity.speed_m_s
     if velocity.v_b_m_s is not None:
         speed = np.linalg.norm(velocity.v_b_m_s, axis=1)
@@ -371,7 +376,7 @@ def distance_m(track: EvaluationTrack, velocity: Velocity, fixes: Fixes) -> floa
     return way if way >= _LEAST_M else None
 
 
-def reckon(
+def reckoning_figures(
     track: EvaluationTrack,
     field_b: Array,
     up_b: Array,
@@ -379,29 +384,31 @@ def reckon(
     fixes: Fixes,
     way_m: float,
 ) -> ReckoningFigures:
-    """Figures of corrected fields (N, 3), with `fixes` of `within` and `way_m` of `distance_m`."""
+    """Figures of corrected fields (N, 3), with fixes of `fixes_within` and way_m of
+    `distance_travelled`.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):  # no heading, no way: looks up or down
         v = np.nan_to_num(_level_velocity(field_b, up_b, velocity))
     dt_s = np.diff(track.time_s)
     path = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * dt_s)])
-    found = np.interp(fixes.time_s, track.time_s, path)
-    found -= found[0]
+    position = np.interp(fixes.time_s, track.time_s, path)
+    position -= position[0]
     true = fixes.north_m + 1j * fixes.east_m
-    offset = np.angle(np.sum(np.diff(found) * np.conj(np.diff(true))))
-    found = found * np.exp(-1j * offset)
-    error = np.abs(found - true)
+    offset = np.angle(np.sum(np.diff(position) * np.conj(np.diff(true))))
+    position = position * np.exp(-1j * offset)
+    error = np.abs(position - true)
     return ReckoningFigures(
         rms_percent=100.0 * float(np.sqrt(np.mean(error**2))) / way_m,
         final_percent=100.0 * float(error[-1]) / way_m,
         worst_m=float(np.max(error)),
         offset_deg=float(np.degrees(offset)),
-        north_m=np.real(found),
-        east_m=np.imag(found),
+        north_m=np.real(position),
+        east_m=np.imag(position),
     )
 
 
 def _level_velocity(field_b: Array, up_b: Array, velocity: Velocity) -> Array:
-    """North + i east (N,) in m/s, of magnetic north."""
+    """North + i east (N,) in m/s, relative to magnetic north."""
     if velocity.v_b_m_s is None:
         assert velocity.speed_m_s is not None
         heading = tilt_compensated_heading(field_b, up_b)

@@ -1,6 +1,5 @@
-"""All figures of a calibration on a recording, before and after, and what may not be believed.
-
-Then the same as JSON and as lines for a person.
+"""All figures of a calibration on a recording, before and after, with warnings; as JSON and as
+lines of text.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ from ahrsd.evaluation.heading import (
     HeadingFigures,
     HeadingReference,
     ReckoningFigures,
-    compare,
-    distance_m,
-    reckon,
+    distance_travelled,
+    fixes_within,
+    heading_figures,
+    reckoning_figures,
     rms_difference,
     velocity_of,
-    within,
 )
 from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, Tilt, up_directions
 from ahrsd.printable import counted
@@ -34,10 +33,10 @@ from ahrsd.world_field import WorldField
 
 # -- Size of the field -----------------------------------------------------------------------------
 #
-# Size of the corrected field: its spread, and the error of the norm constraint.
+# Norm of the corrected field: its spread, and the error of the norm constraint.
 #
-# Spread is [R] 4.4, std |h| / mean |h|. [L]'s constraint is |h_k| = |H_k|; where the world's field
-# is not known the mean of |h| stands for |H|, and the error is then about that.
+# Spread is [R] 4.4, std |h| / mean |h|. The constraint of [L] is |h_k| = |H_k|. If the world's
+# field is not known, the mean of |h| replaces |H|, and the error is relative to that.
 
 
 # -- Figures ---------------------------------------------------------------------------------------
@@ -45,7 +44,7 @@ from ahrsd.world_field import WorldField
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldFigures:
-    """Of one calibration. constraint_*: of |h| - |H|, |H| the mean of |h| unless it was given."""
+    """Of one calibration. constraint_*: of |h| - |H|, where |H| is the mean of |h| unless given."""
 
     mean_gauss: float
     spread: float
@@ -107,7 +106,7 @@ class Reckoned:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """What a calibration is worth on a recording."""
+    """The figures of a calibration on a recording."""
 
     recording: str
     calibration: StoredCalibration
@@ -121,13 +120,13 @@ class Evaluation:
     @property
     def held_out(self) -> bool:
         """Whether the calibration was made from another recording, by its name."""
-        return _stem(self.recording) != _stem(self.calibration.recording)
+        return _recording_stem(self.recording) != _recording_stem(self.calibration.recording)
 
     @property
     def better(self) -> bool:
-        """Whether it is no worse than the device's present values, by the best witness there is.
+        """Whether it is no worse than the device's present values, by the best criterion available.
 
-        That is the first heading reference that is true, else the spread of the field.
+        That is the first heading reference that is true, otherwise the spread of the field.
         """
         for judged in self.headings:
             if judged.truth:
@@ -145,28 +144,32 @@ def judge(
     world: WorldField | None = None,
     tilt_source: Tilt = "auto",
 ) -> Evaluation:
-    """Judge `calibration` on a recording.
+    """Evaluate `calibration` on a recording.
 
-    references: in order of belief; one that the recording hardly overlaps ends in a warning.
-    Raises EvaluationError where a tilt was asked for that the recording does not have.
+    references: in order of reliability; one that the recording hardly overlaps gives a warning.
+    Raises EvaluationError if the recording does not have the requested tilt.
     """
-    said: list[str] = list(calibration.remarks)
+    warnings: list[str] = list(calibration.remarks)
     after_b = calibration.correction.apply(track.raw_b_gauss)
     fields = Pair(track.before_b_gauss, after_b)
     total = None if world is None else world.total_gauss
-    field = _both(fields, lambda b: field_figures(b, total))
-    up_b, up_source = _up(track, tilt_source, references, said)
+    field = _before_and_after(fields, lambda b: field_figures(b, total))
+    up_b, up_source = _choose_up(track, tilt_source, references, warnings)
     declination = 0.0 if world is None else world.declination_rad
     headings = []
     for reference in references:
         up = up_b if reference.up_b is None else reference.up_b
         if up is None:
             continue
-        look = partial(compare, track.time_s, up_b=up, reference=reference)
+        compare_with_reference = partial(
+            heading_figures, track.time_s, up_b=up, reference=reference
+        )
         try:
-            figures = _both(fields, partial(look, declination_rad=declination))
+            figures = _before_and_after(
+                fields, partial(compare_with_reference, declination_rad=declination)
+            )
         except EvaluationError as error:
-            said.append(str(error))
+            warnings.append(str(error))
             continue
         source = up_source if reference.up_b is None else "reference"
         headings.append(
@@ -174,22 +177,22 @@ def judge(
         )
     reckoned = None
     if fixes is not None and up_b is not None:
-        reckoned = _reckoned(track, fields, up_b, fixes, said)
+        reckoned = _dead_reckoning(track, fields, up_b, fixes, warnings)
     found = Evaluation(
-        recording, calibration, track, field, tuple(headings), reckoned, world, tuple(said)
+        recording, calibration, track, field, tuple(headings), reckoned, world, tuple(warnings)
     )
     return _with_caveats(found)
 
 
-def _both(fields: Pair[Array], figures: Callable[[Array], T]) -> Pair[T]:
+def _before_and_after(fields: Pair[Array], figures: Callable[[Array], T]) -> Pair[T]:
     return Pair(figures(fields.before), figures(fields.after))
 
 
-def _up(
+def _choose_up(
     track: EvaluationTrack,
     source: Tilt,
     references: Sequence[HeadingReference],
-    said: list[str],
+    warnings: list[str],
 ) -> tuple[Array | None, str]:
     try:
         up_b, found = up_directions(track, source)
@@ -197,57 +200,59 @@ def _up(
         if source != "auto":
             raise
         if any(reference.up_b is None for reference in references) or not references:
-            said.append(f"no heading of its own: {error}")
+            warnings.append(f"no heading of its own: {error}")
         return None, ""
     if found == "device" and source == "auto":
-        said.append("no acceleration in the recording: roll and pitch are the device's own")
+        warnings.append("no acceleration in the recording: roll and pitch are the device's own")
     return up_b, found
 
 
-def _reckoned(
-    track: EvaluationTrack, fields: Pair[Array], up_b: Array, fixes: Fixes, said: list[str]
+def _dead_reckoning(
+    track: EvaluationTrack, fields: Pair[Array], up_b: Array, fixes: Fixes, warnings: list[str]
 ) -> Reckoned | None:
-    inside = within(track, fixes)
+    inside = fixes_within(track, fixes)
     if inside is None:
-        said.append(f"{fixes.source}: too few fixes within the recording for dead reckoning")
+        warnings.append(f"{fixes.source}: too few fixes within the recording for dead reckoning")
         return None
     velocity = velocity_of(track, fixes)
-    way_m = distance_m(track, velocity, inside)
+    way_m = distance_travelled(track, velocity, inside)
     if way_m is None:
-        said.append("hardly any way was travelled: no dead reckoning")
+        warnings.append("hardly any way was travelled: no dead reckoning")
         return None
     gaps = track.time_s[list(track.starts[1:])] - track.time_s[[k - 1 for k in track.starts[1:]]]
     if np.any(gaps > _LONG_GAP_S):
-        said.append(
+        warnings.append(
             f"in the dead reckoning, as straight lines: "
             f"{counted(int(np.count_nonzero(gaps > _LONG_GAP_S)), 'gap')} of more than "
             f"{_LONG_GAP_S:g} s"
         )
-    figures = _both(fields, lambda b: reckon(track, b, up_b, velocity, inside, way_m))
+    figures = _before_and_after(
+        fields, lambda b: reckoning_figures(track, b, up_b, velocity, inside, way_m)
+    )
     return Reckoned(velocity.source, fixes.source, way_m, inside, figures)
 
 
 def _with_caveats(found: Evaluation) -> Evaluation:
-    said = list(found.warnings)
+    warnings = list(found.warnings)
     if not found.held_out:
-        said.append(
+        warnings.append(
             f"by its name the calibration was made from this very recording ({found.recording}): "
             "its figures are not held out and flatter it"
         )
     if found.world is None:
-        said.append(
+        warnings.append(
             "position and date are not both known (--position, --date): |H| is the mean of the "
             "corrected field, and the declination is part of the constant that is removed"
         )
     if not found.headings:
-        said.append("there is no heading to compare with: only the field is judged")
+        warnings.append("there is no heading to compare with: only the field is judged")
     elif not any(judged.truth for judged in found.headings):
-        said.append("the only heading to compare with is the device's own, which is no truth")
-    return replace(found, warnings=tuple(dict.fromkeys(said)))
+        warnings.append("the only heading to compare with is the device's own, which is no truth")
+    return replace(found, warnings=tuple(dict.fromkeys(warnings)))
 
 
-def _stem(name: str) -> str:
-    """A recording's name without what says how it is stored."""
+def _recording_stem(name: str) -> str:
+    """The name of a recording without the suffixes of its storage."""
     return name.split(".", 1)[0]
 
 
@@ -356,24 +361,24 @@ def evaluation_lines(found: Evaluation) -> list[str]:
         lines += [
             f"heading against {judged.reference}: {len(after.error_deg)} instants; "
             + "; ".join(text for text in (judged.detail, f"tilt: {judged.tilt}") if text),
-            _line("RMS error [deg]", before.rms_deg, after.rms_deg),
-            _line("worst error [deg]", before.worst_deg, after.worst_deg),
-            _line("RMS per fifth of the time: least [deg]", *_ends(before, after, min)),
-            _line("RMS per fifth of the time: most [deg]", *_ends(before, after, max)),
-            _line("constant removed [deg]", before.offset_deg, after.offset_deg),
+            _two_columns("RMS error [deg]", before.rms_deg, after.rms_deg),
+            _two_columns("worst error [deg]", before.worst_deg, after.worst_deg),
+            _two_columns("RMS per fifth of the time: least [deg]", *_ends(before, after, min)),
+            _two_columns("RMS per fifth of the time: most [deg]", *_ends(before, after, max)),
+            _two_columns("constant removed [deg]", before.offset_deg, after.offset_deg),
         ]
     about = "its own mean" if found.world is None else f"{found.world.model}"
     one, other = found.field.before, found.field.after
     lines += [
         "field, held out" if found.held_out else "field",
-        _line("spread, std over mean [%]", 100 * one.spread, 100 * other.spread),
-        _line("mean [mG]", 1e3 * one.mean_gauss, 1e3 * other.mean_gauss),
-        _line(
+        _two_columns("spread, std over mean [%]", 100 * one.spread, 100 * other.spread),
+        _two_columns("mean [mG]", 1e3 * one.mean_gauss, 1e3 * other.mean_gauss),
+        _two_columns(
             f"constraint error about {about}, RMS [mG]",
             1e3 * one.constraint_rms_gauss,
             1e3 * other.constraint_rms_gauss,
         ),
-        _line(
+        _two_columns(
             "constraint error, worst [mG]",
             1e3 * one.constraint_worst_gauss,
             1e3 * other.constraint_worst_gauss,
@@ -385,7 +390,9 @@ def evaluation_lines(found: Evaluation) -> list[str]:
 
 
 def comparison_lines(found: Sequence[Evaluation], without: Mapping[str, str]) -> list[str]:
-    """One row per calibration, least heading error first; without: method to why it has none."""
+    """One row per calibration, least heading error first; without: reason by method without an
+    answer.
+    """
     first = found[0]
     duration_s = first.track.time_s[-1] - first.track.time_s[0]
     lines = [f"{first.recording}: {counted(len(first.track), 'sample')}, {duration_s:.0f} s"]
@@ -399,12 +406,12 @@ def comparison_lines(found: Sequence[Evaluation], without: Mapping[str, str]) ->
     lines += [
         f"{'method':20}{'heading [deg]':>14}{'worst [deg]':>13}{'XY error [%]':>14}"
         f"{'spread [%]':>12}  heading RMS less that of {first.calibration.method}, 95 %",
-        _row("(before)", *_figures(first, "before")),
+        _row("(before)", *_comparison_figures(first, "before")),
     ]
-    by_heading = sorted(found, key=lambda one: _figures(one, "after")[0])
+    by_heading = sorted(found, key=lambda one: _comparison_figures(one, "after")[0])
     for one in by_heading if first.headings else found:
-        row = _row(one.calibration.method, *_figures(one, "after"))
-        apart = _apart(one, first)
+        row = _row(one.calibration.method, *_comparison_figures(one, "after"))
+        apart = _rms_interval(one, first)
         between = "" if apart is None else f"  {apart[0]:+.2f} to {apart[1]:+.2f}"
         lines.append(row + between + ("" if one.calibration.converged else "  not converged"))
     lines += [f"{name:20}no answer: {why}" for name, why in without.items()]
@@ -419,28 +426,28 @@ def comparison_json(found: Sequence[Evaluation], without: Mapping[str, str]) -> 
         "recording": found[0].recording,
         "evaluations": [evaluation_json(one) for one in found],
         "heading_rms_difference_deg": {
-            one.calibration.method: _apart(one, found[0]) for one in found[1:]
+            one.calibration.method: _rms_interval(one, found[0]) for one in found[1:]
         },
         "without": dict(without),
     }
 
 
-def _apart(one: Evaluation, first: Evaluation) -> tuple[float, float] | None:
-    """95 % interval of how much larger its heading RMS is than that of the first, deg."""
+def _rms_interval(one: Evaluation, first: Evaluation) -> tuple[float, float] | None:
+    """95 % interval of its heading RMS less that of the first, deg."""
     if one is first or not first.headings:
         return None
     return rms_difference(one.headings[0].figures.after, first.headings[0].figures.after)
 
 
-def _figures(found: Evaluation, which: Literal["before", "after"]) -> tuple[float, ...]:
-    """Heading RMS and worst (deg), dead reckoning (%), spread (%); NaN where there is none."""
+def _comparison_figures(found: Evaluation, which: Literal["before", "after"]) -> tuple[float, ...]:
+    """Heading RMS and worst (deg), dead reckoning (%), spread (%); NaN if there is none."""
     nan = float("nan")
     heading = getattr(found.headings[0].figures, which) if found.headings else None
-    reckoned = None if found.reckoned is None else getattr(found.reckoned.figures, which)
+    dead_reckoning = None if found.reckoned is None else getattr(found.reckoned.figures, which)
     return (
         nan if heading is None else heading.rms_deg,
         nan if heading is None else heading.worst_deg,
-        nan if reckoned is None else reckoned.rms_percent,
+        nan if dead_reckoning is None else dead_reckoning.rms_percent,
         100 * getattr(found.field, which).spread,
     )
 
@@ -456,9 +463,11 @@ def _reckoned_lines(reckoned: Reckoned) -> list[str]:
     return [
         f"dead reckoning by {reckoned.velocity} over {reckoned.distance_m:.0f} m, "
         f"against {reckoned.reference}",
-        _line("XY error, RMS [% of distance]", before.rms_percent, after.rms_percent),
-        _line("XY error at the end [% of distance]", before.final_percent, after.final_percent),
-        _line("XY error, worst [m]", before.worst_m, after.worst_m),
+        _two_columns("XY error, RMS [% of distance]", before.rms_percent, after.rms_percent),
+        _two_columns(
+            "XY error at the end [% of distance]", before.final_percent, after.final_percent
+        ),
+        _two_columns("XY error, worst [m]", before.worst_m, after.worst_m),
     ]
 
 
@@ -468,5 +477,5 @@ def _ends(
     return which(before.fold_rms_deg), which(after.fold_rms_deg)
 
 
-def _line(label: str, before: float, after: float) -> str:
+def _two_columns(label: str, before: float, after: float) -> str:
     return f"  {label:42}{before:10.2f}{after:10.2f}"

@@ -1,4 +1,4 @@
-"""A recording as arrays for judging: what the sensor read, what the device made of it, and up."""
+"""A recording as arrays for evaluation: readings, the device's own values, and the vertical."""
 
 from __future__ import annotations
 
@@ -20,21 +20,23 @@ _DEVICE = ("yaw", "pitch", "roll")
 
 
 class EvaluationError(AhrsdError):
-    """What cannot be judged: one line that says what is missing or wrong, and what to do."""
+    """An evaluation that is not possible: one line that says what is missing or wrong, and what to
+    do.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EvaluationTrack:
     """N samples.
 
-    time_s:         (N,) ascending
-    raw_b_gauss:    (N, 3) as the sensor read it, register 23 undone
-    before_b_gauss: (N, 3) with the device's present values; those are the identity where the
-                    registers are not known
-    gyro_b_rad_s:   (N, 3)
-    accel_b_m_s2:   (N, 3) specific force, nan where there is none
-    starts:         first row of each stretch without a gap, beginning with 0
-    covariates:     further columns, (N,) each
+    time_s: (N,) ascending
+    raw_b_gauss: (N, 3) as the sensor read it, without the correction of register 23
+    before_b_gauss: (N, 3) with the device's present values; the identity if the registers are not
+        known
+    gyro_b_rad_s: (N, 3)
+    accel_b_m_s2: (N, 3) specific force, nan if there is none
+    starts: first row of each piece without a gap, beginning with 0
+    covariates: further columns, (N,) each
     """
 
     time_s: Array
@@ -54,11 +56,11 @@ class EvaluationTrack:
         return bool(np.isfinite(self.accel_b_m_s2).all())
 
     def ends(self) -> tuple[int, ...]:
-        """The row behind the last one of each stretch."""
+        """One past the last row of each piece."""
         return (*self.starts[1:], len(self))
 
     def device_attitude(self) -> tuple[Array, Array, Array] | None:
-        """Yaw, pitch, roll (N,) in rad as the device says them; None without."""
+        """Yaw, pitch, roll (N,) in rad by the device; None without."""
         for suffix, scale in (("_deg", np.pi / 180.0), ("_rad", 1.0)):
             for prefix in ("vn_", ""):
                 names = [f"{prefix}{name}{suffix}" for name in _DEVICE]
@@ -68,8 +70,10 @@ class EvaluationTrack:
         return None
 
 
-def tracked(pieces: Sequence[tuple[SampleBlock, Affine]]) -> EvaluationTrack:
-    """Blocks in order, each with the correction of its time.  EvaluationError if too few."""
+def build_track(pieces: Sequence[tuple[SampleBlock, Affine]]) -> EvaluationTrack:
+    """Blocks in order, each with the correction of its time. EvaluationError if there are too few
+    samples.
+    """
     kept = [(block, present) for block, present in pieces if len(block)]
     blocks = [block for block, _ in kept]
     if (count := sum(map(len, blocks))) < MINIMUM_SAMPLES:
@@ -98,13 +102,12 @@ def tracked(pieces: Sequence[tuple[SampleBlock, Affine]]) -> EvaluationTrack:
 
 # -- Which way is up -------------------------------------------------------------------------------
 #
-# Which way is up, in the sensor frame, at every sample.
+# The vertical, in the sensor frame, at every sample.
 #
-# accelerometer: the specific force of the sample, as [R] 2.1; it leans with every acceleration.
-# gravity:       specific forces around the sample, turned into its frame by the gyro: their mean,
-#                weighted by exp(-|dt| / 10 s), before and after alike, so that a constant gyro bias
-#                cancels to first order.
-# device:        roll and pitch as the device says them.
+# accelerometer: the specific force of the sample, as [R] 2.1; any acceleration tilts it. gravity:
+# mean of the specific forces around the sample, rotated into its frame by the gyro and weighted by
+# exp(-|dt| / 10 s), symmetrically before and after, so that a constant gyro bias cancels to first
+# order. device: roll and pitch of the device.
 
 
 Tilt = Literal["auto", "gravity", "accelerometer", "device"]
@@ -112,20 +115,20 @@ _MEMORY_S = 10.0
 
 
 def up_directions(track: EvaluationTrack, tilt: Tilt) -> tuple[Array, str]:
-    """(N, 3) directions, of any length, and which were taken.
+    """(N, 3) vertical directions, of any length, and their source.
 
-    auto: gravity, else the device's. Raises EvaluationError where the recording does not have it.
+    auto: gravity, otherwise the device's. Raises EvaluationError if the recording does not have it.
     """
     if tilt == "auto":
         tilt = "gravity" if track.has_accel else "device"
     if tilt == "device":
-        return _of_device(track), tilt
+        return _device_up(track), tilt
     if not track.has_accel:
         raise EvaluationError(f"--tilt {tilt}: not every sample has an acceleration; try device")
-    return (_gravity(track) if tilt == "gravity" else track.accel_b_m_s2), tilt
+    return (_gravity_up(track) if tilt == "gravity" else track.accel_b_m_s2), tilt
 
 
-def _of_device(track: EvaluationTrack) -> Array:
+def _device_up(track: EvaluationTrack) -> Array:
     """Up is -z_n: its sensor components by pitch and roll (3-2-1)."""
     attitude = track.device_attitude()
     if attitude is None:
@@ -138,19 +141,21 @@ def _of_device(track: EvaluationTrack) -> Array:
     )
 
 
-def _gravity(track: EvaluationTrack) -> Array:
+def _gravity_up(track: EvaluationTrack) -> Array:
     out = np.empty((len(track), 3))
     for a, b in zip(track.starts, track.ends(), strict=True):
         dt_s = np.diff(track.time_s[a:b], prepend=track.time_s[a])
         R_0b = so3.products(so3.exp(track.gyro_b_rad_s[a:b] * dt_s[:, None]))
         force_0 = np.einsum("kij,kj->ki", R_0b, track.accel_b_m_s2[a:b])
         step_s = float(np.median(dt_s[1:])) if b - a > 1 else 1.0
-        out[a:b] = np.einsum("kji,kj->ki", R_0b, _both_ways(force_0, step_s / _MEMORY_S))
+        out[a:b] = np.einsum("kji,kj->ki", R_0b, _two_sided_mean(force_0, step_s / _MEMORY_S))
     return out
 
 
-def _both_ways(values: Array, share: float) -> Array:
-    """Exponential means (N, 3) from the past and from the future, added; each counts its own."""
+def _two_sided_mean(values: Array, share: float) -> Array:
+    """Exponential means (N, 3) over the past and the future, combined; the sample itself counts
+    once.
+    """
     keep = np.exp(-share)
     weight = lfilter([1.0], [1.0, -keep], np.ones(len(values)))
     past = lfilter([1.0], [1.0, -keep], values, axis=0)

@@ -22,19 +22,19 @@ from ahrsd.evaluation import (
     EvaluationTrack,
     HeadingReference,
     StoredCalibration,
+    build_track,
     judge,
     parse_calibration,
     parse_calibrations,
-    tracked,
 )
 from ahrsd.evaluation.heading import (
     Fixes,
-    column,
-    course,
+    column_reference,
+    course_reference,
     device_heading,
     fixes_from_degrees,
     fixes_of_track,
-    optical,
+    optical_reference,
 )
 from ahrsd.events import SamplesSeen
 from ahrsd.offline.replay import replay
@@ -125,13 +125,13 @@ def _references(
     said: list[str] = []
     found: list[HeadingReference] = []
     if heading_column is not None:
-        found.append(column(track, heading_column))
+        found.append(column_reference(track, heading_column))
     if fixes is not None:
         try:
-            found.append(course(fixes, least_speed_m_s))
+            found.append(course_reference(fixes, least_speed_m_s))
         except EvaluationError as error:
             said.append(str(error))
-    found += [one for one in (optical(track), device_heading(track)) if one is not None]
+    found += [one for one in (optical_reference(track), device_heading(track)) if one is not None]
     return found, said
 
 
@@ -146,7 +146,7 @@ def read_track(
     recording = open_recording(path, rate_hz, columns=columns or NO_MAP)
     if recording.table is not None:
         pieces = [(block, Affine.identity()) for block in recording.table.blocks()]
-        return tracked(pieces), list(recording.notes)
+        return build_track(pieces), list(recording.notes)
     seen: list[SamplesSeen] = []
     done = replay(
         path,
@@ -157,7 +157,7 @@ def read_track(
         listeners=[lambda event: seen.append(event) if isinstance(event, SamplesSeen) else None],
     )
     said = [*done.warnings, *done.core.stream.warnings]
-    return tracked([(event.block, event.present) for event in seen]), said
+    return build_track([(event.block, event.present) for event in seen]), said
 
 
 def read_calibrations(

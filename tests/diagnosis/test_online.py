@@ -15,7 +15,7 @@ from ahrsd.config.config import Config, core_settings
 from ahrsd.core.core import Core
 from ahrsd.core.estimation import Calibrator
 from ahrsd.core.settings import CalibratorSettings
-from ahrsd.estimator.epoch import GYRO_WAYS, TakenOut
+from ahrsd.estimator.epoch import GYRO_BASIS, InstrumentCorrection
 from ahrsd.estimator.step_detector import (
     KEPT,
     ReferenceCalibration,
@@ -23,7 +23,7 @@ from ahrsd.estimator.step_detector import (
     Step,
     StepDetector,
     Thinned,
-    carried,
+    accumulate_rotations,
 )
 from ahrsd.events import Judged, Noted
 from ahrsd.evidence.values import BasisFacts, HealthFacts
@@ -189,7 +189,7 @@ def turning(seed: int, wrong: Array) -> tuple[SampleBlock, Estimate, Estimate, E
     )
     # of bias and matrix only the sum at that rate is known
     own = np.r_[np.full(3, 0.02), np.full(6, 0.01)] ** 2
-    spread = np.vstack([np.zeros((9, 9)), (GYRO_WAYS @ mean).T, np.eye(9)])
+    spread = np.vstack([np.zeros((9, 9)), (GYRO_BASIS @ mean).T, np.eye(9)])
     covariance = spread @ np.diag(own) @ spread.T
     covariance[:12, :12] += known.covariance
     doubting = replace(perfect, gyro_covariance=covariance)
@@ -307,8 +307,8 @@ def test_nothing_is_said_before_there_is_a_converged_estimate_and_memory_is_boun
     watched(plain.blocks(64), estimate_of(plain), detector)
     assert detector.scored == 156
     assert len(detector._blocks) == KEPT
-    assert len(detector._single) < 2 * KEPT + 1
-    assert detector._intake._count < 128
+    assert len(detector._single_gains) < 2 * KEPT + 1
+    assert detector._builder._count < 128
 
 
 def test_a_block_says_what_the_model_says():
@@ -332,7 +332,7 @@ def test_a_block_says_what_the_model_says():
         soft_iron=A,
         hard_iron_gauss=off[6:9],
         gyro_bias_rad_s=off[9:12],
-        gyro_correction=TakenOut.nothing().with_gyro(off[12:]).gyro,
+        gyro_correction=InstrumentCorrection.identity().with_gyro(off[12:]).gyro,
     )
     found = scorer.score(rows, ReferenceCalibration.of(moved)).score[:21] - base.score[:21]
     expected = base.information[:21, :21] @ theta
@@ -342,7 +342,7 @@ def test_a_block_says_what_the_model_says():
 def test_rotations_are_carried_along():
     turns = np.linalg.qr(np.random.default_rng(0).standard_normal((37, 3, 3)))[0]
     expected = np.eye(3)
-    for turn, one in zip(turns, carried(turns), strict=True):
+    for turn, one in zip(turns, accumulate_rotations(turns), strict=True):
         expected = expected @ turn
         assert np.allclose(one, expected, atol=1e-12)
 
@@ -419,7 +419,7 @@ def gate_of(calibrator: Calibrator) -> bool:
 def test_a_step_shuts_the_gate_until_the_estimate_is_made_anew(monkeypatch):
     """An estimator that does not begin anew by itself, here kept from it: it is begun anew."""
     monkeypatch.setattr("ahrsd.core.estimation._PATIENCE_S", 20.0)
-    monkeypatch.setattr("ahrsd.estimator.online._CHANGED", 1_000)
+    monkeypatch.setattr("ahrsd.estimator.online._CHANGED_EPOCHS", 1_000)
     made = stepped(experiment("mam", samples=18000, rate_hz=40.0, seed=5), 300.0, 0.27 * MAGNET)
     config = Config()
     settings = CalibratorSettings(config.estimator.parameters(), config.gates.limits())

@@ -106,18 +106,18 @@ def case(request):
 def test_derivatives_of_the_residuals(case):
     data, u, x, bias = case
     rows = chain.Rows.of([chain.Chain(data, u, bias, NOISE)])
-    field, motion = chain.parts(rows, x)
+    field, motion = chain.field_and_motion(rows, x)
     n = len(u)
     J = np.zeros((5 * n - 2, 12 + 2 * n))
     r = np.concatenate([field.r.T.ravel(), motion.q[:, 1:].T.ravel()])
     for k in range(n):
         own = slice(12 + 2 * k, 14 + 2 * k)
         at = slice(3 * k, 3 * k + 3)
-        J[at, :9], J[at, own] = field.by_x[:, :, k], field.own[:, :, k]
+        J[at, :9], J[at, own] = field.by_x[:, :, k], field.by_direction[:, :, k]
     for k in range(1, n):
         at = slice(3 * n + 2 * k - 2, 3 * n + 2 * k)
         J[at, 9:12] = motion.by_bias[:, :, k]
-        J[at, 10 + 2 * k : 12 + 2 * k] = motion.prev[:, :, k]
+        J[at, 10 + 2 * k : 12 + 2 * k] = motion.by_previous[:, :, k]
         J[at, 12 + 2 * k : 14 + 2 * k] = -motion.scale[k] * np.eye(2)
     r_numeric, J_numeric = dense(data, u, x, bias)
     np.testing.assert_allclose(r, r_numeric, atol=1e-9)
@@ -141,7 +141,7 @@ def test_move_equals_dense_back_substitution(case):
     step = np.vstack([z[12:14], inner, z[14:16]])
     expected = u + np.einsum("nij,nj->ni", so3.tangent_basis(u), step)
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    np.testing.assert_allclose(chain.move(u, q, z), expected, atol=1e-8)
+    np.testing.assert_allclose(chain.move_directions(u, q, z), expected, atol=1e-8)
 
 
 def test_weights_scale_the_field_residuals():
@@ -170,7 +170,7 @@ def test_gauss_newton_finds_the_minimum():
     for _ in range(8):
         q = chain.linearise(data, u, x, bias, NOISE)
         z = -np.linalg.solve(q.H, q.g)
-        u, x, bias = chain.move(u, q, z), x + z[:9], bias + z[9:12]
+        u, x, bias = chain.move_directions(u, q, z), x + z[:9], bias + z[9:12]
     q = chain.linearise(data, u, x, bias, NOISE)
     covariance = np.linalg.inv(q.H)
     error = np.r_[x[6:] - [0.1, -0.2, 0.05], bias - [0.01, -0.02, 0.03]]
@@ -195,7 +195,9 @@ def test_several_epochs_at_once_are_each_as_by_itself():
         alone = chain.linearise(at.data, at.u, x, at.bias, at.noise, weights=at.weights)
         np.testing.assert_allclose(q.H, alone.H, rtol=1e-9, atol=1e-9 * np.abs(alone.H).max())
         np.testing.assert_allclose(q.g, alone.g, rtol=1e-9, atol=1e-9 * np.abs(alone.g).max())
-        np.testing.assert_allclose(chain.move(at.u, q, z), chain.move(at.u, alone, z), atol=1e-12)
+        np.testing.assert_allclose(
+            chain.move_directions(at.u, q, z), chain.move_directions(at.u, alone, z), atol=1e-12
+        )
         for name in ("cost", "sum_mag", "sum_gyro", "count_mag", "count_gyro"):
             assert getattr(q, name) == pytest.approx(getattr(alone, name), rel=1e-9)
 

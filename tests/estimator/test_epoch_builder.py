@@ -15,11 +15,11 @@ from ahrsd.estimator.epoch_data import (
     EpochBuilder,
     StepAverager,
     check_samples,
-    join,
-    joined,
+    join_epochs,
+    join_steps,
     samples_per_step,
-    split,
-    thinned,
+    split_steps,
+    thin_rows,
 )
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.samples import SampleBlock
@@ -80,16 +80,16 @@ def test_any_split_gives_the_same_steps(n, cuts):
     averager = StepAverager(n)
     edges = [0, *sorted(set(cuts)), 100]
     parts = [averager.add(samples[a:b]) for a, b in pairwise(edges)]
-    pieces = join([part for part in parts if len(part)])
+    pieces = join_steps([part for part in parts if len(part)])
     for name in ("time_s", "field_b_gauss", "angle_b_rad", "dt_s", "accel_b_m_s2"):
         np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
 
 
 def test_split_is_undone_by_join():
     steps = StepAverager(3).add(rows(99))
-    front, back = split(steps, 7)
+    front, back = split_steps(steps, 7)
     assert (len(front), len(back)) == (7, 26)
-    np.testing.assert_array_equal(join([front, back]).angle_b_rad, steps.angle_b_rad)
+    np.testing.assert_array_equal(join_steps([front, back]).angle_b_rad, steps.angle_b_rad)
 
 
 @settings(deadline=None)
@@ -176,14 +176,14 @@ def test_thinning_composes_rotations_and_keeps_fields():
     samples = rows(330)
     samples[:, 1] = 0.03
     data = gate.add(block(samples, gap=True))[0]
-    thin = thinned(data, 4)
+    thin = thin_rows(data, 4)
     np.testing.assert_array_equal(thin.field_b_gauss, data.field_b_gauss[::4][: len(thin)])
     np.testing.assert_allclose(thin.dt_s[1:], 0.12)
     total = np.eye(3)
     for k in range(5, 9):
         total = total @ so3.exp(data.angle_b_rad[k])
     np.testing.assert_allclose(so3.exp(thin.angle_b_rad[2]), total, atol=1e-13)
-    both = joined([thin, thin])
+    both = join_epochs([thin, thin])
     assert len(both) == 2 * len(thin)
     np.testing.assert_array_equal(np.flatnonzero(both.linked == 0), [0, len(thin)])
 

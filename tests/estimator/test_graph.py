@@ -20,11 +20,11 @@ from ahrsd.estimator.graph import (
     Stack,
     bias_prior,
     chain_step,
-    curvature,
+    curvature_covariance,
     epoch_factor,
     gap_factor,
     retract,
-    way,
+    valley_step,
 )
 
 SIGMA = np.r_[np.full(6, 0.3), np.full(3, 0.5)]
@@ -51,7 +51,7 @@ def dense(graph):
     """H and g of all factors and the anchor over [c, y_first ... y_last]."""
     first, size = graph.first, 9 + NODE * len(graph.nodes)
     H, g = np.zeros((size, size)), np.zeros(size)
-    own = zip(*Stack([graph.prior, *graph.factors], graph.c, graph.nodes).here(), strict=True)
+    own = zip(*Stack([graph.prior, *graph.factors], graph.c, graph.nodes).quadratics(), strict=True)
     for factor, (own_H, own_g) in zip((graph.prior, *graph.factors), own, strict=True):
         rows = np.r_[0:9, 9 + NODE * (factor.a - first) : 14 + NODE * (factor.a - first)]
         if factor.b != factor.a:
@@ -116,17 +116,17 @@ def test_chart_change_of_a_node():
     """z and its derivative are the old coordinates of the present direction and tangents."""
     u = np.array([0.6, 0.0, 0.8])
     old = Node.at(np.zeros(3), u)
-    new = old.retracted(np.array([0.1, 0.2, 0.3, 1e-3, -2e-3]))
+    new = old.moved_by(np.array([0.1, 0.2, 0.3, 1e-3, -2e-3]))
     weights = np.random.default_rng(0).normal(size=SIZE)
     factor = Factor(
         0, 1, np.zeros((SIZE, SIZE)), weights, LinearisationPoint(np.zeros(9), old, old)
     )
     stack = Stack([factor], np.ones(9), {0: new, 1: old})
-    z, g = stack.z[0], stack.here()[1][0]
+    z, g = stack.z[0], stack.quadratics()[1][0]
     np.testing.assert_allclose(z[:9], 1.0)
     np.testing.assert_allclose(z[9:14], [0.1, 0.2, 0.3, 1e-3, -2e-3], atol=1e-8)
     h = np.array([3e-7, -5e-7])
-    further = new.retracted(np.r_[np.zeros(3), h])
+    further = new.moved_by(np.r_[np.zeros(3), h])
     z2 = Stack([factor], np.ones(9), {0: further, 1: old}).z[0]
     assert weights @ (z2 - z) == pytest.approx(g[12:14] @ h, abs=1e-11)
     np.testing.assert_allclose(z[14:], 0.0)
@@ -138,13 +138,13 @@ def test_rise_integrates_the_gradient():
     a, b = graph.nodes[0], graph.nodes[1]
 
     def rise(c, a, b):
-        return Stack([factor], c, {0: a, 1: b}).rises()[0]
+        return Stack([factor], c, {0: a, 1: b}).cost_increases()[0]
 
     assert rise(graph.c, a, b) == pytest.approx(0.5e6 * np.sum((b.bias - a.bias) ** 2))
-    g = Stack([factor], graph.c, graph.nodes).here()[1][0]
+    g = Stack([factor], graph.c, graph.nodes).quadratics()[1][0]
     h = np.random.default_rng(1).normal(size=SIZE) * 1e-6
     sides = [
-        rise(graph.c + s * h[:9], a.retracted(s * h[9:14]), b.retracted(s * h[14:]))
+        rise(graph.c + s * h[:9], a.moved_by(s * h[9:14]), b.moved_by(s * h[14:]))
         for s in (1.0, -1.0)
     ]
     assert sides[0] - sides[1] == pytest.approx(2 * g @ h, rel=1e-5)
@@ -194,7 +194,7 @@ def test_a_gap_links_nothing_but_the_bias():
     node = Node.at(np.zeros(3), np.array([0.0, 0.6, 0.8]))
     other = Node.at(np.array([1e-3, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
     gap = gap_factor(0, np.zeros(9), node, other, 4.0)
-    (H,), (g,) = Stack([gap], np.zeros(9), {0: node, 1: other}).here()
+    (H,), (g,) = Stack([gap], np.zeros(9), {0: node, 1: other}).quadratics()
     expected = np.zeros((SIZE, SIZE))
     for k in range(3):
         expected[np.ix_([9 + k, 14 + k], [9 + k, 14 + k])] = [[4.0, -4.0], [-4.0, 4.0]]
@@ -207,7 +207,7 @@ def test_held_directions_stay_and_move_no_other():
     graph = random_graph(nodes=2, rank=10)  # 10 rows for c (9) and two nodes: c is half blind
     free_dc, _ = graph.step()
     covariance = graph.covariance()[:9, :9]
-    graph.hold_blind(0.5, covariance)
+    graph.hold_undetermined(0.5, covariance)
     dc, _ = graph.step()
     whitened = covariance / np.outer(SIGMA, SIGMA)
     values, vectors = np.linalg.eigh(whitened)
@@ -261,7 +261,7 @@ def test_weakly_known_directions_are_not_called_singular(strong):
 
 def test_node_moves_on_the_sphere():
     node = Node.at(np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    moved = node.retracted(np.r_[1.0, 2.0, 3.0, 0.75, 0.0])
+    moved = node.moved_by(np.r_[1.0, 2.0, 3.0, 0.75, 0.0])
     assert np.linalg.norm(moved.direction) == pytest.approx(1.0)
     np.testing.assert_allclose(moved.bias, [1.0, 2.0, 3.0])
     assert node.direction @ moved.direction == pytest.approx(0.8)
@@ -290,7 +290,7 @@ def planar(height, count=40):
     level = np.sqrt(1 - height**2)
     u = np.column_stack([level * np.cos(angle), level * np.sin(angle), np.full(count, height)])
     moments = Moments()
-    moments.take(u @ M + B)
+    moments.add(u @ M + B)
     return u, moments
 
 
@@ -338,7 +338,7 @@ def test_curvature_is_what_the_straight_covariance_misses():
     t = np.random.default_rng(0).normal(size=4000)
     beside = np.array([retract(C9, k * step, moments) - C9 - k * step for k in t])
     expected = beside.T @ beside / len(t)
-    added = curvature(C9, np.outer(step, step) + 1e-16 * np.eye(9), moments)
+    added = curvature_covariance(C9, np.outer(step, step) + 1e-16 * np.eye(9), moments)
     assert np.trace(expected) > 0
     np.testing.assert_allclose(added, expected, atol=0.12 * np.abs(expected).max())
 
@@ -350,7 +350,7 @@ def test_the_way_to_a_calibration_is_the_step_that_leads_there(height):
     for size in (1e-3, 0.05, 0.15):
         dc = size * rng.normal(size=9)
         there = retract(C9, dc, moments)
-        assert np.allclose(way(C9, there, moments), dc, atol=1e-10)
+        assert np.allclose(valley_step(C9, there, moments), dc, atol=1e-10)
 
 
 def test_calibrations_along_the_valley_are_as_near_as_the_data_say():
@@ -359,7 +359,7 @@ def test_calibrations_along_the_valley_are_as_near_as_the_data_say():
     dc = np.r_[chain.upper_triangle(0.3 * 0.9 * M), -0.9 * M[:, 2]]
     there = retract(C9, dc, moments)
     columns = np.concatenate([chain.symmetric_columns(u), np.tile(np.eye(3), (len(u), 1, 1))], 2)
-    along = np.linalg.norm(columns @ way(C9, there, moments) - columns @ dc)
+    along = np.linalg.norm(columns @ valley_step(C9, there, moments) - columns @ dc)
     straight = np.linalg.norm(columns @ (there - C9) - columns @ dc)
     assert along < 1e-9
     assert straight > 0.1
@@ -368,4 +368,4 @@ def test_calibrations_along_the_valley_are_as_near_as_the_data_say():
 def test_no_way_leads_to_the_other_side():
     _, moments = planar(0.3)
     beyond = np.r_[-C9[:6], C9[6:]]
-    np.testing.assert_array_equal(way(C9, beyond, moments), beyond - C9)
+    np.testing.assert_array_equal(valley_step(C9, beyond, moments), beyond - C9)

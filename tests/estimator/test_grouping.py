@@ -7,7 +7,7 @@ import pytest
 
 from ahrsd import so3
 from ahrsd.estimator import chain
-from ahrsd.estimator.epoch_data import group_size, grouped
+from ahrsd.estimator.epoch_data import group_size, group_steps
 from ahrsd.estimator.noise import DirectionCells, variance_inflation
 
 M = np.array([[0.55, 0.03, -0.02], [0.03, 0.45, 0.01], [-0.02, 0.01, 0.5]])
@@ -43,7 +43,7 @@ def epoch(n=60, *, cut=None, noise=0.0, speed=0.03):
 def test_without_noise_nothing_is_left_over(cut, size):
     """The true directions at the groups' middles explain mean field and turns exactly."""
     data, u = epoch(cut=cut)
-    small = grouped([data], [size])[0]
+    small = group_steps([data], [size])[0]
     rows = np.searchsorted(data.time_s, small.time_s)
     assert (rows[0], rows[-1]) == (0, len(data) - 1)
     assert small.steps == len(data)
@@ -57,7 +57,7 @@ def test_without_noise_nothing_is_left_over(cut, size):
 def test_derivatives_of_a_group():
     """Gradient of the cost at fixed directions, against differences, and that H is its slope."""
     data, u = epoch(noise=2e-3)
-    small = grouped([data], [5])[0]
+    small = group_steps([data], [5])[0]
     rows = np.searchsorted(data.time_s, small.time_s)
     q = chain.linearise(small, u[rows], X, np.zeros(3), NOISE)
     step = np.random.default_rng(1).normal(size=12) * 1e-5
@@ -72,7 +72,7 @@ def test_derivatives_of_a_group():
 
 def test_the_information_of_a_group_is_that_of_its_steps():
     data, u = epoch(n=500)
-    small = grouped([data], [5])[0]
+    small = group_steps([data], [5])[0]
     rows = np.searchsorted(data.time_s, small.time_s)
     quiet = chain.Noise(2e-3, 2e-3)
     found = []
@@ -111,10 +111,10 @@ def test_what_repeats_with_the_attitude_counts_once_per_cell():
 
 def test_several_epochs_at_once_are_grouped_as_each_by_itself():
     epochs = [epoch(n=n, cut=cut, noise=2e-3)[0] for n, cut in ((60, 23), (3, None), (41, None))]
-    for few, data in zip(grouped(epochs, [5, 3, 7]), epochs, strict=True):
-        alone = grouped([data], [5 if len(data) == 60 else 7])[0]
+    for few, data in zip(group_steps(epochs, [5, 3, 7]), epochs, strict=True):
+        alone = group_steps([data], [5 if len(data) == 60 else 7])[0]
         assert len(few) == len(alone) <= len(data)
         for name in ("field_b_gauss", "angle_b_rad", "dt_s", "time_s"):
             np.testing.assert_allclose(getattr(few, name), getattr(alone, name), atol=1e-15)
         assert (few.linked is None) == (alone.linked is None)
-    assert grouped(epochs, [1, 1, 1]) == epochs
+    assert group_steps(epochs, [1, 1, 1]) == epochs

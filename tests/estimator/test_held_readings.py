@@ -79,7 +79,7 @@ def test_a_stuck_reading_is_not_waited_for():
 
 def test_rotations_are_composed_and_time_adds_up():
     rows = recorded(100.0, 10, seconds=10.0, noise=(1e-3, 0.0))
-    thin = HeldReadings(10).thin(rows)
+    thin = HeldReadings(10).merge_rows(rows)
     assert len(thin) == 99
     assert np.isnan(thin[0, 1])
     np.testing.assert_allclose(thin[1:, 1], 0.1)
@@ -92,17 +92,17 @@ def test_rotations_are_composed_and_time_adds_up():
 
 def test_any_split_gives_the_same_rows():
     rows = recorded(100.0, 10, seconds=30.0)
-    whole = HeldReadings(10).thin(rows)
+    whole = HeldReadings(10).merge_rows(rows)
     for size in (1, 7, 10, 333):
         one = HeldReadings(10)
-        parts = [one.thin(rows[k : k + size]) for k in range(0, len(rows), size)]
+        parts = [one.merge_rows(rows[k : k + size]) for k in range(0, len(rows), size)]
         np.testing.assert_array_equal(np.vstack(parts), whole)
 
 
 def test_a_reading_that_stays_for_long_counts_again():
     rows = recorded(100.0, 10, seconds=30.0)
     rows[1000:2000, 2:5] = rows[1000, 2:5]
-    thin = HeldReadings(10).thin(rows)
+    thin = HeldReadings(10).merge_rows(rows)
     assert np.max(thin[1:, 1]) == pytest.approx(0.5)
 
 

@@ -15,20 +15,20 @@ from scipy.signal import lfilter
 
 from ahrsd import so3
 from ahrsd.diagnosis.priors import ORDINARY
-from ahrsd.estimator.epoch import with_drift
+from ahrsd.estimator.epoch import add_bias_drift
 from ahrsd.estimator.online import (
     WHOLE,
     Estimator,
     HeadingAdvice,
+    misalignment_heading_deg,
     motion_and_misfit,
-    turned_heading_deg,
 )
 from ahrsd.estimator.parameters import (
     AS_SPECIFIED,
     ASSEMBLED,
     PLACES,
     EstimatorParameters,
-    instruments,
+    possible_instruments,
 )
 from ahrsd.montecarlo import nuisances
 from ahrsd.montecarlo.cramer_rao import Trajectory
@@ -121,7 +121,7 @@ def test_wrong_scales_that_the_motion_hardly_tells(motion):
 
 def test_a_gyro_that_nothing_is_known_of_is_of_the_worst_kind():
     """Sigmas of scale and angle of each gyro that may be, and how likely it is before the data."""
-    gyros, places = instruments((AS_SPECIFIED, ASSEMBLED), PLACES), 4
+    gyros, places = possible_instruments((AS_SPECIFIED, ASSEMBLED), PLACES), 4
     shares = np.exp(gyros.log_prior) / np.sum(np.exp(gyros.log_prior))
     found = {}
     for sigmas, share in zip(gyros.sigmas, shares, strict=True):
@@ -134,7 +134,7 @@ def test_a_gyro_that_nothing_is_known_of_is_of_the_worst_kind():
         (0.01, 3e-4): pytest.approx(1 / 42),
         (0.01, 0.01): pytest.approx(40 / 42),
     }
-    alone = instruments((ASSEMBLED,), (1e-3,))
+    alone = possible_instruments((ASSEMBLED,), (1e-3,))
     assert alone.sigmas[:, 4].tolist() == [0.01]
 
 
@@ -226,9 +226,9 @@ def test_axes_that_are_turned_count_as_what_they_make_of_the_heading():
 
 def test_a_turn_about_down_is_an_error_of_the_heading():
     down = np.array([[0.0, 0.0, 1.0]])
-    about_down = turned_heading_deg(np.radians([0.0, 0.0, 1.0]), down, np.radians(60.0))
+    about_down = misalignment_heading_deg(np.radians([0.0, 0.0, 1.0]), down, np.radians(60.0))
     assert about_down == pytest.approx(1.0)
-    across = turned_heading_deg(np.radians([1.0, 0.0, 0.0]), down, np.radians(60.0))
+    across = misalignment_heading_deg(np.radians([1.0, 0.0, 0.0]), down, np.radians(60.0))
     assert across == pytest.approx(np.tan(np.radians(60.0)), rel=0.01)  # of the steep field
 
 
@@ -303,7 +303,7 @@ def test_the_manoeuvre_that_is_asked_for_tells_what_is_not_known(unknown, asked)
     down = np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 0.87], [0.5, 0.0, 0.87]])
     advice = HeadingAdvice(c, down, np.radians(60.0), 1e-3)
     covariance = 1e-8 * np.eye(12) + 0.1**2 * np.outer(unknown, unknown)
-    assert asked in advice.manoeuvre(covariance)
+    assert asked in advice.best_manoeuvre(covariance)
 
 
 @pytest.mark.parametrize(
@@ -339,7 +339,7 @@ def test_a_drift_is_told_from_the_epochs_times():
     for k, at in enumerate([-1.0, -0.6, 0.0]):
         H[k, 9:12, 9:12] = np.eye(3)
         g[k, 9:12] = -at * wanted
-    both, gradient = with_drift((H, g), times_s)
+    both, gradient = add_bias_drift((H, g), times_s)
     found = -np.linalg.pinv(both.sum(axis=0)) @ gradient.sum(axis=0)
     assert np.allclose(found[9:12], 0.0)
     assert np.allclose(found[22:], wanted)

@@ -13,7 +13,7 @@ from ahrsd import so3
 from ahrsd.calibration_json import why_not_converged
 from ahrsd.config.config import Config
 from ahrsd.estimator import chain
-from ahrsd.estimator.epoch_data import delayed, rates
+from ahrsd.estimator.epoch_data import row_rates, with_lag
 from ahrsd.estimator.online import Estimator
 from ahrsd.montecarlo.accuracy import nees
 from ahrsd.offline.calibrate import calibrate
@@ -97,11 +97,11 @@ def test_delay_turns_what_the_field_is_the_image_of():
     data = chain.EpochData(
         np.ones((5, 3)), rate * dt[:, None], dt, np.ones((5, 3)), np.cumsum(dt), measures_first=True
     )
-    np.testing.assert_allclose(rates(data), np.tile(rate, (5, 1)))
-    seen = delayed(data, 0.1).seen(np.tile([1.0, 0.0, 0.0], (5, 1)))
+    np.testing.assert_allclose(row_rates(data), np.tile(rate, (5, 1)))
+    seen = with_lag(data, 0.1).field_directions(np.tile([1.0, 0.0, 0.0], (5, 1)))
     # u turns against the sensor, so 0.1 s before it was 0.2 rad ahead
     np.testing.assert_allclose(seen, np.tile([np.cos(0.2), np.sin(0.2), 0.0], (5, 1)))
-    back = delayed(delayed(data, 0.1), -0.1).seen(np.tile([1.0, 0.0, 0.0], (5, 1)))
+    back = with_lag(with_lag(data, 0.1), -0.1).field_directions(np.tile([1.0, 0.0, 0.0], (5, 1)))
     np.testing.assert_allclose(back, np.tile([1.0, 0.0, 0.0], (5, 1)), atol=1e-15)
 
 
@@ -111,7 +111,7 @@ def test_a_rate_across_a_cut_is_that_of_the_side_that_is_linked():
         np.ones((4, 3)), angle, np.full(4, 0.1), np.ones((4, 3)), np.arange(4.0),
         measures_first=True, linked=np.array([0.0, 1.0, 0.0, 1.0]),
     )  # fmt: skip
-    np.testing.assert_allclose(rates(data)[:, 0], [1.0, 1.0, 3.0, 3.0])
+    np.testing.assert_allclose(row_rates(data)[:, 0], [1.0, 1.0, 3.0, 3.0])
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from ahrsd.estimator import locked
-from ahrsd.estimator.model_checks import LeftOver, widened
+from ahrsd.estimator.model_checks import ResidualComponent, widen_covariance
 from ahrsd.estimator.online import WHOLE, Estimator
 
 RICH = (("circles", 40.0), ("roll", 30.0), ("pitch", 30.0), ("circles", 40.0), ("roll", 30.0))
@@ -42,7 +42,7 @@ def by_rate(made, seed, size_gauss):
 
 def by_time(made, seed, size_gauss):
     """A hard iron that goes away and comes back, once and a half, `size_gauss` in all."""
-    course = locked.courses(made.block.time_s, 3)[:, 2:]
+    course = locked.cosine_modes(made.block.time_s, 3)[:, 2:]
     way = np.random.default_rng(seed).normal(size=3)
     return size_gauss * np.sqrt(3.0) * course * way / np.linalg.norm(way)
 
@@ -131,10 +131,10 @@ def test_an_answer_is_no_less_wide_than_what_is_left_makes_it():
     """By hand: what misfit makes already counts, and what is more is added."""
     plain, tempered = np.eye(12), 3.0 * np.eye(12)
     added = np.diag([*[1.0] * 6, *[7.0] * 6])
-    left = LeftOver("attitude", 20.0, 1e-3, added)
-    wider = widened(tempered, plain, left)
+    left = ResidualComponent("attitude", 20.0, 1e-3, added)
+    wider = widen_covariance(tempered, plain, left)
     np.testing.assert_allclose(wider, np.diag([*[3.0] * 6, *[8.0] * 6]), atol=1e-12)
-    assert widened(tempered, plain, None) is tempered
+    assert widen_covariance(tempered, plain, None) is tempered
     assert left.words == (
         "what is left follows the attitude: 1 mG; run `ahrsd diagnose` on the recording"
     )
@@ -143,7 +143,7 @@ def test_an_answer_is_no_less_wide_than_what_is_left_makes_it():
 
 def test_columns_by_hand():
     change = np.array([[0.1, -0.2, 0.3]])
-    by_change = locked.of_change(change)[0]
+    by_change = locked.change_columns(change)[0]
     np.testing.assert_allclose(by_change[:, 0], [0.1, 0.0, -0.3])  # xx - zz
     np.testing.assert_allclose(by_change[:, 2], [-0.2, 0.1, 0.0])  # xy
     turn = np.array([1.0, 2.0, 3.0])
@@ -151,6 +151,6 @@ def test_columns_by_hand():
     np.testing.assert_allclose(by_change[:, 5:] @ turn, turned, atol=1e-12)
     each = locked.on_each_axis(np.array([[2.0, 5.0]]))[0]
     np.testing.assert_allclose(each, [[2, 0, 0, 5, 0, 0], [0, 2, 0, 0, 5, 0], [0, 0, 2, 0, 0, 5]])
-    cosines = locked.courses(np.linspace(3.0, 9.0, 2001), 3)
+    cosines = locked.cosine_modes(np.linspace(3.0, 9.0, 2001), 3)
     np.testing.assert_allclose(cosines.T @ cosines / 2001, np.eye(3), atol=2e-3)
     np.testing.assert_allclose(cosines[0], np.sqrt(2.0))

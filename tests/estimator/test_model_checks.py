@@ -13,7 +13,7 @@ import pytest
 from ahrsd import so3
 from ahrsd.calibration_json import why_not_converged
 from ahrsd.config.config import Config
-from ahrsd.estimator.model_checks import divided
+from ahrsd.estimator.model_checks import find_iron_change
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.recording.table import read_table
@@ -132,9 +132,9 @@ def test_two_parts_that_differ_amid_other_trouble_make_the_answer_as_uncertain(s
     H = np.tile(np.eye(17), (24, 1, 1))
     away = 7.0 * rng.standard_normal((24, 17))
     away[12:, 6:9] += step_sigma / np.sqrt(3)
-    found = divided((H, -away), graph, 1.0, 1e3)
+    found = find_iron_change((H, -away), graph, 1.0, 1e3)
     assert found.first is None
-    assert found.parted == pytest.approx(parted, rel=0.1)
+    assert found.variance_factor == pytest.approx(parted, rel=0.1)
 
 
 def misalignment_of(bench, run):

@@ -40,9 +40,9 @@ def residuals_at(data, used):
         q = chain.linearise(data, u, x, np.zeros(3), used)
         z = np.zeros(16)
         z[12:] = -np.linalg.solve(q.H[12:, 12:], q.g[12:])
-        u = chain.move(u, q, z)
+        u = chain.move_directions(u, q, z)
     q = chain.linearise(data, u, x, np.zeros(3), used)
-    return noise.residuals(q, data, used, noise.Typical.of(data))
+    return noise.residual_sums(q, data, used, noise.Typical.of(data))
 
 
 @pytest.mark.parametrize(
@@ -54,14 +54,14 @@ def test_both_sigmas_are_recovered_from_any_start(wrong):
     used = chain.Noise(TRUE.mag_gauss * wrong[0], TRUE.gyro_rad_s * wrong[1])
     for _ in range(12):
         found = [residuals_at(d, used) for d in data]
-        used = noise.pooled(found, chain.Noise(1.0, 1.0), EstimatorParameters())
+        used = noise.pool_noise(found, chain.Noise(1.0, 1.0), EstimatorParameters())
     assert used.mag_gauss == pytest.approx(TRUE.mag_gauss, rel=0.03)
     assert used.gyro_rad_s == pytest.approx(TRUE.gyro_rad_s, rel=0.03)
 
 
 def test_first_guess_of_white_noise_on_a_smooth_motion():
     guesses = [noise.first_guess(d, EstimatorParameters()) for d in epochs(10)]
-    middle = noise.median(guesses)
+    middle = noise.median_noise(guesses)
     assert middle.mag_gauss == pytest.approx(TRUE.mag_gauss, rel=0.05)
     assert middle.gyro_rad_s == pytest.approx(TRUE.gyro_rad_s, rel=0.05)
 
@@ -70,13 +70,13 @@ def test_differences_ignore_a_ramp_and_outliers():
     rng = np.random.default_rng(0)
     values = rng.normal(size=(4000, 3)) * 0.2 + np.arange(4000)[:, None] * 5.0
     values[::100] += 1e3
-    assert noise.from_differences(values) == pytest.approx(0.2, rel=0.06)
+    assert noise.noise_of_differences(values) == pytest.approx(0.2, rel=0.06)
 
 
 def test_pooling_leaves_out_disturbed_epochs():
     quiet = [noise.Residuals(1e-6 * 1000, 1000.0, 25e-6 * 50, 50.0)] * 9
     loud = noise.Residuals(1e-2 * 1000, 1000.0, 25e-6 * 50, 50.0)
-    found = noise.pooled([*quiet, loud], chain.Noise(1.0, 1.0), EstimatorParameters())
+    found = noise.pool_noise([*quiet, loud], chain.Noise(1.0, 1.0), EstimatorParameters())
     assert found.mag_gauss == pytest.approx(1e-3)
     assert found.gyro_rad_s == pytest.approx(5e-3)
 
@@ -84,20 +84,20 @@ def test_pooling_leaves_out_disturbed_epochs():
 def test_gyro_noise_is_held_near_its_first_guess():
     found = [noise.Residuals(1e-3, 1000.0, 1.0, 50.0)]
     guess = chain.Noise(1e-3, 4e-3)
-    assert noise.pooled(found, guess, EstimatorParameters()).gyro_rad_s == pytest.approx(6e-3)
+    assert noise.pool_noise(found, guess, EstimatorParameters()).gyro_rad_s == pytest.approx(6e-3)
 
 
 def test_a_disturbed_epoch_loses_weight_by_itself():
     usual = chain.Noise(1e-3, 5e-3)
     loud = noise.Residuals(1e-4 * 1500, 1500.0, 25e-6 * 40, 40.0)
-    own = noise.shrunk(loud, usual, EstimatorParameters())
+    own = noise.shrink_noise(loud, usual, EstimatorParameters())
     assert own.mag_gauss == pytest.approx(np.sqrt((0.15 + 1e-4) / 1600))
     assert own.gyro_rad_s == pytest.approx(5e-3)
 
 
 def test_noise_is_never_believed_below_its_floor():
     still = noise.Residuals(0.0, 1500.0, 0.0, 40.0)
-    found = noise.pooled([still], chain.Noise(1e-3, 1e-3), EstimatorParameters())
+    found = noise.pool_noise([still], chain.Noise(1e-3, 1e-3), EstimatorParameters())
     assert found == chain.Noise(1e-5, 1e-6)
 
 

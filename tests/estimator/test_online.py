@@ -499,12 +499,12 @@ def test_names_of_what_is_not_seen_do_not_hang_on_the_basis():
     """Equal eigenvalues leave the basis open: another processor has another one."""
     rng = np.random.default_rng(5)
     V = np.linalg.qr(rng.normal(size=(12, 9)))[0]
-    names = online.blind_names(V)
+    names = online.undetermined_names(V)
     assert len(names) == len(set(names)) == 9
     for _ in range(20):
         R = np.linalg.qr(rng.normal(size=(9, 9)))[0]
-        assert online.blind_names(V @ R) == names
+        assert online.undetermined_names(V @ R) == names
     axes = np.eye(12)[:, [5, 8, 11]]
     R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    assert online.blind_names(axes @ R) == ("soft iron zz", "hard iron z", "gyro bias z")
-    assert online.blind_names(axes[:, :0]) == ()
+    assert online.undetermined_names(axes @ R) == ("soft iron zz", "hard iron z", "gyro bias z")
+    assert online.undetermined_names(axes[:, :0]) == ()

@@ -18,7 +18,7 @@ import pytest
 from ahrsd.estimator.graph import Moments
 from ahrsd.estimator.online import Estimator
 from ahrsd.estimator.parameters import ASSEMBLED, EstimatorParameters
-from ahrsd.estimator.window import bends
+from ahrsd.estimator.window import path_curvatures
 from ahrsd.samples import SampleBlock
 
 REGIMES = {
@@ -200,8 +200,8 @@ def test_no_way_is_straight_where_the_matrix_would_not_stay_positive():
     there = at.copy()
     there[5] += 0.2  # C zz would fall from 33 by more than that
     factor = SimpleNamespace(point=SimpleNamespace(c=at))
-    epoch, resting = (SimpleNamespace(turned=t, factor=factor) for t in (True, False))
-    found = bends([epoch, resting], there, Moments(), np.eye(9))
+    epoch, resting = (SimpleNamespace(has_motion=t, factor=factor) for t in (True, False))
+    found = path_curvatures([epoch, resting], there, Moments(), np.eye(9))
     assert np.isinf(found[0])
     assert found[1] == 0.0
 

@@ -9,7 +9,7 @@ import pytest
 
 from ahrsd import so3
 from ahrsd.estimator import chain
-from ahrsd.estimator.epoch_data import turned
+from ahrsd.estimator.epoch_data import has_motion
 
 M = np.array([[0.55, 0.03, -0.02], [0.03, 0.45, 0.01], [-0.02, 0.01, 0.5]])
 B = np.array([0.1, -0.2, 0.05])
@@ -74,13 +74,13 @@ def test_sphere_start_refuses_a_plane():
 
 @pytest.mark.parametrize(("amplitude", "expected"), [(0.0, False), (0.02, True), (0.5, True)])
 def test_turned_wants_a_rotation(amplitude, expected):
-    assert turned(epoch(amplitude, 1e-3, n=512), np.zeros(3)) is expected
+    assert has_motion(epoch(amplitude, 1e-3, n=512), np.zeros(3)) is expected
 
 
 def test_a_field_that_wanders_while_the_gyro_rests_is_no_turn():
     data = epoch(0.0, 1e-3, n=512)
     data.field_b_gauss[:, 2] += np.linspace(0, 0.05, 512)
-    assert not turned(data, np.zeros(3))
+    assert not has_motion(data, np.zeros(3))
 
 
 def test_a_magnet_that_comes_while_the_gyro_rests_is_no_turn_and_a_steady_turn_is_one():
@@ -89,15 +89,15 @@ def test_a_magnet_that_comes_while_the_gyro_rests_is_no_turn_and_a_steady_turn_i
     data.angle_b_rad[:] += bias * data.dt_s[:, None]
     away = np.exp(-0.5 * ((np.arange(512) - 256) / 80.0) ** 2)
     data.field_b_gauss[:] += 0.3 * away[:, None] * np.array([0.6, -0.5, 0.6])
-    assert not turned(data, bias)
+    assert not has_motion(data, bias)
     steady = data.angle_b_rad + np.array([0.0, 0.0, 0.02]) * data.dt_s[:, None]
-    assert turned(replace(data, angle_b_rad=steady), bias)
+    assert has_motion(replace(data, angle_b_rad=steady), bias)
 
 
 def test_a_mirrored_start_is_on_the_other_side_of_the_plane_of_the_fields():
     heading = np.linspace(0.0, 2 * np.pi, 50)
     level = np.column_stack([0.2 * np.cos(heading), 0.2 * np.sin(heading), np.full(50, 0.4)])
     c = np.r_[chain.upper_triangle(M), 0.1, -0.2, 0.05]
-    found = chain.mirrored(c, level)
+    found = chain.mirror_hard_iron(c, level)
     np.testing.assert_allclose(found[6:], [0.1, -0.2, 0.75], atol=1e-12)
     np.testing.assert_array_equal(found[:6], c[:6])

@@ -12,13 +12,13 @@ from vehicle import DECLINATION_DEG, FIELD_N, HARD_IRON, SOFT_IRON
 from ahrsd.evaluation import EvaluationError, judge
 from ahrsd.evaluation.heading import (
     HeadingFigures,
-    column,
-    compare,
-    course,
+    column_reference,
+    course_reference,
     device_heading,
     fixes_from_degrees,
     fixes_of_track,
-    optical,
+    heading_figures,
+    optical_reference,
     rms_difference,
 )
 from ahrsd.evaluation.judging import evaluation_json, evaluation_lines, field_figures
@@ -43,7 +43,9 @@ def with_optics(vehicle, world=None):
 def test_against_the_course_the_truth_has_the_slip_and_the_declination_as_its_constant(
     vehicle, perfect
 ):
-    found = judge("r", vehicle.track, perfect, [course(vehicle.fixes, 4.0)], fixes=vehicle.fixes)
+    found = judge(
+        "r", vehicle.track, perfect, [course_reference(vehicle.fixes, 4.0)], fixes=vehicle.fixes
+    )
     (judged,) = found.headings
     after = judged.figures.after
     assert judged.truth
@@ -67,10 +69,10 @@ def test_the_error_of_a_hard_iron_on_a_level_turn_is_the_textbooks(vehicle):
     )
     up = np.tile([0.0, 0.0, -1.0], (720, 1))
     time_s = np.arange(720.0)
-    reference = course(vehicle.fixes, 4.0)
+    reference = course_reference(vehicle.fixes, 4.0)
     reference = replace(reference, time_s=time_s, heading_rad=heading, half_width_s=0.0)
     expected = np.arctan2(-0.02 * np.sin(heading), 0.2 + 0.02 * np.cos(heading))
-    found = compare(time_s, field, up, reference)
+    found = heading_figures(time_s, field, up, reference)
     assert found.rms_deg == pytest.approx(np.degrees(np.sqrt(np.mean(expected**2))), rel=1e-6)
     assert found.worst_deg == pytest.approx(np.degrees(np.arcsin(0.1)), rel=1e-3)
     assert found.offset_deg == pytest.approx(0.0, abs=1e-9)
@@ -82,7 +84,7 @@ def test_the_error_of_a_hard_iron_on_a_level_turn_is_the_textbooks(vehicle):
 )
 def test_an_optical_world_may_have_any_yaw_and_z_up(vehicle, perfect, world):
     track = with_optics(vehicle, world)
-    reference = optical(track)
+    reference = optical_reference(track)
     found = judge("r", track, perfect, [reference])
     assert found.headings[0].tilt == "reference"
     assert found.headings[0].figures.after.worst_deg < 1e-6
@@ -99,7 +101,7 @@ def test_optical_attitude_judges_where_the_x_axis_points_up(vehicle, perfect):
     track = replace(
         track, raw_b_gauss=raw, before_b_gauss=raw, accel_b_m_s2=track.accel_b_m_s2 @ turned.T
     )
-    found = judge("r", track, perfect, [optical(track)])
+    found = judge("r", track, perfect, [optical_reference(track)])
     assert found.headings[0].figures.after.worst_deg < 1e-3
 
 
@@ -107,13 +109,13 @@ def test_rows_without_an_optical_attitude_are_left_out(vehicle, perfect):
     track = with_optics(vehicle)
     for name in ("ref_qw", "ref_qx", "ref_qy", "ref_qz"):
         track.covariates[name][:4000] = np.nan
-    found = judge("r", track, perfect, [optical(track)])
+    found = judge("r", track, perfect, [optical_reference(track)])
     assert len(found.headings[0].figures.after.error_deg) == 6000
     assert found.headings[0].figures.after.worst_deg < 1e-6
     for name in ("ref_qw", "ref_qx", "ref_qy", "ref_qz"):
         track.covariates[name][:] = np.nan
-    assert optical(track) is None
-    assert optical(vehicle.track) is None
+    assert optical_reference(track) is None
+    assert optical_reference(vehicle.track) is None
 
 
 def test_the_devices_own_yaw_is_said_to_be_no_truth(vehicle, perfect):
@@ -124,13 +126,13 @@ def test_the_devices_own_yaw_is_said_to_be_no_truth(vehicle, perfect):
     found = judge("r", track, perfect, [reference])
     assert any("no truth" in text for text in found.warnings)
     assert found.headings[0].figures.after.offset_deg == pytest.approx(-DECLINATION_DEG, abs=0.02)
-    assert column(track, "vn_yaw_deg").truth is False
+    assert column_reference(track, "vn_yaw_deg").truth is False
     track.covariates["compass_deg"] = yaw
-    assert column(track, "compass_deg").truth is True
+    assert column_reference(track, "compass_deg").truth is True
     with pytest.raises(EvaluationError, match="no column nose_deg; further columns: compass_deg"):
-        column(track, "nose_deg")
+        column_reference(track, "nose_deg")
     with pytest.raises(EvaluationError, match="must end in _deg or _rad"):
-        column(track, "velocity_x_m_s")
+        column_reference(track, "velocity_x_m_s")
     assert device_heading(vehicle.track) is None
 
 
@@ -138,14 +140,14 @@ def test_without_an_accelerometer_the_devices_tilt_is_taken_and_said(vehicle, pe
     yaw, pitch, roll = np.degrees(Rotation.from_matrix(vehicle.R_nb).as_euler("ZYX").T)
     track = with_columns(vehicle, vn_yaw_deg=yaw, vn_pitch_deg=pitch, vn_roll_deg=roll)
     blind = replace(track, accel_b_m_s2=np.full((len(track), 3), np.nan))
-    found = judge("r", blind, perfect, [course(vehicle.fixes, 4.0)])
+    found = judge("r", blind, perfect, [course_reference(vehicle.fixes, 4.0)])
     assert found.headings[0].tilt == "device"
     assert found.headings[0].figures.after.rms_deg < 0.05
     assert any("roll and pitch are the device's own" in text for text in found.warnings)
     with pytest.raises(EvaluationError, match="--tilt gravity: not every sample"):
         judge("r", blind, perfect, [], tilt_source="gravity")
     lost = replace(vehicle.track, accel_b_m_s2=np.full((len(track), 3), np.nan))
-    nothing = judge("r", lost, perfect, [course(vehicle.fixes, 4.0)])
+    nothing = judge("r", lost, perfect, [course_reference(vehicle.fixes, 4.0)])
     assert nothing.headings == ()
     assert any("nothing says which way is up" in text for text in nothing.warnings)
 
@@ -172,7 +174,9 @@ def test_gravity_is_steadier_than_the_accelerometer_and_forgives_a_gyro_bias(veh
 
 
 def test_dead_reckoning_with_a_doppler_log_follows_the_slip(vehicle, perfect):
-    found = judge("r", vehicle.track, perfect, [course(vehicle.fixes, 4.0)], fixes=vehicle.fixes)
+    found = judge(
+        "r", vehicle.track, perfect, [course_reference(vehicle.fixes, 4.0)], fixes=vehicle.fixes
+    )
     reckoned = found.reckoned
     assert reckoned.velocity.startswith("Doppler")
     t = np.linspace(0.0, 199.0, 10_000)
@@ -219,9 +223,9 @@ def test_no_way_no_dead_reckoning(vehicle, perfect):
     assert found.reckoned is None
     assert any("hardly any way" in text for text in found.warnings)
     with pytest.raises(EvaluationError, match="0 fixes faster than 4 m/s"):
-        course(still, 4.0)
+        course_reference(still, 4.0)
     early = replace(vehicle.fixes, time_s=vehicle.fixes.time_s - 1000.0)
-    found = judge("r", vehicle.track, perfect, [course(early, 4.0)], fixes=early)
+    found = judge("r", vehicle.track, perfect, [course_reference(early, 4.0)], fixes=early)
     assert found.headings == ()
     assert any("are both on the same clock?" in text for text in found.warnings)
 
@@ -234,7 +238,7 @@ def test_a_gap_of_fixes_is_not_bridged(vehicle):
         north_m=vehicle.fixes.north_m[kept],
         east_m=vehicle.fixes.east_m[kept],
     )
-    found = course(broken, 4.0)
+    found = course_reference(broken, 4.0)
     assert len(found.time_s) == 78 + 88
     assert not np.any((found.time_s > 78.5) & (found.time_s < 110.5))
 
@@ -273,7 +277,7 @@ def test_field_figures_are_the_definitions():
 
 def test_the_truth_leaves_no_spread_and_the_world_sets_the_scale(vehicle, perfect):
     world = world_field(47.6, -122.3, 0.0, 2026.0)
-    found = judge("r", vehicle.track, perfect, [course(vehicle.fixes, 4.0)], world=world)
+    found = judge("r", vehicle.track, perfect, [course_reference(vehicle.fixes, 4.0)], world=world)
     assert found.field.after.spread < 1e-9
     assert found.field.before.spread > 0.02
     error = np.linalg.norm(FIELD_N) - world.total_gauss
@@ -288,13 +292,15 @@ def test_what_flatters_is_said_and_what_is_worse_is_a_no(vehicle, perfect):
     assert any("made from this very recording" in text for text in own.warnings)
     assert any("no heading to compare with" in text for text in own.warnings)
     worse = replace(perfect, correction=replace(perfect.correction, offset=np.array([0.3, 0, 0])))
-    found = judge("r", vehicle.track, worse, [course(vehicle.fixes, 4.0)])
+    found = judge("r", vehicle.track, worse, [course_reference(vehicle.fixes, 4.0)])
     assert not found.better
     assert found.held_out
 
 
 def test_json_and_table_hold_the_same_figures(vehicle, perfect):
-    found = judge("r", vehicle.track, perfect, [course(vehicle.fixes, 4.0)], fixes=vehicle.fixes)
+    found = judge(
+        "r", vehicle.track, perfect, [course_reference(vehicle.fixes, 4.0)], fixes=vehicle.fixes
+    )
     body = evaluation_json(found)
     assert body["schema"] == "ahrsd.evaluation/1"
     assert body["heading"][0]["after"]["rms_deg"] == found.headings[0].figures.after.rms_deg

@@ -11,8 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ahrsd.calibration import Affine
-from ahrsd.evaluation import EvaluationError, EvaluationTrack, StoredCalibration, judge, tracked
-from ahrsd.evaluation.heading import Fixes, course, device_heading, fixes_of_track, optical
+from ahrsd.evaluation import EvaluationError, EvaluationTrack, StoredCalibration, build_track, judge
+from ahrsd.evaluation.heading import (
+    Fixes,
+    course_reference,
+    device_heading,
+    fixes_of_track,
+    optical_reference,
+)
 from ahrsd.evaluation.judging import evaluation_json, evaluation_lines
 from ahrsd.samples import SampleBlock
 
@@ -64,10 +70,12 @@ def test_junk(seed, n, columns, accel, gyro, scale, gap):
         Affine(np.eye(3) + 0.1 * rng.normal(size=(3, 3)), rng.normal(size=3)),
     )
     fixes = fixes_of_track(track)
-    references = [one for one in (optical(track), device_heading(track)) if one is not None]
+    references = [
+        one for one in (optical_reference(track), device_heading(track)) if one is not None
+    ]
     if fixes is not None:
         try:
-            references.append(course(fixes, 0.5))
+            references.append(course_reference(fixes, 0.5))
         except EvaluationError as error:
             assert "\n" not in str(error)
     found = judge("r", track, calibration, references, fixes=fixes)
@@ -82,15 +90,15 @@ def test_too_few_samples_and_time_backwards_are_refused(vehicle):
         track.gyro_b_rad_s, track.accel_b_m_s2, track.covariates,
     )  # fmt: skip
     present = Affine(np.eye(3), np.array([0.1, 0.0, 0.0]))
-    whole = tracked([(block, present)])
+    whole = build_track([(block, present)])
     assert np.allclose(whole.before_b_gauss, track.raw_b_gauss - [0.1, 0.0, 0.0])
     with pytest.raises(EvaluationError, match="0 samples, 20 are needed"):
-        tracked([])
+        build_track([])
     with pytest.raises(EvaluationError, match="goes backwards"):
-        tracked([(block, present), (replace(block, gap_before=True), present)])
+        build_track([(block, present), (replace(block, gap_before=True), present)])
 
 
 def test_fixes_that_are_all_apart_give_no_course():
     fixes = Fixes(np.arange(12.0), np.zeros(12), np.zeros(12), "GPS")
     with pytest.raises(EvaluationError, match="GPS: 0 fixes faster"):
-        course(fixes, 4.0)
+        course_reference(fixes, 4.0)

@@ -39,7 +39,12 @@ from ahrsd.config.config import Config
 from ahrsd.config.sections import LocationSection
 from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.evaluation import Evaluation, EvaluationTrack, StoredCalibration, judge
-from ahrsd.evaluation.heading import QUATERNION, HeadingReference, course, optical
+from ahrsd.evaluation.heading import (
+    QUATERNION,
+    HeadingReference,
+    course_reference,
+    optical_reference,
+)
 from ahrsd.heading import wrapped
 from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.compare_methods import our_row, row_of, run_published
@@ -127,7 +132,7 @@ def drive(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[Judge
     gps = gps_beside(path)
     assert gps is not None
     fixes, _ = read_fixes(gps)
-    references = [course(fixes, LEAST_SPEED_M_S)]
+    references = [course_reference(fixes, LEAST_SPEED_M_S)]
     lines = []
     for row in rows:
         calibration = stored(row, circles.name)
@@ -146,7 +151,7 @@ def against_optics(
     tracks = [without_lag(read_track(path, Config())[0], BROAD_LAG_S) for path in paths]
     lines = []
     for path, track in zip(paths, tracks, strict=True):
-        reference = optical(track)
+        reference = optical_reference(track)
         assert reference is not None
         row = oracle(track)
         found = judge(path.name, track, stored(row, path.name), [reference])  # type: ignore[arg-type]
@@ -156,7 +161,7 @@ def against_optics(
         for row in rows:
             calibration = stored(row, path.name)
             for other, track in zip(paths, tracks, strict=True):
-                reference = optical(track)
+                reference = optical_reference(track)
                 assert reference is not None
                 found = calibration and judge(other.name, track, calibration, [reference])
                 lines.append(judged(row, path.name[:2], other.name[:2], found))
@@ -337,13 +342,13 @@ def honest(folder: Path) -> tuple[list[Announced], list[Halves]]:
     gps = gps_beside(drive_path)
     assert gps is not None
     answers = {path: estimated(track) for path, track in tracks.items()}
-    references = {drive_path: [course(read_fixes(gps)[0], LEAST_SPEED_M_S)]}
+    references = {drive_path: [course_reference(read_fixes(gps)[0], LEAST_SPEED_M_S)]}
     shown, floors = dict(tracks), {drive_path: np.nan}
     for path in (*broad, stick):
         own = answers[path]
         assert own is not None
         shown[path] = remounted(without_lag(tracks[path], max(own.mag_lag_s, 0.0)))
-        reference = optical(shown[path])
+        reference = optical_reference(shown[path])
         assert reference is not None
         references[path] = [reference]
         best = stored(oracle(shown[path]), path.name)

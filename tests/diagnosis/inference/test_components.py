@@ -14,7 +14,7 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.components.component import ScaledLaw
 from ahrsd.diagnosis.inference.components.gaussian_process import GaussianProcessLaw
 from ahrsd.diagnosis.inference.likelihood import noise_model
-from ahrsd.estimator.locked import harmonics, squares
+from ahrsd.estimator.locked import harmonics, rate_products
 
 
 @pytest.mark.parametrize("psi", [np.array([0.3, 0.5]), np.array([-1.0, 3.0])])
@@ -56,7 +56,7 @@ def test_harmonics_are_orthonormal_and_no_calibration():
 
 
 def test_squares_of_the_rates():
-    np.testing.assert_allclose(squares(np.array([[2.0, 3.0, 5.0]])), [[4, 9, 25, 6, 15, 10]])
+    np.testing.assert_allclose(rate_products(np.array([[2.0, 3.0, 5.0]])), [[4, 9, 25, 6, 15, 10]])
 
 
 def test_octaves_cover_all_cosines():

@@ -16,7 +16,7 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.components.component import Component, FixedLaw, ScaledLaw
 from ahrsd.diagnosis.inference.components.gaussian_process import gaussian_process
 from ahrsd.diagnosis.model import Columns, Context
-from ahrsd.estimator.locked import harmonics, of_change, on_each_axis, squares
+from ahrsd.estimator.locked import change_columns, harmonics, on_each_axis, rate_products
 from ahrsd.samples import Array
 
 #: key of the gyro's matrix, and its coefficients that are turns: they add turn x rate to the rates
@@ -33,7 +33,7 @@ def ordinary_remainder(context: Context) -> list[Component]:
         field_by_change(context),
         _remainder_component(context, "field_by_rate", "sensor", context.rowwise_rate_b_rad_s),
         _remainder_component(
-            context, "by_rate_squared", "gyro", squares(context.rowwise_rate_b_rad_s)
+            context, "by_rate_squared", "gyro", rate_products(context.rowwise_rate_b_rad_s)
         ),
         gyro_matrix(context),
     ]
@@ -78,7 +78,7 @@ def still_intervals(time_s: Array, gyro_rad_s: Array) -> list[tuple[float, float
 
 def field_by_change(context: Context) -> Component:
     """A matrix times the field's rate of change, less the part equal on all axes (a delay)."""
-    columns = of_change(context.field_dot_b)
+    columns = change_columns(context.field_dot_b)
     law = ordinary_size_law(priors.ORDINARY["by_change"], np.ones(columns.shape[2]))
     return Component("by_change", "sensor", Columns(mag=columns), law)
 

@@ -21,7 +21,14 @@ from seed_figures.turning import Turning, sensed
 
 from ahrsd import so3
 from ahrsd.calibration import Affine
-from ahrsd.evaluation.heading import DOPPLER, Fixes, HeadingReference, compare, reckon, velocity_of
+from ahrsd.evaluation.heading import (
+    DOPPLER,
+    Fixes,
+    HeadingReference,
+    heading_figures,
+    reckoning_figures,
+    velocity_of,
+)
 from ahrsd.evaluation.track import EvaluationTrack
 from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.montecarlo.accuracy import MethodAnswer
@@ -182,11 +189,11 @@ class Dive:
     def figures(self, field_b: Array, up_b: Array) -> Said:
         """Heading and dead reckoning of a corrected field, on the INS' instants."""
         reference = HeadingReference("INS", True, self.track.time_s, self.ins_rad)
-        heading = compare(self.track.time_s, field_b, up_b, reference)
+        heading = heading_figures(self.track.time_s, field_b, up_b, reference)
         out: Said = {"heading_deg": heading.rms_deg, "offset_deg": heading.offset_deg}
         velocity = velocity_of(self.track, self.true_fixes)
         for name, fixes in (("ins", self.ins_fixes), ("true", self.true_fixes)):
-            found = reckon(self.track, field_b, up_b, velocity, fixes, WAY_M)
+            found = reckoning_figures(self.track, field_b, up_b, velocity, fixes, WAY_M)
             out[f"worst_{name}_percent"] = 100 * found.worst_m / WAY_M
             out[f"final_{name}_percent"] = found.final_percent
         return out
