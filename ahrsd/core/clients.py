@@ -77,15 +77,15 @@ class Clients:
     def sent(self, item: inputs.ClientSent, host_s: float) -> None:
         """Bytes of a client."""
         data = item.text.encode("latin-1", "replace")
-        self.arbiter.received(item.client, data, self._session.identity, host_s)
+        self.arbiter.receive(item.client, data, self._session.identity, host_s)
 
     def left(self, item: inputs.ClientLeft) -> None:
         """A client closed its port."""
-        self.arbiter.left(item.client)
+        self.arbiter.disconnect(item.client)
 
     def fault(self, code: int) -> None:
         """The device reports an error of its own: each driver would have heard it."""
-        self.arbiter.tell_all(f"VNERR,{code:02X}")
+        self.arbiter.broadcast(f"VNERR,{code:02X}")
 
     def take_answers(self) -> list[SendToClient]:
         """Bytes for clients."""
@@ -102,7 +102,7 @@ class Clients:
 
     def next(self, host_s: float, *, free: bool) -> tuple[list[Action], ClientTurn | None]:
         """The next command for the wire, where it is free, and what must happen before it."""
-        waiting = self.arbiter.first(host_s)
+        waiting = self.arbiter.next_command(host_s)
         if self._announced is not None and self._announced is not waiting:
             self._announced = None
             if dropped := self._writeback.on_client_dropped(host_s):
@@ -115,13 +115,13 @@ class Clients:
             if why_not is None:
                 return back.on_client_wants(waiting.client, does, host_s), None
             if why_not:
-                self.arbiter.refuse_first(Refusal(UNAUTHORIZED, f"{_NOT_SAVED}: {why_not}"))
+                self.arbiter.refuse_next(Refusal(UNAUTHORIZED, f"{_NOT_SAVED}: {why_not}"))
                 return [], None
         if waiting.asked.kind is Kind.CALIBRATE and isinstance(waiting.asked.command, Write):
             return self._calibrate(waiting, waiting.asked.command, host_s)
         lasts = waiting.asked.kind is Kind.SAVE
         known = self._writeback.known if lasts else None
-        return [], ClientTurn(self.arbiter.begin().asked, known)
+        return [], ClientTurn(self.arbiter.start_next().asked, known)
 
     def _calibrate(
         self, waiting: Waiting, command: Write, host_s: float
@@ -132,14 +132,14 @@ class Clients:
             return [], None
         if why:
             told = f"register {command.register} was not written for it: {why}"
-            self.arbiter.refuse_first(Refusal(UNAUTHORIZED, told))
+            self.arbiter.refuse_next(Refusal(UNAUTHORIZED, told))
             return [], None
         wanted = (waiting.client, command.register, command.values)
         actions, ready = self._writeback.on_client_writes(*wanted, host_s)
         self._announced = None if ready else waiting
         if not ready:
             return actions, None
-        return actions, ClientTurn(self.arbiter.begin().asked, self._writeback.known)
+        return actions, ClientTurn(self.arbiter.start_next().asked, self._writeback.known)
 
     def served(
         self,
@@ -151,11 +151,11 @@ class Clients:
         """The command on the wire ended. `registers`: what the device held before it."""
         effects = ServedEffects()
         if isinstance(error, NotAsKnown | TooLate):  # nothing was sent
-            self.arbiter.again()
+            self.arbiter.requeue_current()
             reason = "" if isinstance(error, TooLate) else str(error)
             effects.actions = self._writeback.on_client_waits(reason, host_s)
             return effects
-        if (done := self.arbiter.ended(result, error)) is None:
+        if (done := self.arbiter.finish_current(result, error)) is None:
             return effects
         if done.asked.kind is Kind.RESET and (isinstance(result, Reply) or _silent(error)):
             effects.reset_by, self._reset = done.client, (done.client, host_s)
