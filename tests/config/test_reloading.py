@@ -143,7 +143,7 @@ def test_a_verdict_by_other_limits_allows_nothing():
     assert core._era() != era  # nor does one that is still being worked on
     assert core.settings.calibrator.limits.max_heading_sigma_deg == 0.25
     assert core.calibrator.settings.limits.max_heading_sigma_deg == 0.25
-    assert core.calibrator.anew().settings.limits.max_heading_sigma_deg == 0.25
+    assert core.calibrator.make_fresh().settings.limits.max_heading_sigma_deg == 0.25
 
 
 def test_a_running_daemon_takes_it_on_sighup(emulated, tmp_path):

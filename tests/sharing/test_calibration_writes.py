@@ -246,7 +246,7 @@ def test_a_journal_that_cannot_be_written_lets_nothing_pass():
 
 def test_a_client_that_leaves_while_its_write_is_journaled_leaves_nothing_behind():
     run = shared(planted=False)
-    run.core.clients.sent(
+    run.core.clients.on_bytes(
         inputs.ClientSent(run.now_ns, "owner", "$VNWRG,84,1,0,0,0,1,0,0,0,1,0,0,1*XX\r\n"),
         run.now_s,
     )

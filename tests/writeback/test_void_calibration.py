@@ -140,8 +140,8 @@ def test_one_that_differs_a_little_only_holds_the_save():
 class Red(PlantedCalibrator):
     """One gate is red."""
 
-    def judged(self, at_s: float, *_: object) -> tuple[GateResult, ...]:
-        super().judged(at_s)
+    def judge_estimate(self, at_s: float, *_: object) -> tuple[GateResult, ...]:
+        super().judge_estimate(at_s)
         bad = GateResult(GATES[0].gate, 2.0, 1.0, False, at_s, "", "look at the wire")
         self.gates = (bad, *self.gates[1:])
         return self.gates
