@@ -107,7 +107,7 @@ class Calibrator:
         self.started = True
         self._at_s = float(block.time_s[-1]) if len(block) else self._at_s
         stepped = self._detect_step(block)
-        parts = self.collector.parts(block)
+        parts = self.collector.split(block)
         for _, part in parts:
             self.collector.add(part)
         for piece in self._training_parts(parts) if self.settings.held_out else [block]:

@@ -73,7 +73,7 @@ def test_what_is_held_out_is_never_seen_by_the_estimator(blocks):
     held, rng = 0, np.random.default_rng(1)
     for block in later(blocks, 3):
         plain.take(block)
-        kept_out = all(role == "heldout" for role, _ in other.collector.parts(block))
+        kept_out = all(role == "heldout" for role, _ in other.collector.split(block))
         held += len(block) * kept_out
         raw = block.raw_b_gauss + 0.2 * rng.standard_normal(block.raw_b_gauss.shape)
         other.take(replace(block, raw_b_gauss=raw) if kept_out else block)
