@@ -115,7 +115,7 @@ class Clients:
             return [], None
         if (does := _VERBS.get(waiting.asked.kind)) is not None:
             back = self._writeback
-            why_not = back.no_client_save if does == "saves" else back.no_client_reset
+            why_not = back.client_save_refusal if does == "saves" else back.client_reset_refusal
             if why_not is None:
                 return back.on_client_wants(waiting.client, does, host_s), None
             if why_not:
@@ -124,14 +124,14 @@ class Clients:
         if waiting.asked.kind is Kind.CALIBRATE and isinstance(waiting.asked.command, Write):
             return self._next_calibration_write(waiting, waiting.asked.command, host_s)
         saves = waiting.asked.kind is Kind.SAVE
-        known = self._writeback.known if saves else None
+        known = self._writeback.expected_device if saves else None
         return [], ClientTurn(self.arbiter.start_next().asked, known)
 
     def _next_calibration_write(
         self, waiting: Waiting, command: Write, host_s: float
     ) -> tuple[list[Action], ClientTurn | None]:
         """A calibration write: refused as on a share that lets none pass, journaled, or sent."""
-        why = self._writeback.may_client_write(command.register)
+        why = self._writeback.client_write_refusal(command.register)
         if why is None:
             return [], None
         if why:
@@ -143,7 +143,7 @@ class Clients:
         self._announced = None if ready else waiting
         if not ready:
             return actions, None
-        return actions, ClientTurn(self.arbiter.start_next().asked, self._writeback.known)
+        return actions, ClientTurn(self.arbiter.start_next().asked, self._writeback.expected_device)
 
     def on_served(
         self,

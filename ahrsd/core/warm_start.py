@@ -24,7 +24,7 @@ from ahrsd.calibration import Estimate
 from ahrsd.inputs import EarlierRun, EarlierSamples, WallClock
 from ahrsd.printable import counted
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.writeback.journal_history import Stamp, plausible, same_boot_s
+from ahrsd.writeback.journal_history import Stamp, age_by_boottime_s, plausible
 from drivers.vn100.registers import COMPENSATING, Unit, Values, same
 
 CONFIRM_S = 60.0  # samples of this run before a candidate
@@ -42,7 +42,7 @@ def too_old(then: Stamp, now: Stamp, limit_s: float) -> str:
         return "nobody knows how old they are: the computer does not tell its boot"
     if then.boot_id != now.boot_id:
         return "they are of before the computer started: nobody knows how old they are"
-    age_s = same_boot_s(then, now)
+    age_s = age_by_boottime_s(then, now)
     if age_s is None:
         return "they claim to be of the future"
     if age_s > limit_s:

@@ -33,7 +33,12 @@ from ahrsd.writeback.actions import (
     RunProcedure,
     SetUpStream,
 )
-from ahrsd.writeback.journal_history import OF_OUTPUTS, RecordKind, StoredRecord, of_another_device
+from ahrsd.writeback.journal_history import (
+    OF_OUTPUTS,
+    RecordKind,
+    StoredRecord,
+    find_record_of_other_device,
+)
 from ahrsd.writeback.machine import WriteBack
 from ahrsd.writeback.states import LIVED_WITH, State
 from ahrsd.writeback.trial import LiveTrial
@@ -200,7 +205,7 @@ class DeviceRecord:
     def on_journal_read(self, item: JournalOpened) -> str:
         """Take its journal; returns why it cannot be trusted, "" if it can."""
         records = [StoredRecord.of(r) for r in item.records]
-        error = item.error or of_another_device(records, item.serial)
+        error = item.error or find_record_of_other_device(records, item.serial)
         self._journal = None if error else records
         self._journal_known, self._read_from_s = True, item.host_ns * 1e-9
         return error

@@ -125,7 +125,7 @@ def format_table(rows: Sequence[ComparisonRow]) -> list[str]:
         bias = "-" if row.gyro_bias_rad_s is None else _vector_text(row.gyro_bias_rad_s, 3)
         lines.append(
             f"{row.method:20}{_vector_text(row.hard_iron_gauss, 1):>28}{bias:>26}"
-            f"{_percent_text(row.spread):>9}{_percent_text(row.held_out):>10}  {row.reason}".rstrip()
+            f"{_percentage(row.spread):>9}{_percentage(row.held_out):>10}  {row.reason}".rstrip()
         )
     return lines
 
@@ -134,7 +134,7 @@ def _vector_text(values: Array, digits: int) -> str:
     return ", ".join(f"{v * 1e3:+.{digits}f}" for v in values)
 
 
-def _percent_text(value: float | None) -> str:
+def _percentage(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.2f} %"
 
 

@@ -115,7 +115,7 @@ Action = (
 
 
 JOURNAL_AGAIN_S = 30.0
-_ANNOUNCED = (
+_RECORDED_BEFORE_ACTION = (
     RecordKind.PREPARED,
     RecordKind.RAM_VERIFIED,
     RecordKind.FLASH_SENT,
@@ -141,9 +141,9 @@ class ActionOutbox:
         self._boot: tuple[str, float | None] = ("", None)  # and what to add to `host_s`
         self._serial: int | None = None
         self._bound_s = 0.0
-        self._asked: deque[tuple[RecordKind, dict[str, Any], JournalHistory]] = deque()
+        self._requested: deque[tuple[RecordKind, dict[str, Any], JournalHistory]] = deque()
         self._unjournaled: list[tuple[RecordKind, dict[str, Any]]] = []
-        self._journal_again_s = 0.0
+        self._journal_retry_s = 0.0
         self._runs = 0
         self._out: list[Action] = []
         self._last_note = ""
@@ -204,18 +204,18 @@ class ActionOutbox:
             for kind, facts in self._unjournaled:
                 self.history = self.history.with_record(kind, facts)
 
-    def take(self) -> list[Action]:
+    def take_actions(self) -> list[Action]:
         """The actions since the last call."""
         out, self._out = self._out, []
         return out
 
-    def ask(self, action: Action) -> None:
+    def append(self, action: Action) -> None:
         """Append an action."""
         self._out.append(action)
 
     def record(self, kind: RecordKind, **facts: object) -> None:
         """Append a record behind those still missing on the disk; the history counts it at once."""
-        self.journal_again()
+        self.retry_journal()
         transaction = self.history.open
         complete = {
             **({} if transaction is None else {"txn": transaction.id}),
@@ -225,21 +225,21 @@ class ActionOutbox:
         before, self.history = self.history, self.history.with_record(kind, complete)
         self._append(kind, complete, before)
 
-    def journaled(self, kind: RecordKind) -> bool:
+    def on_journaled(self, kind: RecordKind) -> bool:
         """A record of this kind is on the disk; returns whether none is missing any more."""
-        self._answered(kind)
-        self.journal_again()
-        return not self._unjournaled and not self._asked
+        self._take_request(kind)
+        self.retry_journal()
+        return not self._unjournaled and not self._requested
 
-    def not_journaled(self, kind: RecordKind) -> None:
+    def on_journal_failed(self, kind: RecordKind) -> None:
         """A record of this kind is not on the disk: what it announced does not happen."""
-        asked = self._answered(kind)
-        if asked is None:
+        request = self._take_request(kind)
+        if request is None:
             return
-        _, facts, before = asked
-        if kind not in _ANNOUNCED:
+        _, facts, before = request
+        if kind not in _RECORDED_BEFORE_ACTION:
             self._unjournaled.append((kind, facts))
-            self._journal_again_s = self.host_s + JOURNAL_AGAIN_S
+            self._journal_retry_s = self.host_s + JOURNAL_AGAIN_S
         elif kind is RecordKind.PREPARED:  # nothing was opened
             self.history = replace(
                 self.history,
@@ -250,55 +250,55 @@ class ActionOutbox:
             )
 
     @property
-    def journal_again_s(self) -> float | None:
+    def journal_retry_s(self) -> float | None:
         """When the records that the disk did not take are tried again."""
-        return self._journal_again_s if self._unjournaled else None
+        return self._journal_retry_s if self._unjournaled else None
 
-    def journal_again(self) -> None:
+    def retry_journal(self) -> None:
         """Try the missing records again, in their order."""
         waiting, self._unjournaled = self._unjournaled, []
         for kind, facts in waiting:
             self._append(kind, facts, self.history)
 
     def _append(self, kind: RecordKind, facts: dict[str, Any], before: JournalHistory) -> None:
-        self._asked.append((kind, facts, before))
-        self.ask(AppendToJournal(kind, facts))
+        self._requested.append((kind, facts, before))
+        self.append(AppendToJournal(kind, facts))
 
-    def _answered(
+    def _take_request(
         self, kind: RecordKind
     ) -> tuple[RecordKind, dict[str, Any], JournalHistory] | None:
-        asked = next((one for one in self._asked if one[0] is kind), None)
-        if asked is not None:
-            self._asked.remove(asked)
-        return asked
+        request = next((one for one in self._requested if one[0] is kind), None)
+        if request is not None:
+            self._requested.remove(request)
+        return request
 
     def note(self, level: str, text: str) -> None:
         """One line for the log; not the same one twice in a row."""
         if text != self._last_note:
-            self.ask(Emit(Noted(self.at_s, self.host_s, level, text)))
+            self.append(Emit(Noted(self.at_s, self.host_s, level, text)))
         self._last_note = text
 
-    def changed(self, old: str, new: str, reason: str) -> None:
+    def emit_state_change(self, old: str, new: str, reason: str) -> None:
         """The state changed."""
-        self.ask(Emit(StateChanged(self.at_s, self.host_s, old, new, reason)))
+        self.append(Emit(StateChanged(self.at_s, self.host_s, old, new, reason)))
 
-    def written(
+    def emit_register_writes(
         self, before: Mapping[int, Values], after: Mapping[int, Values], outcome: str
     ) -> None:
         """Registers were written, refused or undone."""
         for number in after:
             old, new = (tuple(float(v) for v in side[number]) for side in (before, after))
-            self.ask(Emit(RegisterWritten(self.at_s, self.host_s, number, old, new, outcome)))
+            self.append(Emit(RegisterWritten(self.at_s, self.host_s, number, old, new, outcome)))
 
-    def in_force(self, registers: Mapping[int, Values] | None) -> None:
+    def set_in_force(self, registers: Mapping[int, Values] | None) -> None:
         """The device applies these registers from now on; None: unknown."""
-        self.ask(InForce(None if registers is None else dict(registers)))
+        self.append(InForce(None if registers is None else dict(registers)))
 
     def run(self, what: str, purpose: Purpose, make: Callable[[], Procedure[object]]) -> None:
         """Start a procedure; the gate judges each command at the newest host time."""
         self._runs += 1
         self.running = f"{what} {self._runs}"
-        self.ask(
+        self.append(
             RunProcedure(
                 self.running,
                 purpose,
@@ -307,8 +307,8 @@ class ActionOutbox:
             )
         )
 
-    def stop_running(self) -> None:
+    def cancel_running(self) -> None:
         """End the procedure that runs, if any."""
         if self.running:
-            self.ask(CancelProcedure(self.running))
+            self.append(CancelProcedure(self.running))
         self.running = ""

@@ -80,13 +80,13 @@ def compose(
     present = _affine(registers, MAG)
     present_gyro = _affine(registers, GYRO)
     _refuse_unusable(estimate)
-    _refuse_moved(estimate, present, present_gyro)
-    proposed = {MAG: _wire(MAG, correction(estimate, present))}
+    _refuse_undetermined_changes(estimate, present, present_gyro)
+    proposed = {MAG: _to_wire(MAG, correction(estimate, present))}
     if gyro_is_raw:
-        proposed[GYRO] = _wire(GYRO, Affine(present_gyro.matrix, estimate.gyro_bias_rad_s))
+        proposed[GYRO] = _to_wire(GYRO, Affine(present_gyro.matrix, estimate.gyro_bias_rad_s))
     written = Affine.from_register(_floats(proposed[MAG]))
     _refuse_out_of_bounds(written, estimate.gyro_bias_rad_s)
-    new = {n: v for n, v in proposed.items() if not _is_there(registers[n], v)}
+    new = {n: v for n, v in proposed.items() if not _equals_present(registers[n], v)}
     lines = register_lines(new)
     return Proposal(
         id=hashlib.sha256("\n".join(lines).encode()).hexdigest()[:8],
@@ -116,7 +116,7 @@ def heading_change_deg(present: Affine, proposed: Affine, estimate: Estimate) ->
     return float(np.degrees(np.max(np.abs(difference))))
 
 
-def apart_deg(one: Proposal, other: Proposal, estimate: Estimate) -> float:
+def proposal_distance_deg(one: Proposal, other: Proposal, estimate: Estimate) -> float:
     """How far two proposals are apart, as a change of heading."""
     if MAG not in one.new or MAG not in other.new:
         return 0.0 if MAG not in one.new and MAG not in other.new else 180.0
@@ -131,23 +131,23 @@ def _scale(written: Affine, estimate: Estimate) -> float:
 
 def correction(estimate: Estimate, present: Affine) -> Affine:
     """What register 23 would be by this estimate, the scale s by the rule above, not rounded."""
-    return Affine(_matrix(estimate, present), estimate.hard_iron_gauss)
+    return Affine(_scaled_inverse(estimate, present), estimate.hard_iron_gauss)
 
 
-def _matrix(estimate: Estimate, present: Affine) -> Array:
+def _scaled_inverse(estimate: Estimate, present: Affine) -> Array:
     inverse = np.linalg.inv(estimate.soft_iron)
     if estimate.field_known:
         return np.asarray(inverse)
     return np.asarray(inverse * np.cbrt(np.linalg.det(present.matrix) / np.linalg.det(inverse)))
 
 
-def _wire(number: int, affine: Affine) -> Values:
+def _to_wire(number: int, affine: Affine) -> Values:
     """As the device will store and print it."""
     rounded = tuple(float(f"{value:.{DIGITS}g}") for value in affine.to_register())
     return as_stored(number, rounded)
 
 
-def _is_there(present: Values, proposed: Values) -> bool:
+def _equals_present(present: Values, proposed: Values) -> bool:
     """Whether they differ by no more than the rounding of one of them (of C: six digits near 1)."""
     difference = np.abs(np.array(_floats(present)) - np.array(_floats(proposed)))
     return bool(difference[:9].max() < 1.2e-5 and difference[9:].max() < 1e-6)
@@ -183,23 +183,29 @@ def _refuse_unusable(estimate: Estimate) -> None:
         raise UnwritableError("the estimated soft iron is not symmetric and positive definite")
 
 
-def _refuse_moved(estimate: Estimate, present: Affine, present_gyro: Affine) -> None:
+def _refuse_undetermined_changes(estimate: Estimate, present: Affine, present_gyro: Affine) -> None:
     """Directions that the motion did not determine must be where the device has them."""
     inverse = np.linalg.inv(present.matrix)
     soft_iron = 0.5 * (inverse + inverse.T) / np.cbrt(np.linalg.det(inverse))
-    held = _named(soft_iron, present.offset, present_gyro.offset)
-    found = _named(estimate.soft_iron, estimate.hard_iron_gauss, estimate.gyro_bias_rad_s)
-    sigma = dict(zip(held, estimate.sigma.tolist(), strict=True))
-    blind = {name for text in estimate.observability.unobservable for name in text.split(" + ")}
-    for name in sorted(blind & held.keys()):
-        if abs(found[name] - held[name]) > HELD_WITHIN_SIGMA * sigma[name] + HELD_WITHIN:
+    current = _numbers_by_name(soft_iron, present.offset, present_gyro.offset)
+    estimated = _numbers_by_name(
+        estimate.soft_iron, estimate.hard_iron_gauss, estimate.gyro_bias_rad_s
+    )
+    sigma = dict(zip(current, estimate.sigma.tolist(), strict=True))
+    undetermined = {
+        name for text in estimate.observability.unobservable for name in text.split(" + ")
+    }
+    for name in sorted(undetermined & current.keys()):
+        if abs(estimated[name] - current[name]) > HELD_WITHIN_SIGMA * sigma[name] + HELD_WITHIN:
             raise UnwritableError(
-                f"{name} is not determined by the motion and yet moved from {held[name]:.4f} to "
-                f"{found[name]:.4f}"
+                f"{name} is not determined by the motion and yet moved from {current[name]:.4f} to "
+                f"{estimated[name]:.4f}"
             )
 
 
-def _named(soft_iron: Array, hard_iron_gauss: Array, gyro_bias_rad_s: Array) -> dict[str, float]:
+def _numbers_by_name(
+    soft_iron: Array, hard_iron_gauss: Array, gyro_bias_rad_s: Array
+) -> dict[str, float]:
     """The twelve numbers of an estimate by name, in the order of its covariance."""
     upper = soft_iron[np.triu_indices(3)]
     numbers = np.concatenate([upper, hard_iron_gauss, gyro_bias_rad_s])

@@ -44,21 +44,21 @@ class Recheck:
     asked_s: float = float("-inf")  # the newest time
     unanswered: bool = False
 
-    def begin(self, host_s: float) -> None:
+    def restart(self, host_s: float) -> None:
         """Restart the interval: the device was read, or is being read."""
         self.asked_s, self.due_s = host_s, host_s + self.interval_s
         self.unanswered = False
 
-    def off(self) -> None:
+    def stop(self) -> None:
         """Stop asking: no device is there."""
         self.due_s = None
 
-    def soon(self, host_s: float) -> None:
+    def schedule_soon(self, host_s: float) -> None:
         """Ask again soon: something is doubtful, or nobody answered."""
         if self.due_s is not None:
             self.due_s = min(self.due_s, max(host_s, self.asked_s + LEAST_S))
 
-    def now(self, host_s: float) -> None:
+    def schedule_now(self, host_s: float) -> None:
         """Ask now: something waits for the answer."""
         if self.due_s is not None:
             self.due_s = host_s
@@ -89,42 +89,44 @@ class RestartWatch:
         self._newest_s = self._newest_at_s = math.nan  # its time, as last heard, and when
         self._started_s = math.inf  # when it started up, at the latest
 
-    def seen(self, record: Stamp, now: Stamp, host_s: float, uptime_s: float | None = None) -> None:
+    def on_restart(
+        self, record: Stamp, now: Stamp, host_s: float, uptime_s: float | None = None
+    ) -> None:
         """A restart was seen; a device that tells its time must show that it was after the record.
 
         So what the device only reports (VNERR) counts where its stream has no time.
         """
-        if self.doubtful(host_s):
+        if self.is_doubtful(host_s):
             self._bound = False
             return
         if uptime_s is not None:
             self._note_fall(uptime_s, host_s)
         untimed = uptime_s is None and self._first_s is None
-        if untimed or self._proves(record, now, uptime_s):
+        if untimed or self._proves_restart_since(record, now, uptime_s):
             self._seen = self._serial
         self._bound = False
 
-    def concluded(self) -> None:
+    def on_restart_proven(self) -> None:
         """Its time has proven a restart: the device is read again, and that counts."""
         self._seen, self._bound = self._serial, False
 
-    def lost(self) -> None:
+    def on_link_lost(self) -> None:
         """The link went away, or nobody is there to ask."""
         self._bound = False
 
-    def doubt(self, host_s: float = -math.inf) -> None:
+    def mark_doubt(self, host_s: float = -math.inf) -> None:
         """From then on the messages may be another device's, until one says who it is."""
         self._doubt_s = host_s if self._doubt_s is None else min(self._doubt_s, host_s)
 
-    def answered(self, asked_s: float, answered_s: float) -> None:
+    def on_confirmed(self, asked_s: float, answered_s: float) -> None:
         """It was this device that was asked; what came in between may still be another's."""
         self._asked_s, self._answered_s = asked_s, answered_s
         if self._doubt_s is not None and self._doubt_s <= asked_s:
             self._doubt_s = None
 
-    def another(self) -> None:
+    def on_other_device(self) -> None:
         """Another device has the cable: what was seen may be of that one, until one is read."""
-        self.doubt()
+        self.mark_doubt()
         self._bound = False
         self._seen, self.fell_s, self._newest_s = None, -math.inf, math.nan
 
@@ -138,44 +140,44 @@ class RestartWatch:
         self._first_s, self._started_s = None, math.inf
         return restarted
 
-    def heard(self, uptime_s: float, host_s: float) -> str:
+    def on_uptime(self, uptime_s: float, host_s: float) -> str:
         """The device's time; why its registers must be read again, empty where they need not."""
         if not self._bound:
             return ""
         if first := self._first_s is None:
             self._first_s = host_s
-        fell = self._fell(uptime_s)
+        fell = self._has_fallen(uptime_s)
         if fell and not first:
             return "the device restarted: its time fell"
-        if not self.doubtful(host_s):
+        if not self.is_doubtful(host_s):
             self._note_fall(uptime_s, host_s)
         self._newest_s, self._newest_at_s = uptime_s, host_s
         self._started_s = min(self._started_s, host_s - uptime_s)
         stale = first and uptime_s < host_s - self._read_from_s - LATENCY_S
         return "the device restarted since it was read" if stale else ""
 
-    def proven(self, record: Stamp, now: Stamp, host_s: float) -> bool:
+    def proves_restart(self, record: Stamp, now: Stamp, host_s: float) -> bool:
         """Whether the device's time proves a restart since this record."""
         settled = self._first_s is not None and host_s - self._first_s >= SETTLE_S
-        if not (self._bound and settled) or self.doubtful(host_s):
+        if not (self._bound and settled) or self.is_doubtful(host_s):
             return False
-        return self._proves(record, now, host_s - self._started_s)
+        return self._proves_restart_since(record, now, host_s - self._started_s)
 
-    def _proves(self, record: Stamp, now: Stamp, uptime_s: float | None) -> bool:
+    def _proves_restart_since(self, record: Stamp, now: Stamp, uptime_s: float | None) -> bool:
         """A record of another boot of the host is older than this run."""
         of_before = bool(now.boot_id) and record.boot_id != now.boot_id
         return (self.fell_s > -math.inf and of_before) or restarted_since(record, now, uptime_s)
 
-    def doubtful(self, host_s: float) -> bool:
+    def is_doubtful(self, host_s: float) -> bool:
         """Whether it is, and was before now: a restart itself makes readings jump."""
         asking = self._asked_s < host_s < self._answered_s
         return asking or (self._doubt_s is not None and self._doubt_s < host_s)
 
     def _note_fall(self, uptime_s: float, host_s: float) -> None:
-        if self._fell(uptime_s) and self._may_have_restarted(uptime_s, host_s):
+        if self._has_fallen(uptime_s) and self._may_have_restarted(uptime_s, host_s):
             self.fell_s = host_s
 
-    def _fell(self, uptime_s: float) -> bool:
+    def _has_fallen(self, uptime_s: float) -> bool:
         return uptime_s < self._newest_s - LATENCY_S
 
     def _may_have_restarted(self, uptime_s: float, host_s: float) -> bool:

@@ -9,7 +9,7 @@ Only what is proven may get to flash, so the trial's registers are undone before
 record of every rollback, and so with all that follows from it where the power goes. Behind the save
 they are written again as a transaction of their own: prepared in the journal, checked, written,
 read back, and tried from the beginning, for nothing that came in between is of the new values.
-The approval is carried over, and with it all that a write needs (`Flow.aside_holds`). It counts as
+The approval is carried over, and with it all that a write needs (`Flow.rewrite_obstacles`). It counts as
 a write of the day's budget; only the pause between two writes is not waited for.
 
 The second write needs the acknowledgement of what the program asked for and, `SETTLE_S` behind it,
@@ -41,12 +41,19 @@ from typing import Final
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.writeback.actions import ActionOutbox, CalibrateAnew, IdentifyAgain, SetUpStream
-from ahrsd.writeback.composition import GYRO, MAG, Proposal, UnwritableError, apart_deg, compose
+from ahrsd.writeback.composition import (
+    GYRO,
+    MAG,
+    Proposal,
+    UnwritableError,
+    compose,
+    proposal_distance_deg,
+)
 from ahrsd.writeback.journal_history import RecordKind, Transaction
 from ahrsd.writeback.permissions import permitted
 from ahrsd.writeback.policy import Safeguards, WriteBackPolicy, contradicts, worth_writing
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
-from ahrsd.writeback.reconcile import found
+from ahrsd.writeback.reconcile import compare_contents
 from ahrsd.writeback.states import (
     LIVED_WITH,
     ON_TIMEOUT,
@@ -131,7 +138,7 @@ RETRY_SAVE_S = 600.0  # after a save that was not sent
 Answer = tuple[bool, str]  # to a person: whether it is accepted, and what follows or why not
 COUNTED = frozenset({"trial", "interlock", "operator"})  # rollbacks that speak against the values
 _ASIDE = (State.ROLLING_BACK, State.SET_ASIDE, State.PREPARING)  # states that remember what was
-_OUT_OF_SIGHT = (Signal.LINK_LOST, Signal.DEVICE_RESET, Signal.IN_DOUBT)
+_DEVICE_LOST = (Signal.LINK_LOST, Signal.DEVICE_RESET, Signal.IN_DOUBT)
 
 
 class Flow:
@@ -149,14 +156,14 @@ class Flow:
         self.proposal: Proposal | None = None
         self.approver = ""
         self.trial = Trial(policy.trial, 0.0)
-        self.passed = ""  # why the trial is passed, until the device was asked again
+        self.trial_passed = ""  # why the trial is passed, until the device was asked again
         self.proven_to_s: float | None = None  # the newest sample when it was, and all was right
         self.waits_for_look = False  # all that is lacking is that the device is asked again
         self.aside: SetAside | None = None  # what is undone for a client
         self.client_write: ClientWrite | None = None  # of what calibrates
         self.staging_s = float("-inf")  # when this run wrote something new last
         self._cause = "device"
-        self._left: dict[int, Values] = {}  # by register, what the device made of ours
+        self._altered_values: dict[int, Values] = {}  # by register, what the device made of ours
         self._from_fault = self._resumed = False
         self._against_since_s: float | None = None
         self._since_s = 0.0
@@ -202,47 +209,47 @@ class Flow:
             if set_aside and signal is Signal.CLIENT_RESET:
                 self.aside = aside
             elif set_aside and target is State.RECONCILING:
-                self._not_again(reason)
-        elif signal in _OUT_OF_SIGHT:
+                self._note_not_rewritten(reason)
+        elif signal in _DEVICE_LOST:
             self.forget_aside(reason)
 
     def enter(self, state: State, reason: str) -> None:
         """Arrive in a state. A procedure of the old one ends."""
-        self.outbox.stop_running()
+        self.outbox.cancel_running()
         self.aside = self.aside if state in _ASIDE else None
         old, self.state = self.state, state
         self._from_fault, self._resumed = old is State.FAULT, old is State.RECONCILING
         self._since_s = self.outbox.host_s
         wait = ON_TIMEOUT.get(state)
         self.deadline_s = None if wait is None else self.outbox.host_s + wait[0]
-        self.outbox.changed(old.value, state.value, reason)
+        self.outbox.emit_state_change(old.value, state.value, reason)
         if state in self._on_entry:
             self._on_entry[state](reason)
 
-    def watch(self) -> None:
+    def take_due_step(self) -> None:
         """Take the step that waits for nothing but a condition, if it holds now."""
         now = (self.outbox.history, self.outbox.host_s, self.outbox.now)
         self.waits_for_look = False
         if self.state is State.QUALIFIED and self.approver:
-            if self.client_write is None and not self.safe.write_holds(*now):
+            if self.client_write is None and not self.safe.write_obstacles(*now):
                 self.signal(Signal.APPROVED, f"approved: {self.approver}")
         elif self.watches_interlock and (
-            word := self.safe.interlock_broken(self.outbox.host_s, self._since_s)
+            word := self.safe.interlock_failure(self.outbox.host_s, self._since_s)
         ):
             self.roll_back("interlock", word)
         elif self.state is State.SET_ASIDE:
-            self._write_again()
+            self._rewrite_if_allowed()
         elif self.state is State.TRIAL and self.proven_to_s is not None:
-            if self.safe.examined(self.proven_to_s) and not self.safe.disagrees:
+            if self.safe.has_examined(self.proven_to_s) and not self.safe.disagrees:
                 self.safe.proof_waits = ""
-                self.outbox.record(RecordKind.PROVEN, reason=self.passed)
-                self.signal(Signal.TRIAL_PASSED, self.passed)
+                self.outbox.record(RecordKind.PROVEN, reason=self.trial_passed)
+                self.signal(Signal.TRIAL_PASSED, self.trial_passed)
         elif self.state is State.PROVEN and self.safe.void:  # it came while the save was under way
             self.roll_back("void", self.safe.void)
         elif self.state is State.PROVEN and self.outbox.host_s >= self._save_from_s:
-            if not (holds := self.safe.save_holds(*now)):
+            if not (holds := self.safe.save_obstacles(*now)):
                 self.signal(Signal.SAVE_DUE, "proven, safe and still")
-            self.waits_for_look = bool(holds) and holds == self.safe.unexamined()
+            self.waits_for_look = bool(holds) and holds == self.safe.unexamined_obstacles()
 
     @property
     def watches_interlock(self) -> bool:
@@ -261,7 +268,7 @@ class Flow:
         self._cause = "device"
         if self.state is State.STAGING:
             self.outbox.record(RecordKind.RAM_FAILED, reason="no end")
-        holds = self.aside_holds() if self.state is State.SET_ASIDE else []
+        holds = self.rewrite_obstacles() if self.state is State.SET_ASIDE else []
         self.signal(Signal.TIMEOUT, "; ".join(holds) or "nothing came in time")
 
     def roll_back(self, cause: str, reason: str) -> None:
@@ -293,7 +300,7 @@ class Flow:
 
     # -- the candidate -----------------------------------------------------------------------------
 
-    def consider(self, estimate: Estimate, gyro_is_raw: bool) -> None:
+    def consider_estimate(self, estimate: Estimate, gyro_is_raw: bool) -> None:
         """A new estimate: is there something to write, and may it be written?
 
         What qualified is kept as it was, so that a person approves what will be written, until the
@@ -310,7 +317,10 @@ class Flow:
             self.signal_if(Signal.GATES_FAILED, f"gates not met: {', '.join(red)}")
         elif self.safe.gates:
             kept = self.proposal
-            if kept is not None and apart_deg(kept, fresh, estimate) > self.policy.min_change_deg:
+            if (
+                kept is not None
+                and proposal_distance_deg(kept, fresh, estimate) > self.policy.min_change_deg
+            ):
                 self.signal_if(Signal.GATES_FAILED, "the estimate moved on")
             if self.state is State.CANDIDATE:
                 self.proposal = fresh
@@ -332,7 +342,7 @@ class Flow:
         self.approver, self.safe.armed = "operator", True
         said = f"{self.proposal.id} approved"
         self.outbox.note("info", said)
-        held = self.safe.write_holds(self.outbox.history, self.outbox.host_s, self.outbox.now)
+        held = self.safe.write_obstacles(self.outbox.history, self.outbox.host_s, self.outbox.now)
         waits = f"; it is written once this is over: {'; '.join(held)}" if held else ""
         return True, f"{said}{waits}"
 
@@ -354,7 +364,7 @@ class Flow:
 
     # -- what is in force, judged by what comes in ------------------------------------------------
 
-    def compare(self, estimate: Estimate, gyro_is_raw: bool) -> None:
+    def compare_estimate(self, estimate: Estimate, gyro_is_raw: bool) -> None:
         """Does the present estimate still ask for what was written, and do its gates pass?
 
         The smallest disagreement holds the pass of a trial and a save; one that is clear and lasts
@@ -366,7 +376,7 @@ class Flow:
         elif self._against_since_s is None:
             self._against_since_s = self.outbox.host_s
         elif self.outbox.host_s - self._against_since_s >= self.policy.trial.worse_for_s:
-            self.void(f"{clear}, for {self.policy.trial.worse_for_s:.0f} s")
+            self.void_calibration(f"{clear}, for {self.policy.trial.worse_for_s:.0f} s")
 
     def _disagreement(
         self, estimate: Estimate, gyro_is_raw: bool, registers: Mapping[int, Values]
@@ -385,7 +395,7 @@ class Flow:
         )
         return reason, reason if contradicts(self.policy, fresh, estimate) else ""
 
-    def void(self, reason: str) -> None:
+    def void_calibration(self, reason: str) -> None:
         """The calibration holds no more: what is not saved yet never will be."""
         if self.state in WITHOUT_TRANSACTION:
             self.signal_if(Signal.GATES_FAILED, reason)
@@ -397,7 +407,7 @@ class Flow:
         """A doubt came after the proof: the registers must be proven again."""
         if self.state in LIVED_WITH:
             self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
-            self.passed, self.proven_to_s = "", None
+            self.trial_passed, self.proven_to_s = "", None
             self.safe.proof_waits = f"{reason}: what is in force is on trial again"
         elif self.aside is not None:
             self.roll_back("client", f"{reason}: what was set aside is not written again")
@@ -416,7 +426,7 @@ class Flow:
 
         It is written again behind that, unless something speaks against it already.
         """
-        against = self.safe.void or self.safe.disagrees or self.trial.in_question
+        against = self.safe.void or self.safe.disagrees or self.trial.currently_worse
         if self.state in (State.TRIAL, State.PROVEN) and not against:
             self.aside = SetAside(self.transaction(), client, does)
         self.roll_back("client", f"{client} {does}, and the old values are in force before that")
@@ -435,9 +445,9 @@ class Flow:
         """What was set aside is not written again; the old values are in RAM already."""
         if self.aside is not None:
             self.aside = None
-            self._not_again(reason)
+            self._note_not_rewritten(reason)
 
-    def _not_again(self, reason: str) -> None:
+    def _note_not_rewritten(self, reason: str) -> None:
         self.outbox.note("info", f"what was on trial is not written again: {reason}")
 
     def judge_aside(self, estimate: Estimate, gyro_is_raw: bool) -> None:
@@ -448,29 +458,29 @@ class Flow:
         if against := self._disagreement(estimate, gyro_is_raw, registers)[0]:
             self.roll_back("client", against)
 
-    def aside_holds(self) -> list[str]:
+    def rewrite_obstacles(self) -> list[str]:
         """Why what was set aside is not written again now; while the trial lasts it may be."""
         if self.aside is None or self.aside.done_s is None:
             return ["what the client asked for is not acknowledged"]
         if not self.aside.confirmed(self.safe.doubt_s):
             return ["the device did not say again what it holds"]
-        return self.safe.again_holds(self.outbox.history, self.outbox.host_s, self.outbox.now)
+        return self.safe.rewrite_obstacles(self.outbox.history, self.outbox.host_s, self.outbox.now)
 
-    def _write_again(self) -> None:
+    def _rewrite_if_allowed(self) -> None:
         """The trial goes on as soon as nothing speaks against it."""
         if self.aside is None:
             return
         self.waits_for_look = self.aside.waits_for_look(self.safe.doubt_s, self.outbox.host_s)
-        if not self.aside_holds():
+        if not self.rewrite_obstacles():
             done = {"saves": "has saved", "resets": "has reset the device"}[self.aside.does]
             self.signal(Signal.GO_ON, f"{self.aside.client} {done}; what was on trial is again")
 
-    def _still_set_aside(self) -> bool:
+    def _keep_set_aside(self) -> bool:
         """A client reset the device, and it was read: whether it is the one that was left."""
         if self.aside is None:
             return False
-        changed = sorted(differences(self.aside.holds, self.expected(self.aside.holds)))
-        if not self.aside.transaction.is_of(self._the_identity().unit):
+        changed = sorted(differences(self.aside.holds, self.expected_values(self.aside.holds)))
+        if not self.aside.transaction.is_of(self._require_identity().unit):
             self.forget_aside("another device answers")
         elif changed:
             which = ", ".join(map(str, changed))
@@ -481,7 +491,7 @@ class Flow:
 
     # -- a client writes what calibrates -----------------------------------------------------------
 
-    def no_client_write(self, number: int) -> str | None:
+    def client_write_refusal(self, number: int) -> str | None:
         """Why a client may not write this register now; "" where it may; None: not yet."""
         if self.safe.mode < Mode.STAGE:
             why = f"the mode is {self.policy.mode.name.lower()}"
@@ -501,9 +511,9 @@ class Flow:
             return "the journal cannot be written"
         return "" if number in self.registers else f"register {number} could not be read"
 
-    def announce(self, client: str, number: int, values: Values) -> None:
+    def journal_client_write(self, client: str, number: int, values: Values) -> None:
         """The journal is told of a client's write, with what the register holds until now."""
-        old, serial = self.registers[number], self._the_identity().serial
+        old, serial = self.registers[number], self._require_identity().serial
         self.client_write = ClientWrite(client, number, values, serial, old)
         self.outbox.record(
             RecordKind.CLIENT_WRITES,
@@ -513,7 +523,7 @@ class Flow:
             new={str(number): list(values)},
         )
 
-    def announced(self, journaled: bool) -> None:
+    def on_client_write_journaled(self, journaled: bool) -> None:
         """That record is on the disk, or is not; then nothing is sent."""
         write = self.client_write
         if write is not None and (write.dropped or not journaled):
@@ -522,7 +532,7 @@ class Flow:
             write.journaled = True
 
     @property
-    def as_announced(self) -> bool:
+    def client_write_ready(self) -> bool:
         """Whether the journal has the client's write, for this unit with what it holds now."""
         write = self.client_write
         if write is None or not write.journaled or self.identity is None:
@@ -537,13 +547,13 @@ class Flow:
         else:
             self.client_write = None
 
-    def client_wrote(self) -> None:
+    def on_client_wrote(self) -> None:
         """The client's write was answered, refused or lost: the device is read again."""
         write, self.client_write = self.client_write, None
         if write is not None:
-            self.safe.client_writes(write.number, self.registers[write.number])
+            self.safe.record_client_write(write.number, self.registers[write.number])
         if write is not None and self.state is not State.RECONCILING:
-            self.look_closer(f"{write.client} wrote register {write.number}")
+            self.reread_device(f"{write.client} wrote register {write.number}")
 
     # -- locks -------------------------------------------------------------------------------------
 
@@ -559,14 +569,14 @@ class Flow:
         """A person looked and found it right. In FAULT: look again."""
         self.outbox.record(RecordKind.UNLOCKED, reason=reason)
         if self.state is State.FAULT:
-            self.outbox.ask(IdentifyAgain())
+            self.outbox.append(IdentifyAgain())
         self.signal_if(Signal.UNLOCK, reason)
         return True, f"unlocked: {reason}"
 
     # -- arriving ----------------------------------------------------------------------------------
 
     def _enter_reconciling(self, reason: str) -> None:
-        self.proposal, self.approver, self._left = None, "", {}
+        self.proposal, self.approver, self._altered_values = None, "", {}
         self.safe.stillness.reset()
 
     def _enter_rest(self, reason: str) -> None:
@@ -581,7 +591,7 @@ class Flow:
         self.proposal, self.approver = None, ""
 
     def _enter_qualified(self, reason: str) -> None:
-        proposal = self._the_proposal()
+        proposal = self._require_proposal()
         small = proposal.heading_change_deg <= self.policy.max_change_auto_deg
         self.approver = "auto" if self.policy.approval == "auto" and small else ""
         may = self.safe.mode >= Mode.STAGE
@@ -607,7 +617,7 @@ class Flow:
         self.outbox.record(RecordKind.PREPARED, **facts, **transaction.facts())
 
     def _new_transaction(self, wall: str) -> Transaction:
-        proposal, identity = self._the_proposal(), self._the_identity()
+        proposal, identity = self._require_proposal(), self._require_identity()
         return Transaction(
             id=f"{proposal.id}-{wall}",
             serial=identity.serial,
@@ -626,18 +636,18 @@ class Flow:
         )
 
     def _enter_staging(self, reason: str) -> None:
-        self._cause, self._left, self.staging_s = "device", {}, self.outbox.host_s
-        self.outbox.in_force(None)
+        self._cause, self._altered_values, self.staging_s = "device", {}, self.outbox.host_s
+        self.outbox.set_in_force(None)
         self.outbox.run("write", Purpose.STAGE, partial(stage, self.transaction()))
 
     def _enter_staged(self, reason: str) -> None:
         transaction = self.transaction()
-        self._now_in_force(transaction.new)
-        self.outbox.written(transaction.old, transaction.new, "verified")
+        self._set_in_force(transaction.new)
+        self.outbox.emit_register_writes(transaction.old, transaction.new, "verified")
         self.outbox.record(RecordKind.RAM_VERIFIED, serial=transaction.serial)
 
     def _enter_trial(self, reason: str) -> None:
-        self.passed, self.proven_to_s = "", None
+        self.trial_passed, self.proven_to_s = "", None
         self.trial = Trial(self.policy.trial, self.transaction().heading_change_deg)
 
     def _enter_proven(self, reason: str) -> None:
@@ -675,9 +685,9 @@ class Flow:
             self.outbox.record(
                 RecordKind.ROLLBACK, reason=reason, cause=self._cause, counts=self._cause in COUNTED
             )
-        self.outbox.in_force(None)
+        self.outbox.set_in_force(None)
         make = partial(
-            roll_back, self.transaction(), only_ours=not self._from_fault, left=self._left
+            roll_back, self.transaction(), only_ours=not self._from_fault, left=self._altered_values
         )
         self.outbox.run("roll back", Purpose.ROLL_BACK, make)
 
@@ -693,68 +703,68 @@ class Flow:
     def on_outcome(self, outcome: ProcedureOutcome) -> None:
         """A procedure came to its end and says how it found the device."""
         if outcome.other is not None:
-            self._another(outcome.other, outcome.written)
+            self._on_other_device_in_procedure(outcome.other, outcome.written)
             return
         endings: dict[State, Callable[[ProcedureOutcome], None]] = {
-            State.CHECKING: self._checked,
-            State.STAGING: self._written,
-            State.SAVING: self._saved,
-            State.ROLLING_BACK: self._rolled_back,
+            State.CHECKING: self._on_checked,
+            State.STAGING: self._on_written,
+            State.SAVING: self._on_saved,
+            State.ROLLING_BACK: self._on_rolled_back,
         }
         endings[self.state](outcome)
 
-    def another(self, unit: Unit) -> None:
+    def on_other_device(self, unit: Unit) -> None:
         """Another device has the cable: forget all that was judged of the first one."""
         wanted = "nobody knew" if self.identity is None else str(self.identity.unit)
         self.outbox.note(
             "error", f"another device answers: {unit}, not {wanted}; nothing is written"
         )
-        self.look_closer(f"another device answers: {unit}")
+        self.reread_device(f"another device answers: {unit}")
 
-    def look_closer(self, reason: str) -> None:
+    def reread_device(self, reason: str) -> None:
         """The device differs from what was expected: identify it, read it, compare."""
-        self.outbox.in_force(None)
-        self.outbox.ask(IdentifyAgain())
+        self.outbox.set_in_force(None)
+        self.outbox.append(IdentifyAgain())
         self.signal(Signal.IN_DOUBT, reason)
 
-    def expected(self, read: Mapping[int, Values]) -> dict[int, Values]:
+    def expected_values(self, read: Mapping[int, Values]) -> dict[int, Values]:
         """The values that these registers are known to hold."""
         return {n: self.registers[n] for n in read if n in self.registers}
 
-    def changed(self, numbers: tuple[int, ...]) -> None:
+    def on_registers_changed(self, numbers: tuple[int, ...]) -> None:
         """The device holds something else than it was left with, nobody knows since when."""
         which = f"register{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers))}"
         reason = f"{which} changed: the device restarted unseen, or somebody else wrote"
         self.outbox.note("warning", reason)
-        self.outbox.ask(CalibrateAnew(reason))
-        self.look_closer(reason)
+        self.outbox.append(CalibrateAnew(reason))
+        self.reread_device(reason)
 
-    def _another(self, unit: Unit, written: bool) -> None:
+    def _on_other_device_in_procedure(self, unit: Unit, written: bool) -> None:
         """In the middle of a procedure; the journal that is open is still the first device's."""
         reason = f"another device answers: {unit}"
         if self.state is State.SAVING:
             self.outbox.record(RecordKind.PROVEN, reason=reason, unsent=True)
         elif self.state in (State.CHECKING, State.STAGING) and not written:
             self.outbox.record(RecordKind.ABORTED, reason=reason)
-        self.another(unit)
+        self.on_other_device(unit)
 
-    def _checked(self, outcome: ProcedureOutcome) -> None:
+    def _on_checked(self, outcome: ProcedureOutcome) -> None:
         if outcome.as_expected:
             self.signal(Signal.DONE, "the device holds what the journal says")
             return
-        self.outbox.in_force(None)
-        self.outbox.ask(IdentifyAgain())
+        self.outbox.set_in_force(None)
+        self.outbox.append(IdentifyAgain())
         self.signal(Signal.DIFFERS, f"somebody else changed the device: {outcome}")
 
-    def _written(self, outcome: ProcedureOutcome) -> None:
+    def _on_written(self, outcome: ProcedureOutcome) -> None:
         if outcome.as_expected:
             self.signal(Signal.DONE, "both registers and the device's identity were read back")
         elif outcome.written:  # a restart, or somebody else, between the writes
-            self.look_closer(f"after the writes {outcome}")
+            self.reread_device(f"after the writes {outcome}")
         else:
             self.signal(Signal.DIFFERS, f"read back: {outcome}")
 
-    def _saved(self, outcome: ProcedureOutcome) -> None:
+    def _on_saved(self, outcome: ProcedureOutcome) -> None:
         if outcome.as_expected:
             self.outbox.record(RecordKind.FLASH_ACKED, serial=self.transaction().serial)
             self.signal(Signal.DONE, "the device acknowledged the save")
@@ -763,17 +773,17 @@ class Flow:
             self.outbox.note("warning", f"not saved: {reason}")
             self.signal(Signal.NOT_SENT, reason)
             if outcome.differing:
-                self.outbox.ask(IdentifyAgain())
+                self.outbox.append(IdentifyAgain())
         self._set_up_stream()
 
     def on_failure(self, error: Exception) -> None:
         """A procedure broke off: the device may be anywhere between old and new."""
         reason, saving = str(error), self.state is State.SAVING
         if isinstance(error, VerifyFailed) and error.echoed:
-            self._left = {error.register: error.read}
+            self._altered_values = {error.register: error.read}
         if self.state is State.STAGING:
             transaction = self.transaction()
-            self.outbox.written(transaction.old, transaction.new, "failed")
+            self.outbox.emit_register_writes(transaction.old, transaction.new, "failed")
             self.outbox.record(RecordKind.RAM_FAILED, reason=reason)
         self.signal(Signal.FAILED, reason)
         if saving:
@@ -782,15 +792,15 @@ class Flow:
     def _set_up_stream(self) -> None:
         """A save put the user's outputs back."""
         if self.session_keys:
-            self.outbox.ask(SetUpStream())
+            self.outbox.append(SetUpStream())
 
-    def _rolled_back(self, outcome: ProcedureOutcome) -> None:
+    def _on_rolled_back(self, outcome: ProcedureOutcome) -> None:
         transaction = self.transaction()
         if not outcome.as_expected:
-            self.look_closer(f"not rolled back: {outcome}")
+            self.reread_device(f"not rolled back: {outcome}")
             return
-        self._now_in_force(transaction.old)
-        self.outbox.written(transaction.new, transaction.old, "undone")
+        self._set_in_force(transaction.old)
+        self.outbox.emit_register_writes(transaction.new, transaction.old, "undone")
         self.outbox.record(RecordKind.ROLLED_BACK, serial=transaction.serial)
         self._lock_after_rollbacks()
         if self.aside is None:
@@ -811,13 +821,13 @@ class Flow:
         if history.torn:
             self.signal(Signal.TORN, "the flash was torn and nobody unlocked it yet")
         elif history.open is None or history.last is None:
-            self._compare_with_the_last()
-            if self._still_set_aside():
+            self._check_last_transaction()
+            if self._keep_set_aside():
                 self.signal(Signal.SET_ASIDE, "a client reset the device, which is as it was")
             else:
                 self.signal(Signal.NOTHING_OPEN, "no transaction is open")
         else:
-            holds = found(history.open.old, history.open.new, self.registers, restarted)
+            holds = compare_contents(history.open.old, history.open.new, self.registers, restarted)
             resolution = RECONCILE[history.last][holds]
             self.outbox.note(resolution.level, resolution.text)
             undoable = self.safe.mode >= Mode.STAGE
@@ -830,12 +840,14 @@ class Flow:
                 self.outbox.record(resolution.record, reason=resolution.text)
             self.signal(resolution.signal, resolution.text)
 
-    def _compare_with_the_last(self) -> None:
+    def _check_last_transaction(self) -> None:
         """No transaction is open: does the device still hold what the last one left in it?"""
         held = self.outbox.history.holds or {}
         changed = [n for n, v in held.items() if not same(n, v, self.registers.get(n, ()))]
         if changed:
-            tried = all(self.outbox.history.tried(n, self.registers.get(n, ())) for n in changed)
+            tried = all(
+                self.outbox.history.is_trial_value(n, self.registers.get(n, ())) for n in changed
+            )
             cause = (
                 "it holds a value of a trial that was undone: the device did not give it up, or "
                 "somebody saved it"
@@ -853,7 +865,7 @@ class Flow:
             if (values := self.registers.get(number)) is not None
             and not held
             and not same(number, factory, values)
-            and not history.knows(number, values)
+            and not history.has_value(number, values)
         ]
         if strange and self.safe.journal_ok:
             self.outbox.note(
@@ -869,16 +881,16 @@ class Flow:
             raise AssertionError(f"{self.state.value} without a transaction")
         return self.outbox.history.open
 
-    def _the_proposal(self) -> Proposal:
+    def _require_proposal(self) -> Proposal:
         if self.proposal is None:
             raise AssertionError(f"{self.state.value} without a proposal")
         return self.proposal
 
-    def _the_identity(self) -> Identity:
+    def _require_identity(self) -> Identity:
         if self.identity is None:
             raise AssertionError(f"{self.state.value} without a device")
         return self.identity
 
-    def _now_in_force(self, values: dict[int, Values]) -> None:
+    def _set_in_force(self, values: dict[int, Values]) -> None:
         self.registers = {**self.registers, **values}
-        self.outbox.in_force(self.registers)
+        self.outbox.set_in_force(self.registers)

@@ -56,10 +56,10 @@ class Stamp:
         """From a journal record, whatever is in it."""
         boot_id = facts.get("boot_id")
         return Stamp(
-            wall_s=_number(facts.get("wall_s")),
+            wall_s=_finite_or_none(facts.get("wall_s")),
             boot_id=boot_id if isinstance(boot_id, str) else "",
-            boot_s=_number(facts.get("boot_s")),
-            device_s=_number(facts.get("device_s")),
+            boot_s=_finite_or_none(facts.get("boot_s")),
+            device_s=_finite_or_none(facts.get("device_s")),
         )
 
     def facts(self) -> dict[str, Any]:
@@ -83,12 +83,12 @@ class Now:
     run_s: float = 0.0
 
 
-def _number(value: object) -> float | None:
+def _finite_or_none(value: object) -> float | None:
     plain = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if plain and math.isfinite(value) else None  # type: ignore[arg-type]
 
 
-def same_boot_s(record: Stamp, now: Stamp) -> float | None:
+def age_by_boottime_s(record: Stamp, now: Stamp) -> float | None:
     """The age of the record by boottime; None where it is of another boot, or claims to be ahead"""
     if not record.boot_id or record.boot_id != now.boot_id:
         return None
@@ -108,14 +108,14 @@ def restarted_since(record: Stamp, now: Stamp, uptime_s: float | None) -> bool:
     fell = record.device_s is not None and uptime_s < record.device_s - LATENCY_S
     if not record.boot_id or record.boot_id != now.boot_id:
         return fell
-    age_s = same_boot_s(record, now)
+    age_s = age_by_boottime_s(record, now)
     if age_s is None:
         return False
     started_later = uptime_s < age_s * (1.0 - CLOCK_RATE) - LATENCY_S
     return started_later or (fell and uptime_s <= age_s * (1.0 + CLOCK_RATE) + LATENCY_S)
 
 
-def passed_s(records: Sequence[Stamp], now: Now) -> list[float]:
+def least_ages_s(records: Sequence[Stamp], now: Now) -> list[float]:
     """For each record, oldest first, the least time that must have passed since; at least 0.
 
     A record is at least as old as every record behind it.
@@ -123,17 +123,17 @@ def passed_s(records: Sequence[Stamp], now: Now) -> list[float]:
     least: list[float] = []
     newest_s = 0.0
     for record in reversed(records):
-        newest_s = max(newest_s, _passed_s(record, now))
+        newest_s = max(newest_s, _least_age_s(record, now))
         least.append(newest_s)
     return least[::-1]
 
 
-def _passed_s(record: Stamp, now: Now) -> float:
+def _least_age_s(record: Stamp, now: Now) -> float:
     wall_s = None
     if plausible(record.wall_s) and plausible(now.stamp.wall_s):
         wall_s = (now.stamp.wall_s or 0.0) - (record.wall_s or 0.0)
     if record.boot_id and record.boot_id == now.stamp.boot_id:
-        age_s = same_boot_s(record, now.stamp)
+        age_s = age_by_boottime_s(record, now.stamp)
         known = [s for s in (age_s, wall_s) if s is not None]
         return min(known) if age_s is not None else 0.0
     up_s = 0.0
@@ -364,23 +364,25 @@ class JournalHistory:
         at = Stamp.of(facts)
         now = replace(self, newest_at=at)
         if kind is RecordKind.CLIENT_WRITES:  # in RAM: the next start may bring either value
-            return now._with_values(facts)._not_sure_of(facts)._without_trials(facts)
+            return now._with_values(facts)._without_holds_of(facts)._without_trials(facts)
         if kind is RecordKind.LOCKED:
             return replace(now, locked=str(facts.get("reason", "no reason given")))
         if kind is RecordKind.UNLOCKED:
             return replace(now, locked=None, torn=False, rollbacks=0, trials=())
         if kind is RecordKind.PREPARED:
             try:
-                return now._begun(Transaction.from_facts(facts), at)._with_values(facts)
+                return now._with_open_transaction(Transaction.from_facts(facts), at)._with_values(
+                    facts
+                )
             except (KeyError, TypeError, ValueError):
                 return replace(now, broken=kind.value)
-        return now._counted(kind, facts, at)._with_transaction_at(kind, facts, at)
+        return now._with_counts(kind, facts, at)._with_transaction_at(kind, facts, at)
 
-    def tried(self, number: int, values: Values) -> bool:
+    def is_trial_value(self, number: int, values: Values) -> bool:
         """Whether a write meant this register to have these values, and nothing kept them."""
         return any(n == number and same(n, known, values) for n, known in self.trials)
 
-    def knows(self, number: int, values: Values) -> bool:
+    def has_value(self, number: int, values: Values) -> bool:
         """Whether a record has these values of this register, as found or as meant."""
         return any(n == number and same(n, known, values) for n, known in self.values)
 
@@ -395,10 +397,10 @@ class JournalHistory:
             return self
         return replace(self, values=tuple(dict.fromkeys((*self.values, *found)))[-TIMES_KEPT:])
 
-    def _begun(self, transaction: Transaction, at: Stamp) -> JournalHistory:
+    def _with_open_transaction(self, transaction: Transaction, at: Stamp) -> JournalHistory:
         """With this transaction open. KeyError or ValueError where its values are no registers'."""
         changed = [(n, v) for n, v in transaction.new.items() if not same(n, v, transaction.old[n])]
-        trials = (*self.trials, *((n, v) for n, v in changed if not self.tried(n, v)))
+        trials = (*self.trials, *((n, v) for n, v in changed if not self.is_trial_value(n, v)))
         return replace(
             self, open=transaction, last=RecordKind.PREPARED, last_at=at, holds=None,
             trials=trials[-TIMES_KEPT:],
@@ -407,16 +409,16 @@ class JournalHistory:
     def _without_trials(self, facts: Mapping[str, Any]) -> JournalHistory:
         """Somebody wrote these values: they are that person's, or program's."""
         try:
-            return replace(self, trials=_without(self.trials, _from_json(facts["new"])))
+            return replace(self, trials=_drop_kept(self.trials, _from_json(facts["new"])))
         except (KeyError, TypeError, ValueError, AttributeError):
             return self
 
-    def _not_sure_of(self, facts: Mapping[str, Any]) -> JournalHistory:
+    def _without_holds_of(self, facts: Mapping[str, Any]) -> JournalHistory:
         written = {str(number) for number in facts.get("new", ())}
         left = {n: v for n, v in (self.holds or {}).items() if str(n) not in written}
         return replace(self, holds=left or None)
 
-    def _counted(self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp) -> JournalHistory:
+    def _with_counts(self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp) -> JournalHistory:
         """Budgets and rollbacks."""
         changes: dict[str, Any] = {}
         if kind in _TOUCHED_RAM and self.last is RecordKind.PREPARED:
@@ -445,7 +447,7 @@ class JournalHistory:
         holds, trials = self.holds, self.trials
         if kind in _HOLDS_NEW:
             holds = self.open.new
-            trials = _without(trials, self.open.new)
+            trials = _drop_kept(trials, self.open.new)
         elif kind in _HOLDS_OLD:
             saved = kind is RecordKind.REVERTED and self.last in (
                 RecordKind.FLASH_SENT,
@@ -459,13 +461,13 @@ class JournalHistory:
         )
 
 
-def _without(
+def _drop_kept(
     trials: Iterable[tuple[int, Values]], kept: Mapping[int, Values]
 ) -> tuple[tuple[int, Values], ...]:
     return tuple((n, v) for n, v in trials if n not in kept or not same(n, kept[n], v))
 
 
-def of_another_device(records: Iterable[JournalRecord], serial: int) -> str:
+def find_record_of_other_device(records: Iterable[JournalRecord], serial: int) -> str:
     """Which record is of a device with another serial number; empty where none is."""
     for number, record in enumerate(records, start=1):
         device = record.facts.get("device")

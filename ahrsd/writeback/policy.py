@@ -18,7 +18,7 @@ from ahrsd.calibration import Estimate
 from ahrsd.events import GateResult
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.composition import GYRO, MAG, Proposal
-from ahrsd.writeback.journal_history import JournalHistory, Now, passed_s
+from ahrsd.writeback.journal_history import JournalHistory, Now, least_ages_s
 from ahrsd.writeback.states import Mode, Purpose
 from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Command, Identity, Word, Write
@@ -125,7 +125,7 @@ def contradicts(policy: WriteBackPolicy, proposal: Proposal, estimate: Estimate)
 def ram_budget(
     policy: WriteBackPolicy, history: JournalHistory, now: Now, *, again: bool = False
 ) -> list[str]:
-    """Why RAM must not be written now; empty where it may. Times as `passed_s` reads them:
+    """Why RAM must not be written now; empty where it may. Times as `least_ages_s` reads them:
     no clock that was wrong, or was set, makes one longer.
 
     again: the values were in RAM just now and were undone for a client's save, so the pause between
@@ -136,7 +136,7 @@ def ram_budget(
         reasons.append(f"locked: {history.locked}; unlock to go on")
     if history.broken is not None:
         reasons.append(f"the journal's {history.broken} record cannot be understood")
-    *writes_s, _ = passed_s((*history.ram_writes_at, history.newest_at), now)
+    *writes_s, _ = least_ages_s((*history.ram_writes_at, history.newest_at), now)
     if writes_s and not again and writes_s[-1] < policy.min_interval_s:
         reasons.append(
             f"the last write was {writes_s[-1]:.0f} s ago, wait for {policy.min_interval_s:.0f} s"
@@ -145,7 +145,7 @@ def ram_budget(
     if today >= policy.ram_writes_per_day:
         reasons.append(f"{today} RAM writes in a day, limit {policy.ram_writes_per_day}")
     if history.rollback_at is not None:
-        since_s, _ = passed_s((history.rollback_at, history.newest_at), now)
+        since_s, _ = least_ages_s((history.rollback_at, history.newest_at), now)
         if since_s < policy.cooldown_s:
             reasons.append(
                 f"a rollback was {since_s / 3600.0:.1f} h ago, wait for "
@@ -157,7 +157,7 @@ def ram_budget(
 def flash_budget(policy: WriteBackPolicy, history: JournalHistory, now: Now) -> list[str]:
     """Why flash must not be written now; empty where it may."""
     reasons: list[str] = []
-    *flashes_s, _ = passed_s((*history.flashes_at, history.newest_at), now)
+    *flashes_s, _ = least_ages_s((*history.flashes_at, history.newest_at), now)
     today = sum(passed < DAY_S for passed in flashes_s)
     if today >= policy.flash_writes_per_day:
         reasons.append(f"{today} flash writes in a day, limit {policy.flash_writes_per_day}")
@@ -199,16 +199,16 @@ class Stillness:
         if block.gap_before:
             self.reset()
         rate = np.linalg.norm(block.gyro_b_rad_s - gyro_bias_rad_s, axis=1)
-        quiet = (rate < self._policy.gyro_rad_s) & np.isfinite(block.accel_b_m_s2).all(axis=1)
-        loud = np.flatnonzero(~quiet)
-        if len(loud):
+        at_rest = (rate < self._policy.gyro_rad_s) & np.isfinite(block.accel_b_m_s2).all(axis=1)
+        moving = np.flatnonzero(~at_rest)
+        if len(moving):
             self.reset()
-        first = int(loud[-1]) + 1 if len(loud) else 0
+        first = int(moving[-1]) + 1 if len(moving) else 0
         if first < len(block):
             self._extend(block.time_s[first:], block.accel_b_m_s2[first:])
         self._device_s, self._host_s = float(block.time_s[-1]), float(block.host_s[-1])
 
-    def why_not(self, host_s: float) -> str | None:
+    def find_motion(self, host_s: float) -> str | None:
         """Why the vehicle does not count as still at this instant, None where it does."""
         policy = self._policy
         age_s = host_s - self._host_s
@@ -273,9 +273,9 @@ class Safeguards:
         self.proof_waits = ""  # why they must be proven again
         self.sampled_s: float | None = None  # host time of the newest sample
         self.examined_s: float | None = None  # and of the newest one in the estimate
-        self._asking_s: deque[float] = deque(maxlen=ASKINGS)  # until it had said who it is
+        self._look_durations_s: deque[float] = deque(maxlen=ASKINGS)  # until it had said who it is
         self.save_from_s = float("-inf")  # when the save was decided
-        self.theirs: frozenset[int] = frozenset()  # registers that others changed in RAM
+        self.changed_by_others: frozenset[int] = frozenset()  # registers that others changed in RAM
         self.client_wrote: dict[int, Values] = {}  # and held before a client wrote and did not save
         self.client_registers: frozenset[int] = frozenset()  # and those of clients' sessions
         self._serial = policy.serial
@@ -289,7 +289,7 @@ class Safeguards:
         """The policy's mode, observe at most while the device or its journal is in doubt."""
         return min(self.policy.mode, Mode.OBSERVE) if self._limits else self.policy.mode
 
-    def no_device(self, why: str) -> None:
+    def set_no_device(self, why: str) -> None:
         """Nothing can be asked, so nothing can be written."""
         self._limits, self._is_ours = [why], False
 
@@ -299,7 +299,7 @@ class Safeguards:
         """Judge a device that was identified and read; the first one is the one to write to."""
         self.journal_ok = self.journal_read = journal_readable
         self.gates = self.flash_gates = ()  # what was judged before is of before
-        self._asking_s.clear()
+        self._look_durations_s.clear()
         hsi = registers.get(HSI_CONTROL)
         self._hsi_applied = hsi is None or hsi[1] == HSI_APPLIED
         self._serial = identity.serial if self._serial is None else self._serial
@@ -316,37 +316,39 @@ class Safeguards:
         if not journal_readable:
             self._limits.append("the journal cannot be read; see its error")
 
-    def arm(self, armed: bool) -> str:
+    def set_armed(self, armed: bool) -> str:
         """Whether this run may begin a write or a save; in words."""
         self.armed = armed
         return "armed: this run may write" if armed else NOT_ARMED
 
-    def client_writes(self, number: int, before: Values) -> None:
+    def record_client_write(self, number: int, before: Values) -> None:
         """A client wrote this register; what it held before is its own as long as nobody knows."""
         self.client_wrote.setdefault(number, before)
 
-    def read_again(self, theirs: frozenset[int], registers: Mapping[int, Values]) -> frozenset[int]:
+    def update_changed_by_others(
+        self, changed: frozenset[int], registers: Mapping[int, Values]
+    ) -> frozenset[int]:
         """Registers that others changed, without those that hold what they held before a client."""
         returned = {
             n for n, before in self.client_wrote.items() if same(n, before, registers.get(n, ()))
         }
-        self.theirs = theirs - returned
-        left = self.client_wrote.keys() & self.theirs
+        self.changed_by_others = changed - returned
+        left = self.client_wrote.keys() & self.changed_by_others
         self.client_wrote = {n: self.client_wrote[n] for n in left}
-        return self.theirs
+        return self.changed_by_others
 
-    def doubt(self, host_s: float) -> None:
+    def mark_doubt(self, host_s: float) -> None:
         """What was judged of samples until now is of before a doubt: nothing is saved by it."""
         if self.examined_s is not None:
             self.examined_s = min(self.examined_s, host_s)
         self.flash_gates, self.doubt_s = (), host_s
         self.stillness.reset()
 
-    def hear_interlock(self, safe: bool, host_s: float) -> None:
+    def set_interlock(self, safe: bool, host_s: float) -> None:
         """The vehicle's word."""
         self._interlock = (safe, host_s)
 
-    def interlock_holds(self, host_s: float) -> str:
+    def interlock_obstacle(self, host_s: float) -> str:
         """Why the vehicle does not allow a write now; empty where it does."""
         if self._interlock is None:
             return "the vehicle has not said that a write is safe"
@@ -357,7 +359,7 @@ class Safeguards:
             return f"the vehicle's word is {host_s - since_s:.1f} s old"
         return ""
 
-    def interlock_broken(self, host_s: float, since_s: float) -> str:
+    def interlock_failure(self, host_s: float, since_s: float) -> str:
         """Why what began at `since_s` must end: the vehicle withdrew its word, or fell silent.
 
         A daemon that has just started gives the vehicle as long to speak as a word lasts.
@@ -365,9 +367,9 @@ class Safeguards:
         begun = self._interlock is None or self._interlock[0]
         if begun and host_s - since_s <= self.policy.interlock_max_age_s:
             return ""
-        return self.interlock_holds(host_s)
+        return self.interlock_obstacle(host_s)
 
-    def write_holds(
+    def write_obstacles(
         self, history: JournalHistory, host_s: float, now: Now, *, again: bool = False
     ) -> list[str]:
         """Why no write may begin now, but for the approval. `again`: see `policy.ram_budget`."""
@@ -389,18 +391,18 @@ class Safeguards:
                 "wrote and did not save: let it save that, or switch the device off and on"
             )
         reasons += ram_budget(self.policy, history, now, again=again)
-        return reasons + self._always(host_s)
+        return reasons + self._common_obstacles(host_s)
 
-    def again_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
+    def rewrite_obstacles(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
         """Why what was set aside may not be written again now: its approval must still hold."""
         reasons = [word for word in (self.void, self.disagrees) if word]
         if not self.armed:
             reasons.append(NOT_ARMED)
-        reasons += self._old_verdict(host_s)
-        more = self.write_holds(history, host_s, now, again=True)
+        reasons += self._stale_verdict(host_s)
+        more = self.write_obstacles(history, host_s, now, again=True)
         return list(dict.fromkeys([*reasons, *more]))
 
-    def save_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
+    def save_obstacles(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
         """Why the flash may not be written now."""
         reasons = [] if self.mode >= Mode.COMMIT else ["only the mode commit may write flash"]
         if not self.armed:
@@ -412,34 +414,34 @@ class Safeguards:
         if not self.flash_gates:
             reasons.append("no gate has judged for flash yet")
         reasons += flash_budget(self.policy, history, now)
-        reasons += self._not_as_judged(host_s)
-        if still := self.stillness.why_not(host_s):
+        reasons += self._validity_obstacles(host_s)
+        if still := self.stillness.find_motion(host_s):
             reasons.append(still)
-        return reasons + self._always(host_s)
+        return reasons + self._common_obstacles(host_s)
 
-    def _not_as_judged(self, host_s: float) -> list[str]:
+    def _validity_obstacles(self, host_s: float) -> list[str]:
         """Why what is in force may not be what was judged, or not be right any more."""
         reasons = [word for word in (self.void, self.disagrees, self.proof_waits) if word]
-        if self.theirs:
-            which = ", ".join(map(str, sorted(self.theirs)))
+        if self.changed_by_others:
+            which = ", ".join(map(str, sorted(self.changed_by_others)))
             reasons.append(
                 f"somebody else changed register {which} in this run, and a save would make it "
                 "permanent; once it is right, switch the device off and on"
             )
-        return reasons + self._old_verdict(host_s) + self.unexamined()
+        return reasons + self._stale_verdict(host_s) + self.unexamined_obstacles()
 
-    def _old_verdict(self, host_s: float) -> list[str]:
+    def _stale_verdict(self, host_s: float) -> list[str]:
         old_s = host_s - self.judged_s
         return [f"the newest verdict is {old_s:.0f} s old"] if old_s > VERDICT_AGE_S else []
 
-    def asking_took(self, took_s: float) -> None:
+    def record_look_duration(self, took_s: float) -> None:
         """The device was asked who it is and what it holds, and answered as it ought to."""
-        self._asking_s.append(took_s)
+        self._look_durations_s.append(took_s)
 
     @property
-    def _on_this_line_s(self) -> float:
+    def _quickest_look_s(self) -> float:
         """How long it takes to ask that, where no answer is late; samples wait meanwhile."""
-        return min(self._asking_s, default=0.0)
+        return min(self._look_durations_s, default=0.0)
 
     def save_too_late(self, host_s: float) -> str:
         """Why what was judged when the save was decided is too old by now; empty where it is not.
@@ -448,7 +450,7 @@ class Safeguards:
         may last as long as they do on this line with no answer late, and as one reply may take
         where the vehicle's word holds for so long.
         """
-        on_this_line_s = SAVE_CHECKS_PER_ASKING * self._on_this_line_s
+        on_this_line_s = SAVE_CHECKS_PER_ASKING * self._quickest_look_s
         reply_s = min(self.policy.reply_timeout_s, self.policy.interlock_max_age_s)
         most_s = max(SAVE_CHECKS_S, on_this_line_s, reply_s)
         if (took_s := host_s - self.save_from_s) <= most_s:
@@ -458,16 +460,16 @@ class Safeguards:
             f"decided, {most_s:.1f} s are allowed"
         )
 
-    def examined(self, to_s: float) -> bool:
+    def has_examined(self, to_s: float) -> bool:
         """Whether the estimate has taken the samples up to this host time into account."""
         return self.examined_s is None or self.examined_s >= to_s
 
-    def unexamined(self) -> list[str]:
+    def unexamined_obstacles(self) -> list[str]:
         """Whether the estimate lags behind the samples, which wait for the device's answer."""
         if self.sampled_s is None or self.examined_s is None:
             return []
         late_s = self.sampled_s - self.examined_s
-        if late_s <= UNEXAMINED_S + self._on_this_line_s:
+        if late_s <= UNEXAMINED_S + self._quickest_look_s:
             return []
         return [f"the newest {late_s:.0f} s of samples are not judged yet"]
 
@@ -483,19 +485,21 @@ class Safeguards:
         A rollback asks neither the vehicle nor the journal: the old values are what it lived with.
         """
         if isinstance(command, Write) and purpose is not Purpose.ROLL_BACK:
-            return (self.armed or purpose is not Purpose.STAGE) and not self.interlock_holds(host_s)
+            return (self.armed or purpose is not Purpose.STAGE) and not self.interlock_obstacle(
+                host_s
+            )
         if isinstance(command, Word) and command.word == "VNWNV":
             return (
                 self.armed
                 and self.journal_ok
-                and not (self.void or self.disagrees or self.proof_waits or self.theirs)
-                and not (self.interlock_holds(host_s) or self.stillness.why_not(host_s))
+                and not (self.void or self.disagrees or self.proof_waits or self.changed_by_others)
+                and not (self.interlock_obstacle(host_s) or self.stillness.find_motion(host_s))
                 and not self.save_too_late(host_s)
             )
         return True
 
-    def _always(self, host_s: float) -> list[str]:
-        reasons = [word] if (word := self.interlock_holds(host_s)) else []
+    def _common_obstacles(self, host_s: float) -> list[str]:
+        reasons = [word] if (word := self.interlock_obstacle(host_s)) else []
         if not self.journal_ok:
             reasons.append("the journal cannot be written; free the disk, then unlock")
         if self.stopping:

@@ -45,7 +45,7 @@ class Resolution:
     text: str
 
 
-def found(
+def compare_contents(
     old: Mapping[int, Values],
     new: Mapping[int, Values],
     device: Mapping[int, Values],
@@ -63,7 +63,7 @@ def found(
     return DeviceContents.NEITHER
 
 
-def _foreign(what: str) -> Resolution:
+def _report_foreign(what: str) -> Resolution:
     return Resolution(
         Signal.FOREIGN,
         RecordKind.FOREIGN,
@@ -77,7 +77,7 @@ def _undo(level: str, text: str) -> Resolution:
     return Resolution(Signal.UNDO, RecordKind.ROLLBACK, level, text)
 
 
-def _closed(record: RecordKind, level: str, text: str) -> Resolution:
+def _close(record: RecordKind, level: str, text: str) -> Resolution:
     return Resolution(Signal.NOTHING_OPEN, record, level, text)
 
 
@@ -108,10 +108,10 @@ _BACK: Final = (
 
 TABLE: Final[dict[RecordKind, dict[DeviceContents, Resolution]]] = {
     RecordKind.PREPARED: {
-        DeviceContents.OLD: _closed(
+        DeviceContents.OLD: _close(
             RecordKind.ABORTED, "info", "a write was prepared and never made"
         ),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.ABORTED,
             "info",
             "a write was prepared; the device restarted with its old values",
@@ -125,24 +125,24 @@ TABLE: Final[dict[RecordKind, dict[DeviceContents, Resolution]]] = {
         DeviceContents.NEW_AFTER_RESTART: _saved_by_others("a write was prepared"),
         DeviceContents.MIXED: _undo("warning", "a write was interrupted between its registers"),
         DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("a write was prepared"),
-        DeviceContents.NEITHER: _foreign("a write was prepared"),
+        DeviceContents.NEITHER: _report_foreign("a write was prepared"),
     },
     RecordKind.RAM_FAILED: {
-        DeviceContents.OLD: _closed(RecordKind.ROLLED_BACK, "info", "a failed write is undone"),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD: _close(RecordKind.ROLLED_BACK, "info", "a failed write is undone"),
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.ROLLED_BACK, "info", "a failed write is undone"
         ),
         DeviceContents.NEW: _undo("warning", "a failed write was not undone"),
         DeviceContents.NEW_AFTER_RESTART: _saved_by_others("a write failed"),
         DeviceContents.MIXED: _undo("warning", "a failed write was not undone"),
         DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("a write failed"),
-        DeviceContents.NEITHER: _foreign("a write failed"),
+        DeviceContents.NEITHER: _report_foreign("a write failed"),
     },
     RecordKind.RAM_VERIFIED: {
-        DeviceContents.OLD: _closed(
+        DeviceContents.OLD: _close(
             RecordKind.REVERTED, "warning", f"a trial was under way; {_BACK}"
         ),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.LOST,
             "warning",
             "the device restarted during the trial and has its old values: safe",
@@ -153,13 +153,13 @@ TABLE: Final[dict[RecordKind, dict[DeviceContents, Resolution]]] = {
         DeviceContents.NEW_AFTER_RESTART: _saved_by_others("a trial was under way"),
         DeviceContents.MIXED: _undo("warning", "one of two registers went back by itself"),
         DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("a trial was under way"),
-        DeviceContents.NEITHER: _foreign("a trial was under way"),
+        DeviceContents.NEITHER: _report_foreign("a trial was under way"),
     },
     RecordKind.PROVEN: {
-        DeviceContents.OLD: _closed(
+        DeviceContents.OLD: _close(
             RecordKind.REVERTED, "warning", f"proven values waited to be saved; {_BACK}"
         ),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.LOST,
             "warning",
             "the device restarted before the proven values were saved and has its old ones: safe",
@@ -175,26 +175,26 @@ TABLE: Final[dict[RecordKind, dict[DeviceContents, Resolution]]] = {
         ),
         DeviceContents.MIXED: _undo("warning", "one of two registers went back by itself"),
         DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("proven values waited to be saved"),
-        DeviceContents.NEITHER: _foreign("proven values waited to be saved"),
+        DeviceContents.NEITHER: _report_foreign("proven values waited to be saved"),
     },
     RecordKind.ROLLBACK: {
-        DeviceContents.OLD: _closed(RecordKind.ROLLED_BACK, "info", "a rollback is complete"),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD: _close(RecordKind.ROLLED_BACK, "info", "a rollback is complete"),
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.ROLLED_BACK, "info", "a rollback is complete"
         ),
         DeviceContents.NEW: _undo("warning", "a rollback was interrupted"),
         DeviceContents.NEW_AFTER_RESTART: _saved_by_others("a rollback was interrupted"),
         DeviceContents.MIXED: _undo("warning", "a rollback was interrupted"),
         DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("a rollback was interrupted"),
-        DeviceContents.NEITHER: _foreign("a rollback was interrupted"),
+        DeviceContents.NEITHER: _report_foreign("a rollback was interrupted"),
     },
     RecordKind.FLASH_SENT: {
-        DeviceContents.OLD: _closed(
+        DeviceContents.OLD: _close(
             RecordKind.REVERTED,
             "warning",
             f"saving was interrupted; {_BACK}; its flash may hold either, the next restart tells",
         ),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.NOT_SAVED,
             "warning",
             "saving was interrupted and the device has its old values: not saved, safe",
@@ -212,12 +212,12 @@ TABLE: Final[dict[RecordKind, dict[DeviceContents, Resolution]]] = {
         DeviceContents.NEITHER: _TORN,
     },
     RecordKind.FLASH_ACKED: {
-        DeviceContents.OLD: _closed(
+        DeviceContents.OLD: _close(
             RecordKind.REVERTED,
             "warning",
             f"the new values were saved; {_BACK}; the next restart tells what its flash holds",
         ),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.NOT_SAVED,
             "error",
             "the device acknowledged the save and still has its old values",

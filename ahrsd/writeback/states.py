@@ -285,6 +285,6 @@ WITHOUT_TRANSACTION: Final = frozenset(
 )
 
 
-def after(state: State, signal: Signal) -> State:
+def next_state(state: State, signal: Signal) -> State:
     """The state that `signal` leads to; `state` itself where it is ignored."""
     return TABLE[state].get(signal, state)

@@ -109,7 +109,7 @@ def save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[Pr
     return quiet(_save(transaction, session_keys))
 
 
-def _other(transaction: Transaction) -> Procedure[Unit | None]:
+def _find_other_device(transaction: Transaction) -> Procedure[Unit | None]:
     """Who answers, where it is another device; asked twice, for a reply may be altered."""
     unit = yield from read_unit()
     if transaction.is_of(unit):
@@ -118,14 +118,14 @@ def _other(transaction: Transaction) -> Procedure[Unit | None]:
     return None if transaction.is_of(unit) else unit
 
 
-def _other_by_serial(transaction: Transaction) -> Procedure[Unit | None]:
+def _find_other_by_serial(transaction: Transaction) -> Procedure[Unit | None]:
     """The same within a procedure that has asked already: the serial number is enough."""
     if int((yield from read(3))[0]) == transaction.serial:
         return None
-    return (yield from _other(transaction))
+    return (yield from _find_other_device(transaction))
 
 
-def _changed(expected: Mapping[int, Values]) -> Procedure[tuple[int, ...]]:
+def _read_differences(expected: Mapping[int, Values]) -> Procedure[tuple[int, ...]]:
     """Registers that do not hold what is expected, in two readings."""
     changed = differences(expected, (yield from read_registers(expected)))
     if changed:
@@ -134,7 +134,7 @@ def _changed(expected: Mapping[int, Values]) -> Procedure[tuple[int, ...]]:
 
 
 def _check(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[ProcedureOutcome]:
-    if (other := (yield from _other(transaction))) is not None:
+    if (other := (yield from _find_other_device(transaction))) is not None:
         return ProcedureOutcome(False, other=other)
     return (yield from _compare(transaction, transaction.old, session_keys))
 
@@ -149,9 +149,9 @@ def _compare(
 
 
 def _stage(transaction: Transaction) -> Procedure[ProcedureOutcome]:
-    if (other := (yield from _other(transaction))) is not None:
+    if (other := (yield from _find_other_device(transaction))) is not None:
         return ProcedureOutcome(False, other=other)
-    if changed := (yield from _changed(transaction.old)):
+    if changed := (yield from _read_differences(transaction.old)):
         return ProcedureOutcome(False, changed)
     written = False
     for number, values in transaction.new.items():
@@ -159,7 +159,7 @@ def _stage(transaction: Transaction) -> Procedure[ProcedureOutcome]:
         if refused is not None:
             return refused
         written = True
-    return (yield from _read_all_back(transaction, transaction.new))
+    return (yield from _verify_all(transaction, transaction.new))
 
 
 def _roll_back(
@@ -169,7 +169,7 @@ def _roll_back(
     try:
         with suppress(NoReply, DeviceRefused):
             yield QUIET
-        return (yield from _put_back(transaction, only_ours, left))
+        return (yield from _restore_old_values(transaction, only_ours, left))
     except GeneratorExit:  # dropped without an end: nobody is there to carry out a command
         abandoned = True
         raise
@@ -179,13 +179,13 @@ def _roll_back(
                 yield from resume()
 
 
-def _read_all_back(
+def _verify_all(
     transaction: Transaction, expected: Mapping[int, Values]
 ) -> Procedure[ProcedureOutcome]:
     """Both registers in one reading, and whose they are: a restart between two writes shows."""
-    if (other := (yield from _other_by_serial(transaction))) is not None:
+    if (other := (yield from _find_other_by_serial(transaction))) is not None:
         return ProcedureOutcome(False, other=other, written=True)
-    changed = yield from _changed(expected)
+    changed = yield from _read_differences(expected)
     return ProcedureOutcome(not changed, changed, written=True)
 
 
@@ -203,8 +203,8 @@ def _write(
     """
     echo: list[Values] = []
     for attempt in range(1, WRITE_TRIES + 1):
-        command = _written_once(number, values, echo)
-        if (other := (yield from _right_behind(transaction, command))) is not None:
+        command = _make_single_write(number, values, echo)
+        if (other := (yield from _run_after_serial_check(transaction, command))) is not None:
             return ProcedureOutcome(False, other=other, written=written)
         written = True
         back = yield from read(number)
@@ -218,7 +218,9 @@ def _write(
     raise VerifyFailed(number, values, back, attempt, echoed=echoed)
 
 
-def _written_once(number: int, values: Values, echo: list[Values]) -> Callable[[], Procedure[None]]:
+def _make_single_write(
+    number: int, values: Values, echo: list[Values]
+) -> Callable[[], Procedure[None]]:
     """The write, as often as asked; what the device answered goes into `echo`."""
 
     def write() -> Procedure[None]:
@@ -229,7 +231,7 @@ def _written_once(number: int, values: Values, echo: list[Values]) -> Callable[[
     return write
 
 
-def _right_behind(
+def _run_after_serial_check(
     transaction: Transaction, make: Callable[[], Procedure[None]]
 ) -> Procedure[Unit | None]:
     """Carry out what changes the device right behind its serial number; the unit that is another.
@@ -238,7 +240,7 @@ def _right_behind(
     Raises TooLate where no answer comes soon enough.
     """
     for left in reversed(range(BEHIND_TRIES)):
-        if (other := (yield from _other_by_serial(transaction))) is not None:
+        if (other := (yield from _find_other_by_serial(transaction))) is not None:
             return other
         try:
             yield from make()
@@ -250,12 +252,12 @@ def _right_behind(
     return None
 
 
-def _put_back(
+def _restore_old_values(
     transaction: Transaction, only_ours: bool, left: Mapping[int, Values]
 ) -> Procedure[ProcedureOutcome]:
-    if (other := (yield from _other_by_serial(transaction))) is not None:
+    if (other := (yield from _find_other_by_serial(transaction))) is not None:
         return ProcedureOutcome(False, other=other)
-    if only_ours and (strange := (yield from _foreign_values(transaction, left))):
+    if only_ours and (strange := (yield from _find_foreign_values(transaction, left))):
         return ProcedureOutcome(False, strange)
     errors: dict[int, Exception] = {}
     for number, values in transaction.old.items():
@@ -269,10 +271,10 @@ def _put_back(
             return refused
     if errors:
         raise RestoreFailed(errors)
-    return (yield from _read_all_back(transaction, transaction.old))
+    return (yield from _verify_all(transaction, transaction.old))
 
 
-def _foreign_values(
+def _find_foreign_values(
     transaction: Transaction, left: Mapping[int, Values]
 ) -> Procedure[tuple[int, ...]]:
     """Registers that hold neither the old nor the new value nor what is left, in two readings."""
@@ -288,17 +290,19 @@ def _foreign_values(
 
 def _save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[ProcedureOutcome]:
     try:
-        if (other := (yield from _other(transaction))) is not None:
+        if (other := (yield from _find_other_device(transaction))) is not None:
             return ProcedureOutcome(False, other=other)
         yield from restore(transaction.snapshot, sorted(session_keys))
         outcome = yield from _compare(transaction, transaction.new, frozenset())
         if outcome.as_expected:
-            outcome = yield from _read_all_back(transaction, transaction.new)
+            outcome = yield from _verify_all(transaction, transaction.new)
     except (NotPermitted, RestoreFailed, NoReply, DeviceRefused) as error:
         return ProcedureOutcome(False, why=str(error))
     if outcome.as_expected:
         try:
-            other = yield from _right_behind(transaction, partial(save_settings, behind=True))
+            other = yield from _run_after_serial_check(
+                transaction, partial(save_settings, behind=True)
+            )
         except (NotPermitted, TooLate) as error:
             return ProcedureOutcome(False, why=str(error))
         if other is not None:

@@ -152,7 +152,7 @@ class Trial:
         self._worse_since_s: float | None = None
 
     @property
-    def in_question(self) -> bool:
+    def currently_worse(self) -> bool:
         """Whether the newest figures speak against the new registers."""
         return self._worse_since_s is not None
 
@@ -160,7 +160,7 @@ class Trial:
         """The finding and its reason. Metrics that are not finite say nothing."""
         if not metrics.finite:
             return TrialVerdict.GOES_ON, "nothing to judge yet"
-        if reason := self._failure(metrics):
+        if reason := self._find_failure(metrics):
             return TrialVerdict.FAILED, reason
         policy = self._policy
         if self._worse_since_s is not None:
@@ -174,7 +174,7 @@ class Trial:
             )
         return TrialVerdict.GOES_ON, ""
 
-    def _failure(self, metrics: TrialMetrics) -> str | None:
+    def _find_failure(self, metrics: TrialMetrics) -> str | None:
         policy = self._policy
         spread_percent = 100.0 * metrics.field_spread
         if spread_percent > policy.max_spread_percent:
@@ -188,9 +188,9 @@ class Trial:
                 f"(with the old registers {metrics.old_wrong:.2%}), clearly more than "
                 f"{policy.max_wrong_percent} %"
             )
-        if (jump := metrics.heading_jump_deg) is not None and self._unexpected(jump):
+        if (jump := metrics.heading_jump_deg) is not None and self._is_unexpected_jump(jump):
             return f"the heading jumped by {jump:.1f} deg, predicted {self._predicted_deg:.1f} deg"
-        worse = _worse(metrics, 1.0 + policy.worse_percent / 100.0)
+        worse = _describe_worsening(metrics, 1.0 + policy.worse_percent / 100.0)
         if worse is None:
             self._worse_since_s = None
             return None
@@ -200,14 +200,14 @@ class Trial:
             return f"{worse}, for {policy.worse_for_s:.0f} s"
         return None
 
-    def _unexpected(self, jump_deg: float) -> bool:
+    def _is_unexpected_jump(self, jump_deg: float) -> bool:
         """More than twice the prediction, or over it by the limit; a nan is unexpected too."""
         size = abs(jump_deg)
         likely = size <= 2.0 * self._predicted_deg + JUMP_NOISE_DEG
         return not (likely and size <= self._predicted_deg + self._policy.max_jump_deg)
 
 
-def _worse(metrics: TrialMetrics, factor: float) -> str | None:
+def _describe_worsening(metrics: TrialMetrics, factor: float) -> str | None:
     """What is worse with the new registers than with the old ones, in words."""
     if metrics.turned and metrics.new_figure > metrics.old_figure * factor:
         return (
@@ -259,40 +259,40 @@ class LeftoverError:
 
     def __init__(self) -> None:
         self._fields: list[Array] = []
-        self._begun_s = 0.0
-        self._done: deque[_Stretch] = deque(maxlen=LEFTOVER_STRETCHES)
+        self._start_s = 0.0
+        self._stretches: deque[_Stretch] = deque(maxlen=LEFTOVER_STRETCHES)
 
     def add(self, time_s: float, corrected: Array) -> None:
         """One corrected field (3,), some ten a second."""
         if not self._fields:
-            self._begun_s = time_s
+            self._start_s = time_s
         self._fields.append(corrected)
-        length_s = time_s - self._begun_s
+        length_s = time_s - self._start_s
         if not 0.0 <= length_s <= 2.0 * LONGEST_S:  # a gap, or the clock fell
             self._fields = [corrected]
-            self._begun_s = time_s
+            self._start_s = time_s
         elif length_s >= SHORTEST_S:
-            self._close(last=length_s >= LONGEST_S)
+            self._close_stretch(last=length_s >= LONGEST_S)
 
     def leftover(self, limit: float) -> Leftover:
         """What is explained, and how clearly it is more than `limit` (parts of the field)."""
-        count = len(self._done)
+        count = len(self._stretches)
         if count < LEFTOVER_FEWEST:
             return Leftover()
-        halves = [list(self._done)[half::2] for half in (0, 1)]
-        (first, _), (second, _) = (_fit(half) for half in halves)
-        both, A = _fit([one for half in halves for one in half])
-        left = [one.g - one.A @ second for one in halves[0]]
-        left += [one.g - one.A @ first for one in halves[1]]
-        solved = np.linalg.solve(A, np.array(left).T)
-        per_row = A / sum(one.rows for one in self._done)
-        spread = per_row @ (solved @ solved.T)
+        halves = [list(self._stretches)[half::2] for half in (0, 1)]
+        (first, _), (second, _) = (_fit_leftover(half) for half in halves)
+        both, A = _fit_leftover([one for half in halves for one in half])
+        residuals = [one.g - one.A @ second for one in halves[0]]
+        residuals += [one.g - one.A @ first for one in halves[1]]
+        deviation = np.linalg.solve(A, np.array(residuals).T)
+        per_row = A / sum(one.rows for one in self._stretches)
+        spread = per_row @ (deviation @ deviation.T)
         square = float(first @ per_row @ second)
         variance = 4.0 * both @ spread @ per_row @ both + 2.0 * np.trace(spread @ spread)
         sigma = max(float(np.sqrt(max(variance, 0.0))), _LEAST_SIGMA)
         return Leftover(float(np.sqrt(max(square, 0.0))), (square - limit**2) / sigma)
 
-    def _close(self, *, last: bool) -> None:
+    def _close_stretch(self, *, last: bool) -> None:
         """End the stretch where the vehicle turned in it; where it did not, it says nothing."""
         field = np.array(self._fields)
         size = np.linalg.norm(field, axis=1)
@@ -307,15 +307,15 @@ class LeftoverError:
             X = X - X.mean(axis=0)
             y = size / size.mean()
             y = y - y.mean()
-            self._done.append(_Stretch(len(y), X.T @ X, X.T @ y, float(y @ y)))
+            self._stretches.append(_Stretch(len(y), X.T @ X, X.T @ y, float(y @ y)))
 
 
-def _fit(stretches: list[_Stretch]) -> tuple[Array, Array]:
+def _fit_leftover(stretches: list[_Stretch]) -> tuple[Array, Array]:
     """b (8,) by least squares, held towards zero by what is believed before; its matrix (8, 8)."""
     A, g = sum(one.A for one in stretches), sum(one.g for one in stretches)
     noise = sum(one.yy for one in stretches) / sum(one.rows for one in stretches)
-    held = np.asarray(A) + np.eye(8) * (noise / _BELIEF**2 + 1e-9)
-    return np.asarray(np.linalg.solve(held, np.asarray(g))), held
+    regularized = np.asarray(A) + np.eye(8) * (noise / _BELIEF**2 + 1e-9)
+    return np.asarray(np.linalg.solve(regularized, np.asarray(g))), regularized
 
 
 # -- Steadiness of the carried field ---------------------------------------------------------------
@@ -331,8 +331,8 @@ class CarriedField:
 
     def __init__(self, pairs: Sequence[tuple[Affine, Array]]) -> None:
         self._pairs = [(mag, bias.copy()) for mag, bias in pairs]
-        self._done: deque[Array] = deque(maxlen=CARRIED_STRETCHES)
-        self._begin()
+        self._spreads: deque[Array] = deque(maxlen=CARRIED_STRETCHES)
+        self._begin_stretch()
 
     def take(self, block: SampleBlock) -> None:
         """Further samples; a step of unknown length begins a new stretch."""
@@ -343,8 +343,8 @@ class CarriedField:
         fields = [mag.apply(block.raw_b_gauss) for mag, _ in self._pairs]
         for k in range(len(block)):
             if not usable[k] or self._length_s > STRETCH_S:
-                self._end()
-                self._begin()
+                self._close_stretch()
+                self._begin_stretch()
                 continue
             self._length_s += float(dt_s[k])
             for n in range(len(self._pairs)):
@@ -354,22 +354,22 @@ class CarriedField:
     @property
     def spreads(self) -> Array:
         """(pairs,) rms over the newest stretches; nan before the first one has ended."""
-        if not self._done:
+        if not self._spreads:
             return np.full(len(self._pairs), np.nan)
-        return np.asarray(np.sqrt(np.mean(self._done, axis=0)))
+        return np.asarray(np.sqrt(np.mean(self._spreads, axis=0)))
 
-    def _begin(self) -> None:
+    def _begin_stretch(self) -> None:
         self._length_s = 0.0
         self._R = [np.eye(3) for _ in self._pairs]
         self._carried: list[list[Array]] = [[] for _ in self._pairs]
 
-    def _end(self) -> None:
+    def _close_stretch(self) -> None:
         if len(self._carried[0]) < _CARRIED_FEWEST:
             return
         u = np.array(self._carried)
         mean = u.mean(axis=1)
         squares = ((u - mean[:, None]) ** 2).sum(axis=2).mean(axis=1)
-        self._done.append(squares / (mean**2).sum(axis=1))
+        self._spreads.append(squares / (mean**2).sum(axis=1))
 
 
 # -- Live figures ----------------------------------------------------------------------------------
@@ -414,7 +414,7 @@ class LiveTrial:
         if self._start_s is None:
             self._start_s = self._last_s = float(block.time_s[0])
         self._carried.take(block)
-        down = _down(block.accel_b_m_s2)
+        down = _mean_down(block.accel_b_m_s2)
         rate = (block.gyro_b_rad_s - self._bias) @ down if np.isfinite(down).all() else np.zeros(1)
         self._turned_rad += abs(float(np.nansum(rate * np.nan_to_num(block.dt_s))))
         for t, m in zip(block.time_s.tolist(), block.raw_b_gauss, strict=True):
@@ -426,21 +426,21 @@ class LiveTrial:
         while self._rows and now_s - self._rows[0][0] > _WINDOW_S:
             self._rows.popleft()
         self._last_s = now_s
-        for piece in _pieces(block.time_s):
+        for piece in _split_pieces(block.time_s):
             if self._jump_covered_s < _JUMP_S:
-                self._see_jump(
+                self._add_heading_jump(
                     block.raw_b_gauss[piece], block.accel_b_m_s2[piece], block.dt_s[piece]
                 )
         return self._metrics()
 
-    def _see_jump(self, raw: Array, accel: Array, dt_s: Array) -> None:
+    def _add_heading_jump(self, raw: Array, accel: Array, dt_s: Array) -> None:
         """How far the heading of these samples is from what it was with the old registers."""
-        down = _down(accel)
+        down = _mean_down(accel)
         if not down[2] >= _LEVEL:  # nor where it is nan
             return
         field = self._new.apply(raw.mean(axis=0)[None])
         heading = tilt_compensated_heading(field, -down[None])
-        level = self._new.undo(_levelled(field[0], heading[0], down)[None])
+        level = self._new.undo(_level_field(field[0], heading[0], down)[None])
         before = tilt_compensated_heading(self._old.apply(level), np.array([[0.0, 0.0, -1.0]]))
         self._jumps.append(float((heading - before)[0]))
         self._jump_covered_s += float(np.nansum(np.minimum(dt_s, _PIECE_S)))
@@ -456,7 +456,7 @@ class LiveTrial:
         if self._jumps:
             angles = np.array(self._jumps)
             jump = float(np.degrees(np.arctan2(np.sin(angles).mean(), np.cos(angles).mean())))
-        left = self._leftover.leftover(self._wrong_limit)
+        leftover = self._leftover.leftover(self._wrong_limit)
         swing = np.nan_to_num(self._carried.spreads)
         start = self._last_s if self._start_s is None else self._start_s
         return TrialMetrics(
@@ -469,13 +469,13 @@ class LiveTrial:
             heading_jump_deg=jump,
             new_swing=float(swing[0]),
             old_swing=float(swing[1:].min() if turned else swing[_OLD_GYRO]),
-            wrong=left.share,
+            wrong=leftover.share,
             old_wrong=self._old_leftover.leftover(self._wrong_limit).share,
-            wrong_sigmas=left.sigmas,
+            wrong_sigmas=leftover.sigmas,
         )
 
 
-def _levelled(field_b: Array, heading_rad: float, down_b: Array) -> Array:
+def _level_field(field_b: Array, heading_rad: float, down_b: Array) -> Array:
     """The same field as it would be in the sensor's axes were it level, on the same heading."""
     vertical = float(down_b @ field_b)
     horizontal = float(np.linalg.norm(field_b - vertical * down_b))
@@ -483,7 +483,7 @@ def _levelled(field_b: Array, heading_rad: float, down_b: Array) -> Array:
     return np.asarray(horizontal * north + np.array([0.0, 0.0, vertical]))
 
 
-def _pieces(time_s: Array) -> list[slice]:
+def _split_pieces(time_s: Array) -> list[slice]:
     """Samples that follow each other within `_PIECE_S` of the first of their piece."""
     starts = [0]
     for k, t in enumerate(time_s.tolist()):
@@ -492,6 +492,6 @@ def _pieces(time_s: Array) -> list[slice]:
     return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(time_s)], strict=True)]
 
 
-def _down(accel: Array) -> Array:
+def _mean_down(accel: Array) -> Array:
     mean = accel.mean(axis=0)
     return np.asarray(-mean / max(float(np.linalg.norm(mean)), 1e-9))

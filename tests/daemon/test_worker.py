@@ -335,7 +335,7 @@ def test_nothing_is_written_from_an_estimator_that_failed(state):
         run.run(1.0)
         fail_waiting(run)
     assert run.core.writeback.proposal is None
-    assert "no gate has judged yet" in run.core.writeback.holds()
+    assert "no gate has judged yet" in run.core.writeback.obstacles()
 
 
 def fail_waiting(run: BesideRun) -> None:

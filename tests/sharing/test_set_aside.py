@@ -97,7 +97,7 @@ def test_a_second_save_sets_it_aside_again_until_the_days_writes_are_used_up():
     assert run.states[-1] != "TRIAL"
     assert run.cable.unit.held() == ONE
     assert [number for number, _ in run.cable.unit.writes].count(23) == 12  # six, each undone
-    assert any("6 RAM writes in a day" in reason for reason in run.core.writeback.holds())
+    assert any("6 RAM writes in a day" in reason for reason in run.core.writeback.obstacles())
 
 
 @pytest.mark.parametrize("what", ["unsafe", "unheard", "disarm", "gone", "killed link", "stop"])
