@@ -1,24 +1,22 @@
-"""Whether the device is still the one that was read, and still runs: asked again, seen by itself.
+"""Whether the device is still the one that was read, and whether it restarted.
 
-**Recheck.** When a device that is written or listened to is asked again who it is and what it
-holds.
+**Recheck.** When the identity and registers of the device are read again.
 
-At intervals, because another program may write through the device's other port and a restart in a
-stream without device time shows nowhere else; soon after anything that makes it doubtful (a
-silence, readings or a time that jump), because another device may have the cable.
+At intervals, because another program may write through the device's other port, and because nothing
+else shows a restart in a stream without device time. Soon after a doubt (a silence, readings or a
+time that jump), because another device may be on the cable.
 
-**Restarts.** Whether the device restarted, by what it shows itself: seen in this run, or told by
-its time.
+**Restarts.** Whether the device restarted: detected in this run, or by its time since start-up.
 
 A suspicion has the device read again at once. Only a proof confirms what is in flash: its time
-since start-up against the journal's newest record (`restarted_since`); its time that fell in
-this run, for a record of before this run; or a restart that it reported, where it tells no time.
+since start-up compared with the journal's newest record (`restarted_since`); its time that fell in
+this run, for a record from before this run; or a restart that it reported, if it sends no time.
 
-While it is doubtful whose the stream is, nothing that it shows is a proof: in a procedure, when
-nobody watches it, while the device is asked who it is, and from a doubt on until it said so.
+Nothing in the stream is a proof while its source is in doubt: during a procedure, when the stream
+is not watched; while the device is being identified; and from a doubt until it is confirmed.
 
-A message may have lain in a buffer, as old as its time says, so a proof by its time takes the
-earliest start-up that a second of messages shows.
+A message may have been delayed in a buffer, so a proof by device time uses the earliest start-up
+that one second of messages shows.
 """
 
 from __future__ import annotations
@@ -32,12 +30,12 @@ from ahrsd.writeback.journal_history import CLOCK_RATE, LATENCY_S, Stamp, restar
 # -- Recheck ---------------------------------------------------------------------------------------
 
 
-LEAST_S = 2.0  # between two that something waits for: a poor link must not be filled with reads
+LEAST_S = 2.0  # minimum between two reads: a poor link must not be filled with them
 
 
 @dataclass(slots=True)
 class Recheck:
-    """See the module. `due_s` is None while nothing is to be asked."""
+    """See the module. `due_s` is None while no device is there."""
 
     interval_s: float
     due_s: float | None = None
@@ -50,21 +48,21 @@ class Recheck:
         self.unanswered = False
 
     def stop(self) -> None:
-        """Stop asking: no device is there."""
+        """Stop: no device is there."""
         self.due_s = None
 
     def schedule_soon(self, host_s: float) -> None:
-        """Ask again soon: something is doubtful, or nobody answered."""
+        """Read again soon: there is a doubt, or nobody answered."""
         if self.due_s is not None:
             self.due_s = min(self.due_s, max(host_s, self.asked_s + LEAST_S))
 
     def schedule_now(self, host_s: float) -> None:
-        """Ask now: something waits for the answer."""
+        """Read again now: something waits for the answer."""
         if self.due_s is not None:
             self.due_s = host_s
 
     def is_due(self, host_s: float) -> bool:
-        """Whether to ask now."""
+        """Whether to read again now."""
         return self.due_s is not None and host_s >= self.due_s
 
 
@@ -75,26 +73,26 @@ SETTLE_S: Final = 1.0
 
 
 class RestartWatch:
-    """Of the device that was bound last; host times are monotonic."""
+    """Detects restarts of the device that was bound last; host times are monotonic."""
 
     def __init__(self) -> None:
         self._serial: int | None = None
         self._bound = False
         self._seen: int | None = None
-        self.fell_s = -math.inf  # when its time fell last since this run knows it
+        self.fell_s = -math.inf  # when its time fell last in this run
         self._read_from_s = math.inf
-        self._doubt_s: float | None = None  # since when nobody knows whose the messages are
-        self._asked_s = self._answered_s = -math.inf  # who it is, the newest time
-        self._first_s: float | None = None  # when its time was heard first since it was bound
-        self._newest_s = self._newest_at_s = math.nan  # its time, as last heard, and when
-        self._started_s = math.inf  # when it started up, at the latest
+        self._doubt_s: float | None = None  # since when the source of the messages is in doubt
+        self._asked_s = self._answered_s = -math.inf  # of the newest identification
+        self._first_s: float | None = None  # when its time came first since it was bound
+        self._newest_s = self._newest_at_s = math.nan  # its newest time, and when it came
+        self._started_s = math.inf  # its start-up, at the latest
 
     def on_restart(
         self, record: Stamp, now: Stamp, host_s: float, uptime_s: float | None = None
     ) -> None:
-        """A restart was seen; a device that tells its time must show that it was after the record.
+        """A restart was detected; if the device sends its time, that must be after the record.
 
-        So what the device only reports (VNERR) counts where its stream has no time.
+        A restart that the device only reports (VNERR) counts only if its stream has no time.
         """
         if self.is_doubtful(host_s):
             self._bound = False
@@ -107,31 +105,31 @@ class RestartWatch:
         self._bound = False
 
     def on_restart_proven(self) -> None:
-        """Its time has proven a restart: the device is read again, and that counts."""
+        """The device's time proved a restart: the next reading of the device counts as after it."""
         self._seen, self._bound = self._serial, False
 
     def on_link_lost(self) -> None:
-        """The link went away, or nobody is there to ask."""
+        """The link was lost, or there is no device."""
         self._bound = False
 
     def mark_doubt(self, host_s: float = -math.inf) -> None:
-        """From then on the messages may be another device's, until one says who it is."""
+        """From then on messages may be of another device, until one is identified."""
         self._doubt_s = host_s if self._doubt_s is None else min(self._doubt_s, host_s)
 
     def on_confirmed(self, asked_s: float, answered_s: float) -> None:
-        """It was this device that was asked; what came in between may still be another's."""
+        """This device answered; messages between request and answer may still be another's."""
         self._asked_s, self._answered_s = asked_s, answered_s
         if self._doubt_s is not None and self._doubt_s <= asked_s:
             self._doubt_s = None
 
     def on_other_device(self) -> None:
-        """Another device has the cable: what was seen may be of that one, until one is read."""
+        """Another device is on the cable: forget what was detected, until a device is read."""
         self.mark_doubt()
         self._bound = False
         self._seen, self.fell_s, self._newest_s = None, -math.inf, math.nan
 
     def bind(self, serial: int, read_from_s: float) -> bool:
-        """A device was identified and read; whether this one was seen to restart before."""
+        """A device was identified and read; returns whether a restart of it was detected before."""
         restarted = self._seen == serial
         if serial != self._serial:
             self.fell_s, self._newest_s = -math.inf, math.nan
@@ -141,7 +139,7 @@ class RestartWatch:
         return restarted
 
     def on_uptime(self, uptime_s: float, host_s: float) -> str:
-        """The device's time; why its registers must be read again, empty where they need not."""
+        """Take the device's time; returns why to read its registers again, empty if not needed."""
         if not self._bound:
             return ""
         if first := self._first_s is None:
@@ -164,12 +162,12 @@ class RestartWatch:
         return self._proves_restart_since(record, now, host_s - self._started_s)
 
     def _proves_restart_since(self, record: Stamp, now: Stamp, uptime_s: float | None) -> bool:
-        """A record of another boot of the host is older than this run."""
+        """Whether this time proves it; a record of another boot is older than this run."""
         of_before = bool(now.boot_id) and record.boot_id != now.boot_id
         return (self.fell_s > -math.inf and of_before) or restarted_since(record, now, uptime_s)
 
     def is_doubtful(self, host_s: float) -> bool:
-        """Whether it is, and was before now: a restart itself makes readings jump."""
+        """Whether the source was in doubt before now: a restart itself makes readings jump."""
         asking = self._asked_s < host_s < self._answered_s
         return asking or (self._doubt_s is not None and self._doubt_s < host_s)
 
@@ -181,6 +179,6 @@ class RestartWatch:
         return uptime_s < self._newest_s - LATENCY_S
 
     def _may_have_restarted(self, uptime_s: float, host_s: float) -> bool:
-        """Not where its time says that it runs for longer than since it was heard before."""
+        """False if its time is longer than the time since its last message."""
         since_s = host_s - self._newest_at_s
         return uptime_s <= since_s * (1.0 + CLOCK_RATE) + LATENCY_S

@@ -1,14 +1,14 @@
-"""The write-back: one object, driven by inputs, that answers with actions. Pure and deterministic.
+"""The write-back: one object that takes inputs and returns actions. Pure and deterministic.
 
-The core calls the `on_...` methods with the host's monotonic time and carries out what they return
-(`actions`), in that order. The gate in front of each command judges interlock and stillness at the
-newest time that was told, so `tick` comes before bytes are given to the session.
+The core calls the `on_...` methods with the host's monotonic time and carries out the returned
+`actions` in that order. The gate in front of each command checks interlock and rest at the newest
+host time, so `tick` must be called before bytes are given to the session.
 
-Order of things, which the tests hold (tests/writeback/test_machine.py):
+Guarantees that the tests check (tests/writeback/test_machine.py):
 
 * PREPARED is on the disk before the first byte of a transaction, FLASH_SENT before VNWNV;
-* a rollback needs neither interlock nor journal: the old values are what the vehicle lived with;
-* in mode `observe` nothing is ever started: QUALIFIED says what would be written, to the byte.
+* a rollback needs neither interlock nor journal: the vehicle worked with the old values before;
+* in mode `observe` nothing is ever started: QUALIFIED shows the exact bytes of a possible write.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from ahrsd.writeback.trial import TrialMetrics, TrialVerdict
 from drivers.vn100.commands import Identity, Seen, differences
 from drivers.vn100.registers import COMPENSATING, Values, same
 
-RESTS = frozenset(  # states in which a proven restart since the newest record has it read again
+RESTS = frozenset(  # states in which a proven restart since the newest record causes a new reading
     {
         State.CANDIDATE,
         State.QUALIFIED,
@@ -61,11 +61,11 @@ _AWAITED = {
 _CLIENTS_WAIT_IN = CHANGED_IN_RAM | {State.RECONCILING, State.PREPARING, State.CHECKING}
 _SWITCH = "switch the device off and on"
 _MAY_HOLD = f"the device may hold values of a trial: {_SWITCH}"
-_NO_LOOK_IN = (State.RECONCILING, State.SAVE_PREPARING)  # the device is read there anyway
+_NO_LOOK_IN = (State.RECONCILING, State.SAVE_PREPARING)  # the device is read in these states anyway
 
 
 class WriteBack:
-    """See the module and `states`. Every `on_...` returns the actions that follow, in order."""
+    """See the module and `states`. Every `on_...` returns the resulting actions, in order."""
 
     def __init__(self, policy: WriteBackPolicy) -> None:
         self.policy = policy
@@ -75,39 +75,39 @@ class WriteBack:
         self._gyro_bias_rad_s: Array = np.zeros(3)
         self._restarts = RestartWatch()
         self._read_after_restart_s = float("-inf")  # when it was read last behind a proven restart
-        self.operator_answer: Answer = (False, "no command yet")  # to the newest `on_operator`
+        self.operator_answer: Answer = (False, "no command yet")  # to the newest `on_operator` call
         self._recheck = Recheck(policy.recheck_s)
         self._sampled_to_s = float("-inf")  # when the device was asked
         self._changed_in_run: dict[
             int, frozenset[int]
-        ] = {}  # by serial number; see `_changed_by_others`
+        ] = {}  # registers by serial number; see `_changed_by_others`
         self.confirmed_s: float | None = None  # see `on_looked`
 
-    # -- what others ask ---------------------------------------------------------------------------
+    # -- read by others ----------------------------------------------------------------------------
 
     @property
     def state(self) -> State:
-        """Where the write-back stands."""
+        """The state of the write-back."""
         return self._flow.state
 
     @property
     def proposal(self) -> Proposal | None:
-        """What would be written: the qualified candidate, as a person approves it."""
+        """The qualified candidate, as an operator approves it; None if there is none."""
         return self._flow.proposal
 
     @property
     def history(self) -> JournalHistory:
-        """The device's journal, summed up."""
+        """Summary of the device's journal."""
         return self._outbox.history
 
     @property
     def mode(self) -> Mode:
-        """What is possible now: observe at most while the device or its journal is in doubt."""
+        """The effective mode: at most observe while the device or its journal is in doubt."""
         return self._safe.mode
 
     @property
     def margin(self) -> float:
-        """How much clearer than usual an improvement must be: the gates multiply by it."""
+        """Factor on the improvement that the gates require."""
         return margin(self.policy, self.history)
 
     @property
@@ -122,16 +122,16 @@ class WriteBack:
 
     @property
     def idle(self) -> bool:
-        """Nothing is under way that must end before the daemon may stop."""
+        """Whether nothing is under way that must end before the daemon may stop."""
         return not self._outbox.running and self.state not in CHANGED_IN_RAM - {State.PROVEN}
 
     @property
     def client_save_refusal(self) -> str | None:
-        """Why all of RAM is not saved for a client; "" where it may be; None: not yet, or what is
-        there is undone first.
+        """Why RAM is not saved for a client; "" if it may be; None: not yet, or values are undone
+        first.
 
-        Never while it may hold what nobody has proven. A restart that is proven shows what is in
-        flash, and a save of that changes nothing.
+        Never while RAM may hold unproven values. After a proven restart RAM equals flash, and a
+        save changes nothing.
         """
         history = self.history
         foreign = history.locked is not None and history.last is RecordKind.FOREIGN
@@ -155,12 +155,12 @@ class WriteBack:
 
     @property
     def client_reset_refusal(self) -> str | None:
-        """The same of a reset, which does no harm where nobody knows what the device holds."""
+        """The same for a reset, which is harmless even if the registers are unknown."""
         between = self.state in _CLIENTS_WAIT_IN and self.state is not State.RECONCILING
         return None if between or self._outbox.running else ""
 
     def obstacles(self) -> list[str]:
-        """Every reason why the next step is not taken now, each with what helps."""
+        """All reasons why the next step is not taken now, each with a remedy."""
         now = (self.history, self._outbox.host_s, self._outbox.now)
         if self.state is State.SET_ASIDE:
             return self._flow.rewrite_obstacles()
@@ -174,7 +174,7 @@ class WriteBack:
     # -- inputs ------------------------------------------------------------------------------------
 
     def tick(self, host_s: float) -> list[Action]:
-        """Time passed: silence, an interlock that went stale, a write or save that may go now."""
+        """Handle the time: timeouts, a stale interlock, a write or save that may start now."""
         self._outbox.host_s = host_s
         if self._flow.deadline_s is not None and host_s >= self._flow.deadline_s:
             self._flow.on_timeout()
@@ -187,7 +187,7 @@ class WriteBack:
     def on_clock(
         self, wall_s: float, boot_id: str, boot_s: float | None, host_s: float
     ) -> list[Action]:
-        """The host's other clocks; the wall clock may have been set."""
+        """Take the host's other clocks; the wall clock may have been adjusted."""
         self._outbox.host_s = host_s
         self._outbox.set_clocks(wall_s, boot_id, boot_s)
         return self._take_actions()
@@ -206,7 +206,7 @@ class WriteBack:
         """The device was identified and read: at the start, after a reset, after a lost link.
 
         registers:    all that were read; `session_keys` (which the daemon changes for its session,
-                      or `clients` for changed) with the values that the user had
+                      or `clients` for theirs) with the values that the user had
         read_from_s:  when the reading of them began; see `on_uptime`
         journal:      this device's records, oldest first; None where they cannot be trusted
         """
@@ -235,7 +235,7 @@ class WriteBack:
         return self._take_actions()
 
     def on_no_device(self, registers: Mapping[int, Values] | None, host_s: float) -> list[Action]:
-        """There is nobody to ask: mode passive, or a recording. Registers where they are known."""
+        """There is no device to ask: mode passive, or a recording. Registers, if known."""
         self._outbox.host_s = host_s
         self._restarts.on_link_lost()
         self._recheck.stop()
@@ -246,7 +246,7 @@ class WriteBack:
         return self._take_actions()
 
     def on_link_lost(self, host_s: float) -> list[Action]:
-        """The port went away."""
+        """The port was lost."""
         self._outbox.host_s = host_s
         self._restarts.on_link_lost()
         self._flow.signal(Signal.LINK_LOST, "the link was lost")
@@ -255,10 +255,10 @@ class WriteBack:
     def on_reset(
         self, host_s: float, uptime_s: float | None = None, client: str = ""
     ) -> list[Action]:
-        """The device restarted: its RAM is what its flash holds. `on_device` must follow.
+        """The device restarted: its RAM equals its flash. `on_device` must follow.
 
-        uptime_s: its time since then, where that is what tells; then it must agree with the journal
-        client:   whose VNRST it was, where it was one
+        uptime_s: its time since then, if that showed the restart; it must agree with the journal
+        client:   the client whose VNRST it was; empty: none
         """
         self._outbox.host_s = host_s
         self._restarts.on_restart(self.history.last_at, self._outbox.stamp, host_s, uptime_s)
@@ -271,12 +271,12 @@ class WriteBack:
     def on_uptime(
         self, uptime_s: float, host_s: float, heard_s: float | None = None
     ) -> list[Action]:
-        """The device's time since its start-up, as its stream tells: a restart that nobody saw.
+        """Take the device's time since start-up from its stream: detects unnoticed restarts.
 
-        One since the registers were read makes that reading void. And only a restart shows what a
-        save left in flash, so it is asked again then.
+        A restart since the registers were read makes that reading void. Only a restart shows what
+        a save left in flash, so the device is read again then.
 
-        heard_s: when the message came that told it, where that was before now
+        heard_s: when the message came, if that was before now
         """
         outbox, record = self._outbox, self.history.last_at
         outbox.host_s, heard_s = host_s, host_s if heard_s is None else heard_s
@@ -300,15 +300,14 @@ class WriteBack:
         return self._take_actions()
 
     def on_looked(self, seen: Seen | None, error: str, host_s: float) -> list[Action]:
-        """Who answered and what it holds, or why nobody did.
+        """Result of a look: who answered with which registers, or why nobody did.
 
-        Where all is as it ought to be, `confirmed_s` is the host's time at which it was asked;
-        else None.
+        If all is as expected, `confirmed_s` is the host time of the request; else None.
         """
         self._outbox.host_s, flow, self.confirmed_s = host_s, self._flow, None
         self._recheck.unanswered = False
         if flow.identity is None or self.state is State.RECONCILING or self._outbox.running:
-            return self._take_actions()  # overtaken
+            return self._take_actions()  # superseded
         if seen is None:
             self._outbox.note(
                 "warning", f"the device does not say who it is and what it holds: {error}"
@@ -329,9 +328,9 @@ class WriteBack:
         return self._take_actions()
 
     def on_waiting(self, span_s: float, host_s: float) -> list[Action]:
-        """So many seconds of samples are not used before the device was asked again.
+        """So many seconds of samples wait until the device is confirmed again.
 
-        A stream that is played faster than it was recorded fills them up sooner than the clock.
+        A stream that is played faster than real time fills them up sooner than the clock.
         """
         self._outbox.host_s = host_s
         if span_s >= self.policy.recheck_s and not self._recheck.unanswered:
@@ -339,9 +338,9 @@ class WriteBack:
         return self._take_actions()
 
     def on_doubt(self, reason: str, host_s: float, *, jumped: bool = False) -> list[Action]:
-        """The stream makes it doubtful whether this is still the device that was read.
+        """The stream raises a doubt whether this is still the device that was read.
 
-        jumped: its readings did, so what was proven before must be proven again.
+        jumped: its readings jumped, so proven values must be proven again.
         """
         self._outbox.host_s = host_s
         self._outbox.note("debug", f"{reason}: the device is asked again who it is")
@@ -354,14 +353,14 @@ class WriteBack:
         return self._take_actions()
 
     def on_samples(self, block: SampleBlock) -> list[Action]:
-        """Raw samples: for the proof that the vehicle stands still."""
+        """Take raw samples, to check whether the vehicle is at rest."""
         if len(block):
             self._safe.sampled_s = float(block.host_s[-1])
         self._safe.stillness.update(block, self._gyro_bias_rad_s)
         return self._take_actions()
 
     def on_interlock(self, safe: bool, host_s: float) -> list[Action]:
-        """The vehicle's word."""
+        """Take the interlock signal of the vehicle."""
         self._outbox.host_s = host_s
         self._safe.set_interlock(safe, host_s)
         return self._take_actions()
@@ -377,7 +376,7 @@ class WriteBack:
         gyro_is_raw: bool = True,
         sampled_s: float | None = None,
     ) -> list[Action]:
-        """A new estimate and what the gates say: for RAM (none at all is no pass), and for flash.
+        """A new estimate and the gates' results: for RAM (no gates: not passed), and for flash.
 
         gyro_is_raw: see `composition.compose`.
         sampled_s:   host time of the newest sample that was judged; None: now
@@ -397,19 +396,19 @@ class WriteBack:
         return self._take_actions()
 
     def on_void(self, reason: str, at_s: float, host_s: float) -> list[Action]:
-        """What was calibrated until now holds no more: something on the vehicle changed."""
+        """Earlier calibrations are void: something on the vehicle changed."""
         self._outbox.host_s, self._outbox.at_s = host_s, at_s
         self._safe.mark_doubt(host_s)
         self._flow.void_calibration(reason)
         return self._take_actions()
 
     def on_examined(self, sampled_s: float, host_s: float) -> list[Action]:
-        """The estimate has taken the samples up to this host time into account."""
+        """The estimate now includes the samples up to this host time."""
         self._outbox.host_s, self._safe.examined_s = host_s, sampled_s
         return self._take_actions()
 
     def on_estimator_failed(self, host_s: float) -> list[Action]:
-        """The estimator failed: estimate and verdict are gone, and what rests on them ends."""
+        """The estimator failed: drop estimate and verdict, and end what depends on them."""
         self._outbox.host_s = host_s
         self._safe.gates = self._safe.flash_gates = ()
         self._flow.signal_if(Signal.NOT_WORTH_WRITING, "the estimator failed")
@@ -417,14 +416,14 @@ class WriteBack:
         return self._take_actions()
 
     def on_limits_changed(self, host_s: float) -> list[Action]:
-        """The gates have other limits: their earlier verdict allows nothing any more."""
+        """The gates have other limits: their earlier verdict no longer counts."""
         self._outbox.host_s = host_s
         self._safe.gates = self._safe.flash_gates = ()
         self._flow.signal_if(Signal.NOT_WORTH_WRITING, "the limits of the gates were changed")
         return self._take_actions()
 
     def on_operator(self, verb: str, argument: str, host_s: float) -> list[Action]:
-        """A person's command: arm, disarm, approve ID, lock REASON, unlock REASON, rollback."""
+        """An operator's command: arm, disarm, approve ID, lock REASON, unlock REASON, rollback."""
         self._outbox.host_s = host_s
         reason = argument or "no reason given"
         verbs: dict[str, Callable[[], Answer]] = {
@@ -444,7 +443,7 @@ class WriteBack:
         return self._take_actions()
 
     def on_trial_metrics(self, metrics: TrialMetrics, host_s: float) -> list[Action]:
-        """The new registers against the old ones on live samples."""
+        """Compare the new registers with the old ones on live samples."""
         self._outbox.host_s = host_s
         if self.state in (State.TRIAL, State.PROVEN) and metrics.finite:
             self._flow.deadline_s = host_s + ON_TIMEOUT[self.state][0]
@@ -454,7 +453,7 @@ class WriteBack:
             elif finding is TrialVerdict.FAILED:
                 self._flow.roll_back("trial", reason)
             elif finding is TrialVerdict.PASSED and not self._flow.trial_passed:
-                self._recheck.schedule_now(host_s)  # proven is what the device still holds
+                self._recheck.schedule_now(host_s)  # to prove what it still holds
                 self._request_look()
             if self.state is State.TRIAL:
                 self._flow.trial_passed = reason if finding is TrialVerdict.PASSED else ""
@@ -468,22 +467,22 @@ class WriteBack:
         clients: frozenset[int],
         host_s: float,
     ) -> list[Action]:
-        """A client set registers, for its session.
+        """A client set registers for its session.
 
-        session_keys: all that hold values of a session; clients: those of clients
+        session_keys: all registers with values of a session; clients: those of clients
         """
         self._outbox.host_s, self._flow.session_keys = host_s, session_keys
         self._safe.client_registers = clients
         return self._take_actions()
 
     def on_client_wants(self, client: str, does: str, host_s: float) -> list[Action]:
-        """A client "saves" all of RAM or "resets" the device: what is on trial is undone first."""
+        """A client "saves" all of RAM or "resets" the device: undo values on trial first."""
         self._outbox.host_s = host_s
         self._flow.set_aside(client, does)
         return self._take_actions()
 
     def on_client_failed(self, does: str, why: str, host_s: float) -> list[Action]:
-        """The device refused that, or nobody knows whether it was carried out."""
+        """The device refused that command, or its result is unknown."""
         self._outbox.host_s = host_s
         self._flow.client_command_ended(does, why)
         return self._take_actions()
@@ -500,7 +499,7 @@ class WriteBack:
 
     @property
     def expected_device(self) -> Seen | None:
-        """Who is there and what it must hold for anything that lasts; None: nobody was asked."""
+        """The device and registers required for a permanent change; None: no device was read."""
         flow = self._flow
         if flow.identity is None:
             return None
@@ -509,7 +508,7 @@ class WriteBack:
         )
 
     def on_client_waits(self, reason: str, host_s: float) -> list[Action]:
-        """A client's save or write was held back: why the device is not as known, if that is so."""
+        """A client's save or write was not sent; `reason`: how the device differs, if it does."""
         self._outbox.host_s = host_s
         self._flow.drop_client_write()
         if reason and self.state is not State.RECONCILING:
@@ -518,16 +517,16 @@ class WriteBack:
         return self._take_actions()
 
     def client_write_refusal(self, number: int) -> str | None:
-        """Why a client may not write this register now; "" where it may; None: not yet."""
+        """Why a client may not write this register now; "" if it may; None: not yet."""
         return self._flow.client_write_refusal(number)
 
     def on_client_writes(
         self, client: str, number: int, values: Values, host_s: float
     ) -> tuple[list[Action], bool]:
-        """A client's write of what calibrates is next: what must happen, and whether it may go.
+        """A client's calibration write is next: actions, and whether it may be sent.
 
-        Asked again until the journal has it; from then on nobody knows what the device applies,
-        until `on_client_wrote`. Where it will not be sent after all: `on_client_dropped`.
+        Called again until the journal has it. From then on the registers in force are unknown,
+        until `on_client_wrote`. If it is not sent after all: `on_client_dropped`.
         """
         self._outbox.host_s, write = host_s, self._flow.client_write
         if self._flow.client_write_ready:
@@ -538,16 +537,16 @@ class WriteBack:
         return self._take_actions(), False
 
     def on_client_dropped(self, host_s: float) -> list[Action]:
-        """The write that the journal was told of is not sent: its client left, or waited too long.
+        """The journaled write is not sent: its client disconnected, or it waited too long.
 
-        The next one, even of the same values, is a write of its own.
+        The next one, even of the same values, is a separate write.
         """
         self._outbox.host_s = host_s
         self._flow.drop_client_write()
         return self._take_actions()
 
     def on_client_wrote(self, host_s: float) -> list[Action]:
-        """That write was carried out, refused, or nobody knows."""
+        """That write was carried out or refused, or its result is unknown."""
         self._outbox.host_s = host_s
         self._flow.on_client_wrote()
         return self._take_actions()
@@ -559,11 +558,11 @@ class WriteBack:
         session_keys: frozenset[int],
         host_s: float,
     ) -> list[Action]:
-        """All of RAM was saved for a client; `saved`: what clients had set is the user's now."""
+        """RAM was saved for a client; `saved`: settings of clients, which are the user's now."""
         self._outbox.host_s, self._flow.session_keys = host_s, session_keys
         self._safe.client_registers = frozenset()
         self._flow.registers = {**self._flow.registers, **saved}
-        self._safe.changed_by_others = frozenset()  # whoever changed what: it is permanent by now
+        self._safe.changed_by_others = frozenset()  # any change is permanent now
         self._safe.client_wrote = {}
         if self._flow.identity is not None:
             self._changed_in_run.pop(self._flow.identity.serial, None)
@@ -574,7 +573,7 @@ class WriteBack:
         return self._take_actions()
 
     def on_stop(self, host_s: float) -> list[Action]:
-        """The daemon ends: what is only in RAM is undone, unless it is proven and to be kept."""
+        """The daemon stops: undo values that are only in RAM, unless proven and to be kept."""
         self._outbox.host_s, self._safe.stopping = host_s, True
         self._outbox.retry_journal()
         if not (self.policy.keep_on_stop and self.state is State.PROVEN):
@@ -592,7 +591,7 @@ class WriteBack:
         return self._take_actions()
 
     def on_journal_failed(self, kind: RecordKind, error: str, host_s: float) -> list[Action]:
-        """The record is not on the disk. What waited for it does not happen."""
+        """The record could not be written: the step that waited for it is not taken."""
         self._outbox.host_s, self._safe.journal_ok = host_s, False
         self._outbox.on_journal_failed(kind)
         if kind is RecordKind.CLIENT_WRITES:
@@ -607,7 +606,7 @@ class WriteBack:
         self._outbox.host_s = host_s
         if name == self._outbox.running and isinstance(result, ProcedureOutcome):
             self._outbox.running = ""
-            self._restarts.mark_doubt()  # nobody watched the stream
+            self._restarts.mark_doubt()  # the stream was not watched
             if result.other is not None:
                 self._restarts.on_other_device()
             self._flow.on_outcome(result)
@@ -621,7 +620,7 @@ class WriteBack:
             self._outbox.running = ""
             self._restarts.mark_doubt()
             self._flow.on_failure(error)
-            self._recheck.schedule_now(host_s)  # nobody knows who was silent, or refused
+            self._recheck.schedule_now(host_s)  # unknown which device was silent, or refused
         return self._take_actions()
 
     def _changed_by_others(
@@ -631,9 +630,9 @@ class WriteBack:
         session_keys: frozenset[int],
         restarted: bool,
     ) -> frozenset[int]:
-        """Registers that changed in this run without us; only a restart shows what flash holds.
+        """Registers that other programs changed in RAM in this run; a restart clears them.
 
-        What an open transaction writes is judged by `reconcile`.
+        Registers of an open transaction are judged by `reconcile`.
         """
         before = self._flow.identity
         changed = (
@@ -647,7 +646,7 @@ class WriteBack:
         return changed
 
     def _request_look(self) -> None:
-        """Have the device say who it is and what it holds, unless something else runs."""
+        """Request a look at identity and registers, unless something else runs."""
         flow, now_s = self._flow, self._outbox.host_s
         self._recheck.restart(now_s)
         if self._safe.sampled_s is not None:
@@ -660,7 +659,7 @@ class WriteBack:
         self._outbox.append(Look(flow.identity.unit, expected))
 
     def _set_armed(self, armed: bool) -> Answer:
-        """Whether this run may begin a write or a save; what is under way is not undone."""
+        """Set whether this run may begin a write or a save; nothing under way is undone."""
         text = self._safe.set_armed(armed)
         self._outbox.note("info", text)
         if armed and self.policy.mode < Mode.STAGE:
@@ -668,7 +667,7 @@ class WriteBack:
         return True, text if armed else "disarmed: this run writes nothing by itself"
 
     def _take_actions(self) -> list[Action]:
-        """Take the steps that are due now, then hand over everything that was asked for."""
+        """Take the steps that are due now; returns all actions."""
         self._flow.take_due_step()
         if self._flow.waits_for_look:
             self._recheck.schedule_soon(self._outbox.host_s)

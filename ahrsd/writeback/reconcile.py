@@ -1,14 +1,15 @@
-"""After an interruption: what the journal says last, what the device holds, what follows.
+"""Recovery after an interruption, by the journal's last record and the device's registers.
 
-A transaction can end at any point: the power, the link or this program goes. RAM that was written
-and not saved is lost with the device's power and keeps living with the program's, so "the device
-holds the old values" is always a safe end. The one dangerous stretch is VNWNV itself, between
+A transaction can be interrupted at any point by loss of power, link or program. Values in RAM that
+were not saved are lost if the device loses power, and remain if only the program ends. So "the
+device holds the old values" is always a safe end. The one dangerous phase is VNWNV itself, between
 FLASH_SENT and the next reading after a reset.
 
-The table is total over (last record, what the device holds, whether it is proven that the device
-restarted since that record). Where they contradict each other it raises an alarm; it never writes
-flash. After a restart that is proven the device holds what is in its flash, so what is neither the
-old values nor saved from here was saved by somebody: it is never written over without a person.
+The table is total over (last record, contents of the device, whether a restart of the device since
+that record is proven). If they contradict each other, it raises an alarm; it never writes flash.
+After a proven restart the device holds what is in its flash, so values that are neither the old
+ones nor saved by ahrsd were saved by another program: they are never overwritten without an
+operator.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from drivers.vn100.registers import Values, same
 
 
 class DeviceContents(Enum):
-    """What the device holds in the registers of a transaction; a restart counts if it is proven."""
+    """Contents of the registers of a transaction; only a proven restart counts as one."""
 
     OLD = "the old values"
     OLD_AFTER_RESTART = "the old values after a restart"
@@ -37,7 +38,7 @@ class DeviceContents(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Resolution:
-    """What follows: the signal, the record that says so (if any), the level and text of a note."""
+    """The resulting signal, journal record (None: none), and level and text of the note."""
 
     signal: Signal
     record: RecordKind | None
@@ -51,7 +52,7 @@ def compare_contents(
     device: Mapping[int, Values],
     restarted: bool,
 ) -> DeviceContents:
-    """Compare register by register, as the device prints them. A register not read is neither."""
+    """Compare the registers as the device prints them. An unread register is neither."""
     is_old = {n: n in device and same(n, old[n], device[n]) for n in new}
     is_new = {n: n in device and same(n, new[n], device[n]) for n in new}
     if all(is_old.values()):
