@@ -1,13 +1,13 @@
-"""Columns that the vehicle tells beside the stream, and what a repaired model's terms make of them.
+"""Columns that the vehicle reports besides the stream, and a repaired model's terms of them.
 
     vehicle.load_terms(text)                 # model.json of `ahrsd diagnose --report`
-    vehicle.record_columns(host_s, {"motor_current_a": 3.2})  # as often as the vehicle says it
-    block = vehicle.with_columns(block)      # by the host's time of each sample
-    free = vehicle.without_terms(block)      # what is calibrated; None: no column
+    vehicle.record_columns(host_s, {"motor_current_a": 3.2})  # as often as the vehicle reports it
+    block = vehicle.with_columns(block)      # at the host time of each sample
+    free = vehicle.without_terms(block)      # for the calibration; None: a column is missing
 
-Only terms that a column gives from one sample to the next can be taken out of a running stream: a
-current's field, a temperature's bias. What follows the motion, the edges of a column or the time
-of one recording stays where it is, and is said.
+Only terms that follow from a column sample by sample can be subtracted from a running stream: the
+field of a current, the bias due to temperature. Terms of the motion, of the edges of a column or of
+the time of one recording stay in the readings, and are reported.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from ahrsd.samples import Array, SampleBlock
 if TYPE_CHECKING:
     from ahrsd.diagnosis.model import Term
 
-_KEPT = 256  # instants of a column: some seconds at any rate that a vehicle tells it
-Added = Callable[["Term", Array, Array, Mapping[str, Array]], Array]
+_KEPT = 256  # instants of a column: some seconds at any rate of the vehicle
+TermEvaluation = Callable[["Term", Array, Array, Mapping[str, Array]], Array]
 
 
 class VehicleTerms:
-    """See the module. `warn` takes sentences for a person; one may come again and again."""
+    """See the module. `warn` takes sentences for a person; the same one may be repeated."""
 
     def __init__(self, warn: Callable[[str], object], max_age_s: float) -> None:
         self.terms: tuple[Term, ...] = ()
-        self.waits_for: tuple[str, ...] = ()  # columns that the newest samples lack
+        self.waits_for: tuple[str, ...] = ()  # columns missing from the newest samples
         self._warn, self._max_age_s = warn, max_age_s
         self._columns: dict[str, deque[tuple[float, float]]] = {}
         self._gap = False
-        self._added: Added | None = None
+        self._evaluate_term: TermEvaluation | None = None
 
     def take(self, item: Columns | TermsKnown) -> None:
-        """What the vehicle measures, or the model. A text that is no model is said, not raised."""
+        """Take columns or the model. An invalid model text is a warning, not an exception."""
         if isinstance(item, Columns):
             self.record_columns(item.host_ns * 1e-9, item.values)
             return
@@ -51,15 +51,15 @@ class VehicleTerms:
             self._warn(f"the model of the terms {error}")
 
     def load_terms(self, text: str) -> None:
-        """The model's text; terms that cannot be followed are said. ValueError: it is no model."""
-        # the library of effects takes 50 MB, which a daemon without a model does without
+        """Load the model; warns of terms that cannot be followed. ValueError: it is no model."""
+        # the effect library takes 50 MB, which a daemon without a model does not need
         from ahrsd.diagnosis.repaired_model.column_terms import (
             column_contribution,
             follows_a_column,
         )
         from ahrsd.diagnosis.repaired_model.model_file import from_text
 
-        terms, self._added = from_text(text).terms, column_contribution
+        terms, self._evaluate_term = from_text(text).terms, column_contribution
         self.terms = tuple(term for term in terms if follows_a_column(term))
         for term in terms:
             if term not in self.terms:
@@ -72,18 +72,20 @@ class VehicleTerms:
             self._warn(f"calibrated without {names}")
 
     def record_columns(self, host_s: float, values: Mapping[str, float]) -> None:
-        """The columns at a moment."""
+        """Store the columns at one instant."""
         for name, value in values.items():
             self._columns.setdefault(name, deque(maxlen=_KEPT)).append((host_s, value))
 
     def with_columns(self, block: SampleBlock) -> SampleBlock:
-        """The block with what the vehicle told; nan where that is older than `max_age_s`."""
+        """The block with the vehicle's columns; nan where no value is within `max_age_s`."""
         if not self._columns:
             return block
-        told = {name: self._at(block.host_s, known) for name, known in self._columns.items()}
-        return replace(block, covariates={**told, **block.covariates})
+        measured = {
+            name: self._interpolate(block.host_s, known) for name, known in self._columns.items()
+        }
+        return replace(block, covariates={**measured, **block.covariates})
 
-    def _at(self, host_s: Array, known: deque[tuple[float, float]]) -> Array:
+    def _interpolate(self, host_s: Array, known: deque[tuple[float, float]]) -> Array:
         at_s, values = np.array(known).T
         after = np.clip(np.searchsorted(at_s, host_s), 0, len(at_s) - 1)
         before = np.maximum(after - 1, 0)
@@ -91,18 +93,20 @@ class VehicleTerms:
         return np.where(away_s <= self._max_age_s, np.interp(host_s, at_s, values), np.nan)
 
     def without_terms(self, block: SampleBlock) -> SampleBlock | None:
-        """The block without what the terms add; None where one of its columns is not known."""
-        if not self.terms or self._added is None or not len(block):
+        """The block with the terms subtracted; None if one of their columns is missing."""
+        if not self.terms or self._evaluate_term is None or not len(block):
             return block
         columns = block.covariates
-        parts = [self._added(term, block.time_s, block.dt_s, columns) for term in self.terms]
-        if not all(np.isfinite(part).all() for part in parts):
-            self._gap, self.waits_for = True, self._missing(block)
+        contributions = [
+            self._evaluate_term(term, block.time_s, block.dt_s, columns) for term in self.terms
+        ]
+        if not all(np.isfinite(values).all() for values in contributions):
+            self._gap, self.waits_for = True, self._missing_columns(block)
             self._warn(f"samples without {', '.join(self.waits_for)} are not calibrated")
             return None
         self.waits_for = ()
         gap, self._gap = block.gap_before or self._gap, False
-        mag, gyro = np.sum(parts, axis=0)
+        mag, gyro = np.sum(contributions, axis=0)
         return replace(
             block,
             raw_b_gauss=block.raw_b_gauss - mag,
@@ -110,7 +114,7 @@ class VehicleTerms:
             gap_before=gap,
         )
 
-    def _missing(self, block: SampleBlock) -> tuple[str, ...]:
-        wanted = dict.fromkeys(str(term.setting["covariate"]) for term in self.terms)
+    def _missing_columns(self, block: SampleBlock) -> tuple[str, ...]:
+        required = dict.fromkeys(str(term.setting["covariate"]) for term in self.terms)
         known = block.covariates
-        return tuple(n for n in wanted if n not in known or not np.isfinite(known[n]).all())
+        return tuple(n for n in required if n not in known or not np.isfinite(known[n]).all())

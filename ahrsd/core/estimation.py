@@ -1,15 +1,15 @@
-"""Samples to a judged estimate: what is held out, what the estimator sees, what the gates say.
+"""From samples to a judged estimate: held-out data, estimator, evidence and gates.
 
-**Beside the core.** The calibrator takes samples and judges; now and then that takes a good part of
-a second, in which the port, the vehicle's word and an operator would wait. So each block becomes a
-task whose result is taken later: in a run another thread does the tasks in their order
-(`estimation_worker`), and the input `Examined` says how many are done. A replay does them when it
-comes to that input, and so takes the same decisions from the same results at the same place. A
-calibrator belongs to its tasks: only they may change it.
+**Tasks.** The calibrator takes samples and judges the estimate. Now and then that takes much of a
+second, in which the port, the interlock and an operator would wait. So each block becomes a
+task whose result is taken later. In a run another thread does the tasks in order
+(`daemon.core_runner.Worker`), and the input `Examined` says how many are done. A replay does them
+when it comes to that input, and so takes the same decisions from the same results at the same
+place. Only its tasks may change a calibrator.
 
-`supervised` is the one place where whatever breaks off is caught: what the estimator cannot take
-is a state with a reason (`core`), never an end. In a run `Examined` says which task broke off, so
-that a replay takes the same decision.
+`run_supervised` is the one place where every exception is caught: a failure of the estimator
+becomes a state with a reason (`core`) and never ends the program. In a run `Examined` says which
+task failed, so that a replay takes the same decision.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ from drivers.vn100.registers import Values
 # -- The calibration of one device -----------------------------------------------------------------
 
 
-_PATIENCE_S = 60.0  # after a step was told, for the estimator to see it and begin anew by itself
+_PATIENCE_S = 60.0  # after a reported step, for the estimator to detect it and restart by itself
 
 
 class Calibrator:
     """One device's calibration. `present` and `present_gyro_bias_rad_s` are the user's registers 23
-    and 84: what a candidate must be better than, also while a candidate of ours is on trial.
+    and 84: the reference for a candidate, also while a candidate is on trial.
     """
 
     def __init__(
@@ -61,105 +61,104 @@ class Calibrator:
         self.gates: tuple[GateResult, ...] = ()
         self._gap = True
         self.started = False
-        self.broken = False  # something broke off in it: it may be anything now
+        self.broken = False  # a task failed in it: its state is undefined
         self.steps = StepDetector()
-        self.step: Step | None = None  # the newest one that was told
-        self.step_open = False  # the estimate still rests on data from before it
+        self.step: Step | None = None  # the newest reported step
+        self.step_open = False  # the estimate still uses data from before the step
         self._notes: list[tuple[float, str]] = []
         self._void = ""
         self._at_s = float("nan")
-        self._heeded_s: float | None = None  # the estimator's restart that was told
-        self._told: set[str] = set()  # what is wrong with the estimate, without its size
+        self._reported_restart_s: float | None = None  # of the estimator
+        self._reported_warnings: set[str] = set()  # without their numbers
 
     @property
     def proposed(self) -> Affine | None:
-        """The correction of the estimate, once it has converged."""
+        """The correction of the estimate; None until it has converged."""
         found = self.estimate
         return found.correction if found is not None and found.converged else None
 
     def take_void(self) -> str:
-        """Why a calibration from before the last call holds no more; empty where it may hold."""
+        """Why calibrations from before the last call are void; empty if they may be valid."""
         void, self._void = self._void, ""
         return void
 
     def take_notes(self, host_s: float) -> list[Noted]:
-        """Warnings since the last call: what changed on the vehicle."""
+        """Warnings since the last call, about changes on the vehicle and the estimate."""
         notes, self._notes = self._notes, []
         return [Noted(at_s, host_s, "warning", text) for at_s, text in notes]
 
     def compare_with(self, present: Affine, present_gyro_bias_rad_s: Array) -> None:
-        """What a candidate must be better than; before the first sample also the prior's centre."""
+        """Set the reference for a candidate; before the first sample also the prior's centre."""
         if not self.started:
             self.estimator = Estimator(self.settings.estimator, present, present_gyro_bias_rad_s)
         self.present, self.present_gyro_bias_rad_s = present, present_gyro_bias_rad_s
 
-    def adopt(self, settings: CalibratorSettings) -> None:
-        """Other limits from now on."""
+    def set_settings(self, settings: CalibratorSettings) -> None:
+        """Use other settings from now on."""
         self.settings = settings
 
-    def anew(self) -> Calibrator:
-        """One that has seen nothing: what follows cannot be mixed with what came before."""
+    def make_fresh(self) -> Calibrator:
+        """A calibrator without samples: later samples must not be mixed with earlier ones."""
         return Calibrator(self.settings, self.present, self.present_gyro_bias_rad_s)
 
     def take(self, block: SampleBlock) -> bool:
-        """Samples in order; true where there is something new to judge."""
+        """Take samples in order; returns whether there is something new to judge."""
         new = False
         self.started = True
         self._at_s = float(block.time_s[-1]) if len(block) else self._at_s
-        stepped = self._watch(block)
-        parts = self.collector.parts(block)
+        stepped = self._detect_step(block)
+        parts = self.collector.split(block)
         for _, part in parts:
             self.collector.add(part)
-        for piece in self._training(parts) if self.settings.held_out else [block]:
-            new |= self.estimator.add(_unknown_first_step(piece))
+        for piece in self._training_parts(parts) if self.settings.held_out else [block]:
+            new |= self.estimator.add(_clear_first_step(piece))
         if new:
-            self.estimate = self._scaled(self.estimator.estimate())
-            self._heed(self.estimate)
+            self.estimate = self._apply_known_field(self.estimator.estimate())
+            self._report_estimator_news(self.estimate)
         return (new or stepped) and self.estimate is not None
 
-    def _watch(self, block: SampleBlock) -> bool:
-        """Whether hard iron or gyro bias are seen to have stepped since the estimate was made."""
+    def _detect_step(self, block: SampleBlock) -> bool:
+        """Whether this block shows a step of hard iron or gyro bias. Restarts when overdue."""
         step = self.steps.add(block, self.estimate)
         if step is not None:
             self.step, self.step_open = step, True
             self._notes.append((step.told_s, step.words))
             self._void = step.words
-        elif self.step_open and self._waited_enough:
+        elif self.step_open and self._restart_overdue:
             self.estimator = Estimator(
                 self.settings.estimator, self.present, self.present_gyro_bias_rad_s
             )
-            self.estimate, self._gap, self._heeded_s = None, True, None
-            self._begin_anew([f"calibrated anew from {self._at_s:.0f} s"])
+            self.estimate, self._gap, self._reported_restart_s = None, True, None
+            self._restart_evidence([f"calibrated anew from {self._at_s:.0f} s"])
         return step is not None
 
     @property
-    def _waited_enough(self) -> bool:
+    def _restart_overdue(self) -> bool:
         return self.step is None or not 0.0 <= self._at_s - self.step.told_s <= _PATIENCE_S
 
-    def _heed(self, estimate: Estimate | None) -> None:
-        """Whether the estimator began anew by itself since the last call, and what else it warns of
-        for the first time."""
+    def _report_estimator_news(self, estimate: Estimate | None) -> None:
+        """Note a restart that the estimator made by itself, and warnings that are new."""
         at_s = self.estimator.restarted_s
-        if estimate is not None and at_s is not None and at_s != self._heeded_s:
-            self._heeded_s = at_s
+        if estimate is not None and at_s is not None and at_s != self._reported_restart_s:
+            self._reported_restart_s = at_s
             self._void = change_message(at_s)
-            self._begin_anew([self._void])
-            self._told.add(_kind(self._void))
+            self._restart_evidence([self._void])
+            self._reported_warnings.add(_warning_without_numbers(self._void))
         for text in () if estimate is None else estimate.warnings:
-            if _kind(text) not in self._told:
-                self._told.add(_kind(text))
+            if _warning_without_numbers(text) not in self._reported_warnings:
+                self._reported_warnings.add(_warning_without_numbers(text))
                 self._notes.append((self._at_s, text))
 
-    def _begin_anew(self, notes: list[str]) -> None:
-        """The estimate forgot what was before a change: evidence from then proves nothing now."""
+    def _restart_evidence(self, notes: list[str]) -> None:
+        """The estimate discarded data before a change: discard the evidence from then as well."""
         self._notes += [(self._at_s, text) for text in notes]
         self.collector = EvidenceCollector()
         self.steps.restart()
         self.step_open = False
-        self._told = set()
+        self._reported_warnings = set()
 
-    def _training(self, parts: Iterable[tuple[Role, SampleBlock]]) -> Iterator[SampleBlock]:
-        """What the estimator may see; nothing is bridged over what is held out."""
+    def _training_parts(self, parts: Iterable[tuple[Role, SampleBlock]]) -> Iterator[SampleBlock]:
+        """The parts for the estimator, with a gap marked after each held-out part."""
         for role, part in parts:
             if role == "heldout":
                 self._gap = True
@@ -168,16 +167,16 @@ class Calibrator:
             self._gap = False
 
     def finish(self) -> Estimate | None:
-        """The end of the stream: iterate to the end."""
-        self.estimate = self._scaled(self.estimator.finish())
+        """End of the stream: iterate until the estimate has converged."""
+        self.estimate = self._apply_known_field(self.estimator.finish())
         return self.estimate
 
-    def judged(
+    def judge_estimate(
         self, at_s: float, health: HealthFacts, basis: BasisFacts, margin: float = 1.0
     ) -> tuple[GateResult, ...]:
-        """Evaluate the evidence for the present estimate and pass it through the gates.
+        """Evaluate the evidence for the present estimate and judge it by the gates.
 
-        margin: how much clearer than usual an improvement must be (after a rollback).
+        margin: factor on the required improvement (larger after a rollback).
         """
         if self.estimate is None:
             return ()
@@ -194,8 +193,8 @@ class Calibrator:
         )
         return self.gates
 
-    def _scaled(self, estimate: Estimate | None) -> Estimate | None:
-        """With a world field the scale is known: A grows so that the corrected field has it."""
+    def _apply_known_field(self, estimate: Estimate | None) -> Estimate | None:
+        """With a world field the scale is known: scale A so that the corrected field has it."""
         field = self.settings.world_field
         if estimate is None or field is None:
             return estimate
@@ -210,12 +209,12 @@ class Calibrator:
         )
 
 
-def _kind(warning: str) -> str:
-    """A warning without its numbers, which are others with each estimate."""
+def _warning_without_numbers(warning: str) -> str:
+    """A warning without its numbers, which differ between estimates."""
     return warning.partition(":")[0]
 
 
-def _unknown_first_step(block: SampleBlock) -> SampleBlock:
+def _clear_first_step(block: SampleBlock) -> SampleBlock:
     if not block.gap_before or np.isnan(block.dt_s[0]):
         return block
     dt_s = block.dt_s.copy()
@@ -223,21 +222,21 @@ def _unknown_first_step(block: SampleBlock) -> SampleBlock:
     return replace(block, dt_s=dt_s)
 
 
-# -- Beside the core -------------------------------------------------------------------------------
+# -- Tasks of the estimation -----------------------------------------------------------------------
 
 
-PAUSE_S = (5.0, 60.0)  # after a failure, and at most where it fails again soon
-HEALTHY_S = 300.0  # without a failure: the next one is a first one
+PAUSE_S = (5.0, 60.0)  # after a failure; at most, if it fails again soon
+HEALTHY_S = 300.0  # time without failure after which the next one counts as the first
 _LONGEST_REASON = 200
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class Circumstances:
-    """How things stood when the block came.
+    """Circumstances at the arrival of a block.
 
     at_s, host_s: time of the device and of the host
-    era: two blocks of one era were taken with the same registers in force, over one link
+    era: equal for blocks that were taken with the same registers in force, over one link
     """
 
     at_s: float
@@ -250,9 +249,9 @@ class Circumstances:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EstimationResult:
-    """What a block brought. `estimate` is None where there is nothing new to judge.
+    """Result of a task. `estimate` is None if there is nothing new to judge.
 
-    void: why a calibration from before this block holds no more, empty where it may hold
+    void: why calibrations from before this block are void, empty if they may be valid
     """
 
     calibrator: Calibrator
@@ -266,41 +265,41 @@ class EstimationResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EstimationFailure:
-    """A task that broke off: `calibrator` may be anything now and is used no more."""
+    """A failed task: the state of `calibrator` is undefined, and it is no longer used."""
 
     calibrator: Calibrator
     reason: str
 
 
 class EstimationTask:
-    """Work that is done once: by the thread, or when its result is asked for."""
+    """Work that is done once: by the thread, or when its result is needed."""
 
     def __init__(self, calibrator: Calibrator, make: Callable[[], EstimationResult | None]) -> None:
         self.calibrator = calibrator
         self._make = make
-        self._begun = False
+        self._done = False
         self._result: EstimationResult | None = None
         self._failure: Failure | None = None
 
     def work(self) -> Failure | None:
-        """Do it; returns how it broke off. None: not at all, or its calibrator was broken."""
-        self._begun = True
+        """Do the work; returns the failure. None: it succeeded, or the calibrator was broken."""
+        self._done = True
         if not self.calibrator.broken:
-            self._result, self._failure = supervised(self._make)
+            self._result, self._failure = run_supervised(self._make)
             self.calibrator.broken = self._failure is not None
         return self._failure
 
     def result(self) -> EstimationResult | EstimationFailure | None:
-        """What it brought."""
-        if not self._begun:
+        """The result; does the work first if the thread has not."""
+        if not self._done:
             self.work()
         if self._failure is not None:
             return EstimationFailure(self.calibrator, self._failure.reason)
         return self._result
 
 
-def supervised(make: Callable[[], T | None]) -> tuple[T | None, Failure | None]:
-    """What `make` returns, or how it broke off."""
+def run_supervised(make: Callable[[], T | None]) -> tuple[T | None, Failure | None]:
+    """Call `make`; returns its result, or the failure if it raised."""
     try:
         return make(), None
     except Exception as error:  # noqa: BLE001 - see the module
@@ -310,9 +309,9 @@ def supervised(make: Callable[[], T | None]) -> tuple[T | None, Failure | None]:
 
 
 class EstimatorState:
-    """Whether the estimator works: after it broke off it rests for a while, then begins anew.
+    """Whether the estimator works: after a failure it pauses for a while, then restarts.
 
-    The pauses are of samples, not of a clock, so that a replay has the same ones.
+    Pauses are measured by samples, not by a clock, so that a replay has the same ones.
     """
 
     def __init__(self) -> None:
@@ -327,15 +326,15 @@ class EstimatorState:
         """Whether there is no estimator now."""
         return self.left_s > 0.0
 
-    def broke_off(self, reason: str) -> None:
-        """It did; soon again means a longer pause."""
+    def record_failure(self, reason: str) -> None:
+        """Start a pause after a failure; a longer one if the last failure was recent."""
         again = self.failures > 0 and self._since_s < HEALTHY_S
         self._pause_s = min(2 * self._pause_s, PAUSE_S[1]) if again else PAUSE_S[0]
         self.reason, self.failures = reason, self.failures + 1
         self.left_s, self._since_s = self._pause_s, 0.0
 
-    def takes(self, block: SampleBlock) -> bool:
-        """Whether the estimator may have this block, or it falls into a pause."""
+    def accepts(self, block: SampleBlock) -> bool:
+        """Whether the estimator may take this block; False during a pause."""
         span_s = float(np.nansum(block.dt_s))
         if not self.failed:
             self._since_s += span_s
@@ -353,36 +352,40 @@ class EstimationQueue:
     def examine(
         self, calibrator: Calibrator, blocks: list[SampleBlock], circumstances: Circumstances
     ) -> EstimationTask:
-        """Let the calibrator take the blocks and judge; how things stood when the last one came."""
-        return self._put(calibrator, partial(_examined, calibrator, blocks, circumstances))
+        """Let the calibrator take the blocks and judge; circumstances of the last one."""
+        return self._append(calibrator, partial(_take_and_judge, calibrator, blocks, circumstances))
 
-    def recall(
+    def add_earlier(
         self, calibrator: Calibrator, block: SampleBlock, circumstances: Circumstances
     ) -> EstimationTask:
-        """Let the calibrator take a block of an earlier run; nothing is judged by it."""
-        return self._put(calibrator, partial(_recalled, calibrator, block, circumstances))
+        """Let the calibrator take a block of an earlier run, without judging."""
+        return self._append(
+            calibrator, partial(_take_earlier_block, calibrator, block, circumstances)
+        )
 
-    def compare(
+    def set_present(
         self, calibrator: Calibrator, present: Affine, bias_b_rad_s: Array
     ) -> EstimationTask:
-        """Tell the calibrator what a candidate must be better than."""
-        return self._put(calibrator, partial(calibrator.compare_with, present, bias_b_rad_s))
+        """Set the calibrator's reference for a candidate."""
+        return self._append(calibrator, partial(calibrator.compare_with, present, bias_b_rad_s))
 
-    def adopt(self, calibrator: Calibrator, settings: CalibratorSettings) -> EstimationTask:
-        """Let the calibrator judge by other limits from now on."""
-        return self._put(calibrator, partial(calibrator.adopt, settings))
+    def set_settings(self, calibrator: Calibrator, settings: CalibratorSettings) -> EstimationTask:
+        """Set the calibrator's settings, with other limits."""
+        return self._append(calibrator, partial(calibrator.set_settings, settings))
 
-    def _put(
+    def _append(
         self, calibrator: Calibrator, make: Callable[[], EstimationResult | None]
     ) -> EstimationTask:
         task = EstimationTask(calibrator, make)
         self._tasks.append(task)
         return task
 
-    def take(self, tasks: int, broken: str = "") -> list[EstimationResult | EstimationFailure]:
-        """The results of the oldest tasks; a record that lost some of them may ask for more.
+    def take_results(
+        self, tasks: int, broken: str = ""
+    ) -> list[EstimationResult | EstimationFailure]:
+        """The results of the oldest tasks; an incomplete recording may request too many.
 
-        broken: how the last one of them broke off; it is not tried again
+        broken: how the last one of them failed; it is not tried again
         """
         taken = [self._tasks.popleft() for _ in range(min(tasks, len(self._tasks)))]
         last = [EstimationFailure(taken.pop().calibrator, broken)] if broken and taken else []
@@ -392,13 +395,15 @@ class EstimationQueue:
         return [*found, *last]
 
 
-def _recalled(calibrator: Calibrator, block: SampleBlock, now: Circumstances) -> EstimationResult:
+def _take_earlier_block(
+    calibrator: Calibrator, block: SampleBlock, now: Circumstances
+) -> EstimationResult:
     calibrator.take(block)
     notes, void = tuple(calibrator.take_notes(now.host_s)), calibrator.take_void()
     return EstimationResult(calibrator, now, None, notes, void=void)
 
 
-def _examined(
+def _take_and_judge(
     calibrator: Calibrator, blocks: list[SampleBlock], now: Circumstances
 ) -> EstimationResult:
     new, void = False, ""
@@ -408,7 +413,7 @@ def _examined(
     proposed, notes = calibrator.proposed, tuple(calibrator.take_notes(now.host_s))
     if not new:
         return EstimationResult(calibrator, now, proposed, notes, void=void)
-    gates = calibrator.judged(now.at_s, now.health, now.basis, now.margin)
+    gates = calibrator.judge_estimate(now.at_s, now.health, now.basis, now.margin)
     return EstimationResult(calibrator, now, proposed, notes, calibrator.estimate, gates, void)
 
 
@@ -418,66 +423,66 @@ def _examined(
 class Estimation:
     """The calibrator in use, its tasks, and whether it works.
 
-    begin: has a task done, beside the core or at once
+    begin: has a task done, by the thread or at once
     """
 
     def __init__(
         self, settings: CalibratorSettings, begin: Callable[[EstimationTask], None]
     ) -> None:
         self._settings, self._begin = settings, begin
-        self._compared: tuple[Affine, Array] = (Affine.identity(), np.zeros(3))
+        self._present: tuple[Affine, Array] = (Affine.identity(), np.zeros(3))
         self._queue = EstimationQueue()
         self.state = EstimatorState()
-        self.calibrator = Calibrator(settings, *self._compared)
+        self.calibrator = Calibrator(settings, *self._present)
         self.proposed: Affine | None = None
 
-    def begin_from_scratch(self) -> None:
-        """Another device, or other registers than those that were taken out of the samples."""
+    def restart_from_identity(self) -> None:
+        """New calibrator: another device, or the samples were decompensated wrongly."""
         self.calibrator = Calibrator(self._settings, Affine.identity(), np.zeros(3))
 
-    def begin_anew(self) -> None:
-        """Other quantities: what follows cannot be mixed with what came before."""
-        self.calibrator = self.calibrator.anew()
-        self._compare()
+    def restart(self) -> None:
+        """New calibrator for a stream with other quantities."""
+        self.calibrator = self.calibrator.make_fresh()
+        self._pass_present()
 
     def compare_with(self, users: Mapping[int, Values]) -> None:
-        """What a candidate must be better than: what these registers of the user do."""
-        self._compared = user_compensation(users)
-        self._compare()
+        """Set the reference for a candidate: the correction by the user's registers."""
+        self._present = user_compensation(users)
+        self._pass_present()
 
-    def adopt(self, limits: Mapping[str, Any]) -> CalibratorSettings:
-        """Judge by these limits from now on; returns the settings with them."""
+    def set_limits(self, limits: Mapping[str, Any]) -> CalibratorSettings:
+        """Judge by these limits from now on; returns the new settings."""
         self._settings = replace(self._settings, limits=GateLimits(**limits))
-        self._begin(self._queue.adopt(self.calibrator, self._settings))
+        self._begin(self._queue.set_settings(self.calibrator, self._settings))
         return self._settings
 
     def examine(self, blocks: list[SampleBlock], when: Circumstances) -> None:
         """Let the calibrator take the blocks and judge."""
         self._begin(self._queue.examine(self.calibrator, blocks, when))
 
-    def recall(self, blocks: list[SampleBlock], when: Circumstances) -> None:
-        """A calibrator from scratch that takes the blocks of an earlier run first."""
-        self.begin_from_scratch()
-        self._compare()
+    def restart_with_earlier(self, blocks: list[SampleBlock], when: Circumstances) -> None:
+        """New calibrator that takes the blocks of an earlier run first."""
+        self.restart_from_identity()
+        self._pass_present()
         for block in blocks:
-            self._begin(self._queue.recall(self.calibrator, block, when))
+            self._begin(self._queue.add_earlier(self.calibrator, block, when))
 
-    def results(
+    def take_results(
         self, tasks: int, failure: str = ""
     ) -> Iterator[EstimationResult | EstimationFailure]:
-        """Of the oldest tasks, those of the calibrator in use: another may have replaced it."""
-        for found in self._queue.take(tasks, failure):
+        """Results of the oldest tasks, without those of a calibrator that was replaced."""
+        for found in self._queue.take_results(tasks, failure):
             if found.calibrator is self.calibrator:
                 if isinstance(found, EstimationResult):
                     self.proposed = found.proposed
                 yield found
 
-    def broke_off(self, reason: str) -> float:
-        """Drop the calibrator and what it proposed; returns for how long a new one rests."""
-        self.state.broke_off(reason)
-        self.calibrator = Calibrator(self._settings, *self._compared)
+    def record_failure(self, reason: str) -> float:
+        """Replace the failed calibrator and drop its proposal; returns the pause in seconds."""
+        self.state.record_failure(reason)
+        self.calibrator = Calibrator(self._settings, *self._present)
         self.proposed = None
         return self.state.left_s
 
-    def _compare(self) -> None:
-        self._begin(self._queue.compare(self.calibrator, *self._compared))
+    def _pass_present(self) -> None:
+        self._begin(self._queue.set_present(self.calibrator, *self._present))

@@ -1,19 +1,19 @@
-"""What is wrong with the sensors themselves, seen in the raw stream and said in plain words.
+"""Detects faults of the sensors themselves in the raw stream, and reports them in plain words.
 
 Two kinds of statistic, both over the newest samples:
 
-* how long a value has stood still: a real sensor has noise, so one that repeats itself exactly for
+* how long a value has not changed: a real sensor has noise, so a value that repeats exactly for
   `still_s` is stuck, held, saturated, or simulated without noise;
-* how the field turns against what the gyroscope says, per axis. With theta_k the angle between two
+* how the field turns compared with the gyroscope, per axis. With theta_k the angle between two
   means of the raw field m, G = diag(g) and hard iron o,
 
       m_k - m_(k-1) = -(G theta_k) x (m - o)
 
-  is linear in g and in the products g_i o_j (9 unknowns). g = 1 is a right gyroscope, 1/57.3 one in
-  deg/s, -1 one with the wrong sign. Scale errors move g by percents; soft iron shows a tenth of the
-  turn about one axis as one about another, which is much for an axis that hardly turns.
+  is linear in g and in the products g_i o_j (9 unknowns). g = 1 is a correct gyroscope, 1/57.3 one
+  in deg/s, -1 one with the wrong sign. Scale errors change g by percents. Soft iron makes a tenth
+  of a turn about one axis appear as a turn about another, much for an axis that hardly turns.
 
-All limits are in `SensorLimits`. Nothing is decided here: a finding is for a person.
+All thresholds are in `SensorLimits`. The module decides nothing: a finding is for a person.
 """
 
 from __future__ import annotations
@@ -34,19 +34,18 @@ AXES = ("x", "y", "z")
 class SensorLimits:
     """Every threshold of this module.
 
-    still_s, still_samples: exactly the same for so long, and for so many samples, is no noise
-    same_gauss, same_rad_s: values this close are the same one, after un-mapping
-    turned_deg, turning_rad_s: a vehicle that turned so far is said to have turned; a slower rate
-                      may be a bias
-    saturated_gauss:  of the sensor's 2.5 gauss
+    still_s, still_samples: a value is stuck if it is the same for this time and number of samples
+    same_gauss, same_rad_s: values this close count as the same, after decompensation
+    turned_deg, turning_rad_s: turn above which it is mentioned; a slower rate may be a bias
+    saturated_gauss:  of the sensor's range of 2.5 gauss
     window_s, step_s: of the comparison of field and gyroscope
-    least_steps, least_field_gauss: fewer steps, or a field that moves less (rms), say nothing
-    explained:        share of the field's movement that the fit must explain
-    sure:             1-sigma of an axis' g over its size below which the axis is spoken of
-    degrees:          g of a gyroscope in deg/s, between
+    least_steps, least_field_gauss: minimum steps and field variation (rms) for a conclusion
+    explained:        share of the field's changes that the fit must explain
+    sure:             largest relative 1-sigma of an axis' g for a finding on that axis
+    degrees:          range of g of a gyroscope in deg/s
     negated:          g below which an axis has the wrong sign
-    soft_iron:        share of a turn that may be shown as one about another axis
-    readings, share:  of so many readings, more than this share must not be unusable
+    soft_iron:        share of a turn that may appear as a turn about another axis
+    readings, share:  of this many readings, at most this share may be unusable
     """
 
     still_s: float = 10.0
@@ -71,7 +70,7 @@ class SensorLimits:
 
 @dataclass(slots=True)
 class _Still:
-    """Since when one value has stood still, and how far the vehicle turned meanwhile."""
+    """Since when a value has not changed, and how far the vehicle turned meanwhile."""
 
     value: float = float("nan")
     since_s: float = 0.0
@@ -90,51 +89,51 @@ class _Step:
 
 
 class SensorChecks:
-    """Takes raw blocks in order, and says what began or ended to be wrong. Deterministic."""
+    """Takes raw blocks in order; reports faults that began or ended. Deterministic."""
 
     def __init__(self, limits: SensorLimits | None = None) -> None:
         self.limits = limits or SensorLimits()
         self._by_samples: dict[str, str] = {}
         self._by_count: dict[str, str] = {}
-        self._counted = (0, 0)
-        self._begin()
+        self._counts_before = (0, 0)
+        self._reset()
 
-    def _begin(self) -> None:
-        self._still = [_Still() for _ in range(6)]
-        self._now_s = self._looked_s = float("-inf")
+    def _reset(self) -> None:
+        self._still_values = [_Still() for _ in range(6)]
+        self._now_s = self._checked_s = float("-inf")
         self._step: _Step | None = None
         self._steps: deque[tuple[float, Array, Array] | None] = deque()
 
     @property
     def findings(self) -> dict[str, str]:
-        """What is wrong now, by a name, in words."""
+        """Present faults: description by short identifier."""
         return {**self._by_samples, **self._by_count}
 
     def take(self, block: SampleBlock) -> list[str]:
-        """Further samples; what began or ended to be wrong, one sentence each."""
+        """Take samples; returns one sentence for each fault that began or ended."""
         if not len(block):
             return []
         if float(block.time_s[0]) < self._now_s:  # the device restarted
-            self._begin()
+            self._reset()
         self._now_s = float(block.time_s[-1])
-        self._stand_still(block)
-        self._turn(block)
-        if self._now_s - self._looked_s < 1.0:
+        self._update_still_values(block)
+        self._update_steps(block)
+        if self._now_s - self._checked_s < 1.0:
             return []
-        self._looked_s = self._now_s
+        self._checked_s = self._now_s
         before, self._by_samples = (
             self._by_samples,
-            {**dict(self._stuck()), **dict(self._turning())},
+            {**dict(self._find_stuck_axes()), **dict(self._find_gyro_faults())},
         )
-        return _changed(before, self._by_samples)
+        return _describe_changes(before, self._by_samples)
 
     def count(self, unusable: int, usable: int) -> list[str]:
-        """Readings since the start that could not be used, and that could; sentences as `take`."""
-        before = self._counted
+        """Numbers of unusable and usable readings since the start; returns sentences as `take`."""
+        before = self._counts_before
         bad, good = unusable - before[0], usable - before[1]
         if bad + good < self.limits.readings:
             return []
-        self._counted = (unusable, usable)
+        self._counts_before = (unusable, usable)
         share, found = bad / (bad + good), {}
         if share > self.limits.share:
             found["readings"] = (
@@ -143,24 +142,24 @@ class SensorChecks:
                 "twice; look for a magnet beside it, a damaged cable, or another program that "
                 "changes the stream"
             )
-        told, self._by_count = self._by_count, found
-        return _changed(told, found)
+        before_findings, self._by_count = self._by_count, found
+        return _describe_changes(before_findings, found)
 
-    # -- values that stand still -------------------------------------------------------------------
+    # -- values that do not change -----------------------------------------------------------------
 
-    def _stand_still(self, block: SampleBlock) -> None:
+    def _update_still_values(self, block: SampleBlock) -> None:
         speed = np.linalg.norm(block.gyro_b_rad_s, axis=1)
         turning = speed > self.limits.turning_rad_s
         rates = np.where(turning, speed, 0.0) * np.nan_to_num(block.dt_s)
         values = np.hstack([block.raw_b_gauss, block.gyro_b_rad_s])
-        for k, still in enumerate(self._still):
+        for k, still in enumerate(self._still_values):
             same = self.limits.same_gauss if k < 3 else self.limits.same_rad_s
             column = values[:, k]
             last = float(column[-1])
             others = np.flatnonzero(np.abs(column - last) > same)
             if len(others) or not abs(still.value - last) <= same:
                 start = int(others[-1]) + 1 if len(others) else 0
-                self._still[k] = _Still(
+                self._still_values[k] = _Still(
                     last,
                     float(block.time_s[start]),
                     len(block) - start,
@@ -170,10 +169,10 @@ class SensorChecks:
                 still.samples += len(block)
                 still.turned_rad += float(rates.sum())
 
-    def _stuck(self) -> Iterator[tuple[str, str]]:
+    def _find_stuck_axes(self) -> Iterator[tuple[str, str]]:
         p = self.limits
         for sensor, unit, first in (("magnetometer", "gauss", 0), ("gyroscope", "rad/s", 3)):
-            group = self._still[first : first + 3]
+            group = self._still_values[first : first + 3]
             stuck = [
                 k
                 for k, one in enumerate(group)
@@ -182,34 +181,34 @@ class SensorChecks:
             if not stuck:
                 continue
             axes = "all axes" if len(stuck) == 3 else f"axis {', '.join(AXES[k] for k in stuck)}"
-            held = ", ".join(f"{group[k].value:.5g}" for k in stuck)
+            values = ", ".join(f"{group[k].value:.5g}" for k in stuck)
             for_s = self._now_s - max(group[k].since_s for k in stuck)
             turned = float(np.degrees(min(group[k].turned_rad for k in stuck)))
-            moves = turned >= p.turned_deg and sensor == "magnetometer"
-            moving = f" while the vehicle turned by {turned:.0f} deg" if moves else ""
-            full = sensor == "magnetometer" and any(
+            turned_enough = turned >= p.turned_deg and sensor == "magnetometer"
+            moving = f" while the vehicle turned by {turned:.0f} deg" if turned_enough else ""
+            saturated = sensor == "magnetometer" and any(
                 abs(group[k].value) >= p.saturated_gauss for k in stuck
             )
             cause = (
                 "it is saturated: move it away from the magnet beside it"
-                if full
+                if saturated
                 else "not even noise moves it: it is stuck, held by another program, or simulated "
                 "without noise; nothing can be calibrated from it"
             )
             yield (
                 f"{sensor} still",
-                f"the {sensor} gives the same value on {axes} ({held} {unit}) for {for_s:.0f} s"
+                f"the {sensor} gives the same value on {axes} ({values} {unit}) for {for_s:.0f} s"
                 f"{moving}; {cause}",
             )
 
-    # -- field against gyroscope -------------------------------------------------------------------
+    # -- field and gyroscope -----------------------------------------------------------------------
 
-    def _turn(self, block: SampleBlock) -> None:
+    def _update_steps(self, block: SampleBlock) -> None:
         angle = block.gyro_b_rad_s * np.nan_to_num(block.dt_s)[:, None]
         if block.gap_before:
             self._step = None
             self._steps.append(None)
-        for a, b in _cuts(block.time_s, self.limits.step_s):
+        for a, b in _split_half_steps(block.time_s, self.limits.step_s):
             if self._step is None:
                 self._step = _Step(float(block.time_s[a]), np.zeros(3), np.zeros(3))
             step = self._step
@@ -226,15 +225,15 @@ class SensorChecks:
         ):
             self._steps.popleft()
 
-    def _turning(self) -> Iterator[tuple[str, str]]:
-        p, fit = self.limits, self._fit()
+    def _find_gyro_faults(self) -> Iterator[tuple[str, str]]:
+        p, fit = self.limits, self._fit_gyro_gain()
         if fit is None:
             return
-        g, sigma, feigned = fit
-        # what a scale of 1/57 means is small beside 1 and must be known beside itself
+        g, sigma, soft_iron_share = fit
+        # relative uncertainty: a gain of 1/57 is small compared with 1
         known = [k for k in range(3) if sigma[k] < p.sure * abs(g[k])]
         degrees = [k for k in known if p.degrees[0] < abs(g[k]) < p.degrees[1]]
-        negated = [k for k in known if g[k] + feigned[k] < p.negated]
+        negated = [k for k in known if g[k] + soft_iron_share[k] < p.negated]
         if degrees and len(degrees) == len(known):
             yield (
                 "gyroscope unit",
@@ -250,9 +249,9 @@ class SensorChecks:
                 "two sensors do not share one frame; nothing that is calibrated from them is right",
             )
 
-    def _fit(self) -> tuple[Array, Array, Array] | None:
-        """g (3,) with its 1-sigma, and how much of it soft iron may feign, per axis; None where the
-        field says too little."""
+    def _fit_gyro_gain(self) -> tuple[Array, Array, Array] | None:
+        """Per axis the gain g (3,), its 1-sigma, and the part that soft iron may cause; None if
+        the data are insufficient."""
         p = self.limits
         pairs = [
             (one, two)
@@ -284,31 +283,31 @@ class SensorChecks:
         u, values, vt = np.linalg.svd(scaled, full_matrices=False)
         keep = values > 1e-6 * values[0]
         found = vt[keep].T @ ((u[:, keep].T @ target) / values[keep])
-        rest = target - scaled @ found
+        residual = target - scaled @ found
         total = float(target @ target)
-        if total <= 0.0 or 1.0 - float(rest @ rest) / total < p.explained:
+        if total <= 0.0 or 1.0 - float(residual @ residual) / total < p.explained:
             return None
-        noise = float(rest @ rest) / max(len(target) - len(used), 1)
+        noise = float(residual @ residual) / max(len(target) - len(used), 1)
         spread = noise * np.sum((vt[keep].T / values[keep]) ** 2, axis=1)
-        lost = 1.0 - np.sum(vt[keep].T ** 2, axis=1) > 1e-6  # a direction nobody determined
+        undetermined = 1.0 - np.sum(vt[keep].T ** 2, axis=1) > 1e-6  # not in the data
         g, sigma = np.full(3, np.nan), np.full(3, np.inf)
         for row, k in enumerate(used):
-            if k < 3 and not lost[row]:
+            if k < 3 and not undetermined[row]:
                 g[k], sigma[k] = found[row] / size[k], np.sqrt(spread[row]) / size[k]
         turned = np.sqrt(np.mean(angle**2, axis=0))
-        shown = np.abs(np.nan_to_num(g)) * turned  # by the field
-        others = np.sqrt(np.maximum(shown @ shown - shown**2, 0.0))
+        apparent = np.abs(np.nan_to_num(g)) * turned  # turn as the field shows it
+        others = np.sqrt(np.maximum(apparent @ apparent - apparent**2, 0.0))
         return g, sigma, p.soft_iron * others / np.maximum(turned, 1e-12)
 
 
-def _changed(before: dict[str, str], now: dict[str, str]) -> list[str]:
-    """What began and what ended, in sentences."""
-    told = [text for name, text in now.items() if name not in before]
-    return told + [f"over: {text}" for name, text in before.items() if name not in now]
+def _describe_changes(before: dict[str, str], now: dict[str, str]) -> list[str]:
+    """One sentence for each fault that began or ended."""
+    began = [text for name, text in now.items() if name not in before]
+    return began + [f"over: {text}" for name, text in before.items() if name not in now]
 
 
-def _cuts(time_s: Array, step_s: float) -> Iterator[tuple[int, int]]:
-    """Rows of a block in pieces of at most half a step."""
+def _split_half_steps(time_s: Array, step_s: float) -> Iterator[tuple[int, int]]:
+    """Row ranges of a block, each at most half a step long."""
     number = ((time_s - time_s[0]) // (step_s / 2)).astype(np.int64)
     edges = np.flatnonzero(np.diff(number)) + 1
     bounds = [0, *edges.tolist(), len(time_s)]

@@ -30,14 +30,14 @@ class CoreSettings:
 
     output_rate_hz:  of the stream that `configure_stream` sets up
     reply_timeout_s: how long a reply may take
-    stream_rate_hz, stream_rate_source: of streams without time, and how it is known
-    keep: how many decisions, and how many of the first and of the newest gaps, stay in memory for
-        a summary; None: all, for a recording, whose length is known. Counts and hash are always
-        those of everything.
-    columns_max_age_s: how far a sample may be from what the vehicle measured, to be calibrated
-    warm_start_s: how old samples of an earlier run may be (`warm_start`); 0: none
+    stream_rate_hz, stream_rate_source: of streams without time, and how the rate is known
+    keep: how many decisions, and how many of the first and of the newest gaps, are kept in memory
+        for a summary; None: all, for a recording, whose length is known. Counts and hash always
+        cover everything.
+    columns_max_age_s: largest time between a sample and a vehicle's measurement that is used for it
+    warm_start_s: maximum age of samples of an earlier run (`warm_start`); 0: none are used
     shares: the ports on which other programs find the device
-    beside: the slow part of the work is done beside the core (`estimation`), not at once
+    beside: the slow work is done outside the core (`estimation`), not at once
     """
 
     calibrator: CalibratorSettings
@@ -54,11 +54,11 @@ class CoreSettings:
 
     @property
     def level(self) -> Level:
-        """Which gates must hold before RAM is written; those of the flash are asked at the save."""
+        """Which gates must pass before RAM is written; those for flash are checked at the save."""
         return Level.UNATTENDED if self.policy.approval == "auto" else Level.RAM
 
     def gates_of(
         self, gates: tuple[GateResult, ...]
     ) -> tuple[tuple[GateResult, ...], tuple[GateResult, ...]]:
-        """Those that must hold before RAM is written, and before flash is."""
+        """The gates that must pass before RAM is written, and those before flash is written."""
         return for_level(gates, self.level), for_level(gates, Level.FLASH)

@@ -32,7 +32,7 @@ from ahrsd.events import Failure
 from ahrsd.inputs import Input, Journalled, JournalOpened
 from ahrsd.recording.capture import CaptureWriter, make_private_folder
 from ahrsd.viewer.sink import RerunLimits, RerunSink
-from ahrsd.writeback.journal_history import of_another_device
+from ahrsd.writeback.journal_history import find_record_of_other_device
 
 log = logging.getLogger("ahrsd")
 
@@ -210,7 +210,7 @@ class JournalKeeper:
             journal = self.open(serial)
         except JournalError as error:
             return JournalOpened(self.now_ns(), serial, [], str(error))
-        if other := of_another_device(journal.records(), serial):
+        if other := find_record_of_other_device(journal.records(), serial):
             text = f"{journal.path}: {other}; move the file away or put that device's name on it"
             return JournalOpened(self.now_ns(), serial, [], text)
         self.journal = journal

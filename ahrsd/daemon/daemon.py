@@ -26,7 +26,7 @@ from typing import Protocol
 from ahrsd import inputs
 from ahrsd.config.config import Change, Config, Reloader
 from ahrsd.core.core import Core
-from ahrsd.core.estimation import supervised
+from ahrsd.core.estimation import run_supervised
 from ahrsd.daemon import host_clock
 from ahrsd.daemon.core_runner import Shell
 from ahrsd.daemon.health_log import Watch
@@ -69,7 +69,7 @@ class Recall:
         return Recall(lambda go_on: earlier_inputs(folder, own, now, limit_s, rate_hz, go_on))
 
     def _run(self) -> None:
-        found, failure = supervised(lambda: self._read(self._go_on))
+        found, failure = run_supervised(lambda: self._read(self._go_on))
         if failure is not None:
             log.error("no warm start: %s", failure.reason, extra={"trace": failure.trace})
             found = [inputs.EarlierRun(0, why=failure.reason)]

@@ -109,7 +109,7 @@ class Watch:
         rate = (facts.samples - before) / max(now_s - before_s, 1e-9)
         estimate = core.calibrator.estimate
         sigma = "no estimate" if estimate is None else _sigma(estimate.heading_sigma_deg)
-        holds = core.writeback.holds() if core.calibrator.gates else []
+        holds = core.writeback.obstacles() if core.calibrator.gates else []
         gates = [text.removeprefix("gate ") for text in holds if text.startswith("gate ")]
         waits = f", waits for {gates[0]}" if gates else "".join(f"; {text}" for text in holds[:1])
         return (

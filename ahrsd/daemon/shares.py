@@ -681,9 +681,9 @@ class Shares:
 
         Whether a program was handed any of it.
         """
-        ahead = self._splitter.ahead(data)
+        ahead = self._splitter.completed_message(data)
         taken = bool(ahead) and self._measured([ahead])
-        messages = self._splitter.feed(data) if data else self._splitter.silence()
+        messages = self._splitter.feed(data) if data else self._splitter.flush()
         return (bool(messages) and self._measured(messages)) or taken
 
     def _measured(self, messages: Sequence[bytes]) -> bool:

@@ -1,15 +1,15 @@
-"""Evidence about a calibration from data that the estimate has, and has not, seen.
+"""Evidence about a calibration, from training data and from held-out data.
 
 ::
 
     samples ─▶ segments (every 4th held out; attitude by gyro and gravity, no compass)
                  ├─▶ heading    held-out error
-                 ├─▶ coverage   attitudes shown
-                 └─▶ second_opinions  refits of halves and of the field's size, gyro bias at rest
+                 ├─▶ coverage   attitudes covered
+                 └─▶ second_opinions  refits of halves and of the magnitude, gyro bias at rest
 
-`collector` compares the candidate with the calibration in force and the world, by all of these.
-
-`EvidenceCollector` runs it all; `values` is what it finds, and what `ahrsd.gates` judges.
+`collector` compares the candidate with the calibration in force and with the world model, using all
+of these. `EvidenceCollector` runs everything; `values` holds its results, which `ahrsd.gates`
+judges.
 """
 
 from ahrsd.evidence.collector import (

@@ -1,9 +1,9 @@
-"""Which directions and attitudes the vehicle has shown, and what is missing in words.
+"""Which field directions and attitudes the data cover, and in words what is missing.
 
-Directions are those of the field in the sensor's own frame, as cells of a sphere. It is cut into
-rings of 10 degrees from the sensor's z axis, each ring into sectors of about 10 degrees of arc, so
-that all cells are about equally large. A vehicle that turns level shows one ring; where it tilts,
-it shows what lies beside that ring. Numbers of cells run ring by ring from +z, in a ring from +x to
+Directions are those of the field in the sensor frame, as cells of a sphere. The sphere is divided
+into rings of 10 degrees from the sensor's z axis, and each ring into sectors of about 10 degrees of
+arc, so that all cells have about the same area. A vehicle that turns level visits one ring; with
+tilt it visits neighbouring rings. Cells are numbered ring by ring from +z, within a ring from +x to
 +y.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ahrsd.calibration import Affine
-from ahrsd.evidence.heading import sectors
+from ahrsd.evidence.heading import visited_sectors
 from ahrsd.evidence.segments import Nodes
 from ahrsd.evidence.values import FREE_DEG, SECTOR_DEG, SECTORS, Bools, Coverage, Regime
 from ahrsd.samples import Array
@@ -30,7 +30,7 @@ CELLS = int(_FIRST[-1])
 
 
 def cells_of(directions_b: Array) -> NDArray[np.intp]:
-    """The cell of each (N, 3) vector; only its direction counts. Vectors of no length: none."""
+    """The cell of each (N, 3) vector by its direction; vectors of zero length are left out."""
     length = np.linalg.norm(directions_b, axis=1)
     unit = directions_b[length > 0] / length[length > 0, None]
     from_z_rad = np.arccos(np.clip(unit[:, 2], -1.0, 1.0))
@@ -40,15 +40,15 @@ def cells_of(directions_b: Array) -> NDArray[np.intp]:
     return np.asarray(_FIRST[ring] + sector, dtype=np.intp)
 
 
-def shown(directions_b: Array) -> Bools:
-    """(CELLS,) the cells in which at least one of the (N, 3) vectors lies."""
+def visited_cells(directions_b: Array) -> Bools:
+    """(CELLS,) whether at least one of the (N, 3) vectors lies in the cell."""
     seen = np.zeros(CELLS, dtype=bool)
     seen[cells_of(directions_b)] = True
     return seen
 
 
-def centres() -> Array:
-    """(CELLS, 3) unit vectors to the middle of each cell."""
+def cell_centres() -> Array:
+    """(CELLS, 3) unit vectors to the centre of each cell."""
     ring = np.repeat(np.arange(_RINGS), _SECTORS)
     sector = np.arange(CELLS) - _FIRST[ring]
     angle = 2 * np.pi * (sector + 0.5) / _SECTORS[ring]
@@ -62,16 +62,16 @@ def centres() -> Array:
 
 
 PLANAR_DEG = 5.0
-_ANY_DEG = 45.0  # of heading, below which there was no motion to speak of
+_ANY_DEG = 45.0  # range of heading below which there is no motion to evaluate
 
 
-def coverage(nodes: Nodes, heading_rad: Array, correction: Affine) -> Coverage:
+def motion_coverage(nodes: Nodes, heading_rad: Array, correction: Affine) -> Coverage:
     """Coverage of all segments; `heading_rad` (N,) is their `gyro_heading_rad`."""
-    directions = shown(correction.apply(nodes.raw_b_gauss))
+    directions = visited_cells(correction.apply(nodes.raw_b_gauss))
     if not nodes.has_gravity:
         nan = float("nan")
         return Coverage(nan, nan, nan, "unknown", "add acceleration to the stream", directions)
-    seen = sectors(heading_rad)
+    seen = visited_sectors(heading_rad)
     down_b = nodes.down_b
     roll_deg = _half_range(np.degrees(np.unwrap(np.arctan2(down_b[:, 1], down_b[:, 2]))))
     pitch_deg = _half_range(np.degrees(np.arcsin(np.clip(-down_b[:, 0], -1.0, 1.0))))
@@ -89,15 +89,15 @@ def coverage(nodes: Nodes, heading_rad: Array, correction: Affine) -> Coverage:
 
 
 def turn_advice(seen: Bools, heading_deg: float) -> str:
-    """The shorter way to sweep every sector that is missing, from the present heading."""
+    """Advice: the shorter turn that visits all missing sectors, from the present heading."""
     missing = np.flatnonzero(~seen)
     if len(missing) == 0:
         return ""
     here = int(heading_deg // SECTOR_DEG)
     right = int(np.max((missing - here) % SECTORS)) * SECTOR_DEG
     left = int(np.max((here - missing) % SECTORS)) * SECTOR_DEG
-    way, far = ("left", left) if left < right else ("right", right)
-    return f"turn {way} about {far:.0f} deg more"
+    side, angle_deg = ("left", left) if left < right else ("right", right)
+    return f"turn {side} about {angle_deg:.0f} deg more"
 
 
 def _regime(heading_deg: float, roll_deg: float, pitch_deg: float, down_b: Array) -> Regime:

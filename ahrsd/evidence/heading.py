@@ -1,10 +1,10 @@
-"""Magnetic heading against gyro heading on data that the estimate has not seen.
+"""Compares magnetic heading with gyro heading on held-out data.
 
-Within a segment (at most one slot long) the corrected field, turned into the segment's first frame
-by the gyro, must stand still. Its swing around down is tilt-compensated magnetic heading minus gyro
-heading, with the one unknown constant removed: the heading error. The candidate's gyro bias serves
-both calibrations that are compared, so that it is the magnetometer that is judged. Errors are
-averaged over one second: noise of single samples is no calibration error.
+Within a segment (at most one slot long) the corrected field, rotated into the segment's first frame
+by the gyro, must be constant. Its rotation about down is tilt-compensated magnetic heading minus
+gyro heading, up to one unknown constant that is removed: the heading error. Both calibrations use
+the candidate's gyro bias, so that only the magnetometer is judged. Errors are averaged over one
+second, because the noise of single samples is no calibration error.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ _BLOCK = 10  # one-second means in one block of the bootstrap
 _DRAWS = 500
 _SEED = 23
 _LEVEL_ENOUGH = 0.3  # horizontal part of the x axis below which there is no heading
-_TYPICAL_DIP_RAD = np.radians(65.0)  # where gravity is not known
+_TYPICAL_DIP_RAD = np.radians(65.0)  # if gravity is not known
 
 
-def prove(
+def compare_heading_errors(
     everything: Nodes, heading_rad: Array, after: Affine, before: Affine, least_turn_deg: float
 ) -> HeadingProof:
-    """Judge `after` against `before` on the held-out segments that turned by `least_turn_deg`.
+    """Heading errors of `after` and `before` on held-out segments with enough turning.
 
-    `heading_rad` (N,) is `gyro_heading_rad` of all nodes.
+    `heading_rad` (N,) is `gyro_heading_rad` of all nodes; `least_turn_deg`: per segment.
     """
-    chosen = everything.heldout & (turned_deg(everything, heading_rad) >= least_turn_deg)
-    nodes = everything.only(chosen)
+    chosen = everything.heldout & (heading_range_deg(everything, heading_rad) >= least_turn_deg)
+    nodes = everything.select(chosen)
     if nodes is None:
         return NO_PROOF
     heading_rad = heading_rad[chosen[everything.segment]]
     errors = np.column_stack([heading_errors_deg(nodes, c) for c in (after, before)])
-    windows = [_one_second(errors[a:b]) for a, b in _ranges(nodes)]
-    turns = [_one_second(np.degrees(heading_rad[a:b, None]))[:, 0] for a, b in _ranges(nodes)]
+    windows = [_one_second_means(errors[a:b]) for a, b in _ranges(nodes)]
+    turns = [_one_second_means(np.degrees(heading_rad[a:b, None]))[:, 0] for a, b in _ranges(nodes)]
     if nodes.has_gravity:
         windows = [w - np.mean(w, axis=0) for w in windows]
     pooled = np.concatenate(windows)
     rms_deg = np.sqrt(np.mean(pooled**2, axis=0))
     return HeadingProof(
         windows=len(windows),
-        sectors=sectors(heading_rad),
+        sectors=visited_sectors(heading_rad),
         rms_before_deg=float(rms_deg[1]),
         rms_after_deg=float(rms_deg[0]),
         max_after_deg=float(np.max(np.abs(pooled[:, 0]))),
@@ -54,16 +54,16 @@ def prove(
     )
 
 
-def field_0(nodes: Nodes, correction: Affine) -> Array:
+def mean_field_0(nodes: Nodes, correction: Affine) -> Array:
     """(S, 3) mean corrected field of each segment, in its first frame."""
-    return nodes.mean(_seen_from_0(nodes, correction))
+    return nodes.mean(_field_in_first_frame(nodes, correction))
 
 
 def gyro_heading_rad(nodes: Nodes, field_0: Array) -> Array:
     """(N,) heading of the x axis from each segment's mean field direction (S, 3).
 
-    Unwrapped within each segment; whole turns between segments mean nothing.
-    nan where x stands within 17 degrees of vertical, and where the stream has no gravity.
+    Unwrapped within each segment; whole turns between segments are arbitrary. nan if the x axis
+    is within 17 degrees of vertical, or if gravity is not known.
     """
     north, east = _level_axes(nodes.down_0, field_0)
     x_0 = nodes.R_0b[:, :, 0]
@@ -75,8 +75,8 @@ def gyro_heading_rad(nodes: Nodes, field_0: Array) -> Array:
     return heading
 
 
-def turned_deg(nodes: Nodes, heading_rad: Array) -> Array:
-    """(S,) range of heading within each segment; without gravity, all that the gyro turned."""
+def heading_range_deg(nodes: Nodes, heading_rad: Array) -> Array:
+    """(S,) range of heading within each segment; without gravity, the total turn of the gyro."""
     if not nodes.has_gravity:
         return np.degrees([t.segment.turned_rad for t in nodes.tracks])
     high = np.fmax.reduceat(heading_rad, nodes.starts)
@@ -85,28 +85,30 @@ def turned_deg(nodes: Nodes, heading_rad: Array) -> Array:
 
 
 def heading_errors_deg(nodes: Nodes, correction: Affine) -> Array:
-    """(N,) heading error of a calibration; without gravity an upper estimate that has no sign."""
-    h_0 = _seen_from_0(nodes, correction)
+    """(N,) heading error of a calibration; without gravity an unsigned upper estimate."""
+    h_0 = _field_in_first_frame(nodes, correction)
     mean_0 = nodes.mean(h_0)
     if nodes.has_gravity:
         north, east = _level_axes(nodes.down_0, mean_0)
         n = np.sum(h_0 * north[nodes.segment], axis=1)
         e = np.sum(h_0 * east[nodes.segment], axis=1)
-        return np.asarray(-np.degrees(np.arctan2(e, n)))  # north seen too far right: reads left
+        return np.asarray(
+            -np.degrees(np.arctan2(e, n))
+        )  # north too far right: heading reads too far left
     mean_0 = mean_0 / np.linalg.norm(mean_0, axis=1, keepdims=True)
     off = np.cross(mean_0[nodes.segment], h_0 / np.linalg.norm(h_0, axis=1, keepdims=True))
     return np.asarray(np.degrees(np.linalg.norm(off, axis=1) / np.cos(_TYPICAL_DIP_RAD)))
 
 
-def sectors(heading_rad: Array) -> Bools:
-    """(36,) which ten-degree sectors the headings visited; nan is nowhere."""
+def visited_sectors(heading_rad: Array) -> Bools:
+    """(36,) which ten-degree sectors the headings visited; nan is ignored."""
     known = heading_rad[np.isfinite(heading_rad)]
     seen = np.zeros(SECTORS, dtype=bool)
     seen[(np.degrees(known) // SECTOR_DEG).astype(int) % SECTORS] = True
     return seen
 
 
-def _seen_from_0(nodes: Nodes, correction: Affine) -> Array:
+def _field_in_first_frame(nodes: Nodes, correction: Affine) -> Array:
     return np.asarray((nodes.R_0b @ correction.apply(nodes.raw_b_gauss)[..., None])[..., 0])
 
 
@@ -121,7 +123,7 @@ def _ranges(nodes: Nodes) -> list[tuple[int, int]]:
     return list(zip(nodes.starts, [*nodes.starts[1:], len(nodes.time_s)], strict=True))
 
 
-def _one_second(values: Array) -> Array:
+def _one_second_means(values: Array) -> Array:
     """Means of (n, c) over one second of nodes; an incomplete last second is left out."""
     whole = len(values) // _PER_MEAN * _PER_MEAN
     return np.asarray(values[:whole].reshape(-1, _PER_MEAN, values.shape[1]).mean(axis=1))
@@ -130,8 +132,8 @@ def _one_second(values: Array) -> Array:
 def _closure_deg(turns_deg: list[Array], errors_deg: list[Array]) -> float:
     """How much the heading error changes over 360 degrees.
 
-    Where a window holds a full turn: mean change between its pairs one turn apart, worst window.
-    Else the slope of error against turn over all windows, times 360, if they turned 360 together.
+    If a window holds a full turn: mean change between its pairs one turn apart, worst window.
+    Otherwise 360 times the slope of error over turn in all windows, if they turned 360 in total.
     """
     changes = [
         change

@@ -1,24 +1,26 @@
 """Second opinions on an estimate: two independent fits, and the gyro bias as the mean at rest.
 
 Gyro fit (for halves of the data). With R_0k of `segments`, the corrected field of a segment must
-not move: R_0k (C m_k - c) = f_s, c = C b. Linear in (C, c); f_s is removed by centring. C = 0 would
-do, so the trace of C is held: C = C0 + sum x_i E_i over the five traceless symmetric E_i. Noise in
-the regressor m pulls C towards 0 with the weight n sigma^2; its pull on the right-hand side is
-taken off, which leaves a pull towards C0: harmless where motion is rich, wanted where it is not.
-Likewise the gyro's drift: R_0k wrong by milliradians looks like motion, and is weighed down.
+be constant: R_0k (C m_k - c) = f_s, c = C b. This is linear in (C, c); f_s is removed by centring.
+C = 0 would be a solution, so the trace of C is fixed: C = C0 + sum x_i E_i over the five traceless
+symmetric E_i. Noise in the regressor m biases C towards 0 with the weight n sigma^2. Its effect on
+the right-hand side is subtracted, which leaves a bias towards C0: harmless with rich motion, wanted
+with poor motion. Likewise gyro drift: an error of R_0k by milliradians looks like motion, and is
+counted as additional prior weight.
 
-Size fit (second opinion): |C m - c| = F over symmetric C and c by Levenberg and Marquardt, in
-distances from the ellipsoid: no gyro, no gravity, and none of the quadric's troubles with signs and
-shapes (Fang et al. 2011 fit the quadric; its answer need not be an ellipsoid).
+Magnitude fit: |C m - c| = F over symmetric C and c by Levenberg-Marquardt, in distances from the
+ellipsoid. It needs no gyro and no gravity, and avoids the problems of a quadric with signs and
+shapes (Fang et al. 2011 fit the quadric; its solution need not be an ellipsoid).
 
-Both hold what the motion does not determine at the calibration in force, by a prior as wide as
-anything physical: in the plane the vertical stays, and a circle becomes the 2-D fit by itself.
+In directions that the motion does not determine, a prior keeps both fits at the calibration in
+force; it is as wide as anything physical. With planar motion the vertical is kept, and a circle
+becomes the 2-D fit by itself.
 
-Rest, the plainest second opinion there is. What is contiguous is cut in bins of one second,
-whatever segments it lies in. At rest the force is steady, the rate is small and steady, and the
-field stays where it is (a slow steady turn has the first two). No bias is assumed. Runs of three
-such bins and more count, between two more. The scatter of the bins gives the sigma of the mean; the
-Earth's rotation (0.07 mrad/s) and a bias that wanders are a floor under it.
+Rest, the simplest second opinion. Contiguous data are divided into bins of one second, across
+segments. At rest the force is steady, the rate is small and steady, and the field is constant (a
+slow steady turn has only the first two). No bias is assumed. Runs of at least three such bins
+count, without one more bin at each end. The scatter of the bins gives the sigma of the mean; the
+Earth's rotation (0.07 mrad/s) and a drifting bias set a floor for it.
 """
 
 from __future__ import annotations
@@ -40,8 +42,8 @@ _PRIOR_MATRIX = 0.3
 _PRIOR_GAUSS = 0.5
 _DRIFT_RAD = 2e-3  # error of the gyro's attitude within a segment: 0.1 mrad/s for half a minute
 _NODES = 1000
-_ROUNDS = 60
-_SETTLED = 1e-3  # of the cost, in units of one sigma squared
+_ITERATIONS = 60
+_COST_TOLERANCE = 1e-3  # of the cost, in units of one sigma squared
 _PRIOR_SIGMA = np.r_[np.full(6, _PRIOR_MATRIX), np.full(3, _PRIOR_GAUSS)]
 _ELEMENTS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -60,8 +62,8 @@ _TRACELESS = np.array(
 )
 
 
-def gyro_fit(nodes: Nodes, present: Affine, sigma_gauss: float) -> Affine | None:
-    """Calibration from the segments of `nodes`; None where it is no calibration.
+def fit_with_gyro(nodes: Nodes, present: Affine, sigma_gauss: float) -> Affine | None:
+    """Calibration from the segments of `nodes`; None if the result is no valid calibration.
 
     `sigma_gauss` is the noise of one node's field per axis.
     """
@@ -82,11 +84,11 @@ def gyro_fit(nodes: Nodes, present: Affine, sigma_gauss: float) -> Affine | None
     if solution is None:
         return None
     C = C0 + np.einsum("a,aij->ij", solution[:5], E)
-    return _calibration(C, solution[5:], present)
+    return _to_calibration(C, solution[5:], present)
 
 
-def size_fit(nodes: Nodes, present: Affine, sigma_gauss: float) -> Affine | None:
-    """Ellipsoid through all nodes; None where it does not converge to one."""
+def fit_magnitude(nodes: Nodes, present: Affine, sigma_gauss: float) -> Affine | None:
+    """Ellipsoid fit to all nodes; None if it does not converge to one."""
     m = nodes.raw_b_gauss[:: max(1, len(nodes.raw_b_gauss) // _NODES)]
     middle = m.mean(axis=0)
     C0 = (present.matrix + present.matrix.T) / 2
@@ -95,25 +97,25 @@ def size_fit(nodes: Nodes, present: Affine, sigma_gauss: float) -> Affine | None
     upper = [C0[i, j] for i, j in _ELEMENTS]
     prior = np.r_[upper, C0 @ (present.offset - middle)]
     x = np.r_[upper, C0 @ (start - middle)]
-    cost, N, y = _size_normal(m - middle, x, F, sigma_gauss, prior=prior)
+    cost, N, y = _magnitude_normal_equations(m - middle, x, F, sigma_gauss, prior=prior)
     damping = 1e-3
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         step = _solve(N + damping * np.diag(np.diag(N)), y)
         if step is None:
             return None
-        trial = _size_normal(m - middle, x + step, F, sigma_gauss, prior=prior)
+        trial = _magnitude_normal_equations(m - middle, x + step, F, sigma_gauss, prior=prior)
         if not trial[0] <= cost:
             damping *= 10.0
             continue
-        settled = cost - trial[0] < _SETTLED
+        converged = cost - trial[0] < _COST_TOLERANCE
         x, (cost, N, y), damping = x + step, trial, damping / 10.0
-        if settled:
+        if converged:
             C = np.einsum("a,aij->ij", x[:6], _BASIS)
-            return _calibration(C, x[6:] + C @ middle, present)
+            return _to_calibration(C, x[6:] + C @ middle, present)
     return None
 
 
-def _size_normal(
+def _magnitude_normal_equations(
     m: Array, x: Array, F: float, sigma_gauss: float, *, prior: Array
 ) -> tuple[float, Array, Array]:
     """Cost, normal matrix and right-hand side at x = (C, c), with h = C m - c.
@@ -141,7 +143,7 @@ def _bilinear(a: Array, b: Array) -> Array:
 
 
 def _sphere_centre(m: Array, present: Affine, sigma_gauss: float) -> Array:
-    """Centre of the sphere |m - b|^2 = F^2, linear in b; held where it is not seen."""
+    """Centre of the sphere |m - b|^2 = F^2, linear in b, with a prior at the present one."""
     mean = m.mean(axis=0)
     d = m - mean
     square = np.sum(d**2, axis=1)
@@ -154,7 +156,7 @@ def _sphere_centre(m: Array, present: Affine, sigma_gauss: float) -> Array:
 
 
 def _solve(N: Array, y: Array) -> Array | None:
-    """N^-1 y for a symmetric N that must be positive definite; None where it is not."""
+    """N^-1 y for a symmetric positive definite N; None if N is not."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
     values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
     if values[0] <= 1e-13:
@@ -162,8 +164,8 @@ def _solve(N: Array, y: Array) -> Array | None:
     return np.asarray(scale * (vectors @ ((vectors.T @ (scale * y)) / values)))
 
 
-def _calibration(C: Array, c: Array, present: Affine) -> Affine | None:
-    """C and C b as a calibration of the present one's determinant; None unless C is positive."""
+def _to_calibration(C: Array, c: Array, present: Affine) -> Affine | None:
+    """Calibration of C and C b, scaled to the present determinant; None unless C is positive."""
     if np.linalg.eigvalsh(C)[0] <= 0.05:
         return None
     scale = np.cbrt(np.linalg.det(present.matrix) / np.linalg.det(C))
@@ -176,17 +178,17 @@ def _calibration(C: Array, c: Array, present: Affine) -> Affine | None:
 STILL_GYRO_RAD_S = 0.01
 STILL_ACCEL_M_S2 = 0.05
 STILL_BINS = 3
-MOST_BIAS_RAD_S = 0.0625  # 3 deg/s of bias and what counts as still
+MOST_BIAS_RAD_S = 0.0625  # 3 deg/s of bias plus the threshold of rest
 _LONGEST_BINS = 30
 _TURN_GAUSS = 0.003  # between the halves of a run: more is a slow turn
 _FLOOR_RAD_S = 1e-4
-_JOINED_ROWS = 2.5  # of averaged rows: a shorter hole is the row that a cut left incomplete
-_NEWEST_S = 900.0  # rest that is older says nothing about the bias of today
+_JOINED_ROWS = 2.5  # averaged rows: a shorter gap is the incomplete row at a cut
+_NEWEST_S = 900.0  # older rest says nothing about the present bias
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seconds:
-    """One-second bins of a stretch: time_s (k,), rate (k, 3), force_std (k,), field (k, 3)."""
+    """One-second bins: time_s (k,), rate (k, 3), force_std (k,), field (k, 3)."""
 
     time_s: Array
     rate_b_rad_s: Array
@@ -196,17 +198,17 @@ class Seconds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rest:
-    """Mean rate at rest (3,) with the sigma of that mean; nan and 0 s where there was no rest."""
+    """Mean rate at rest (3,) with the sigma of that mean; nan and 0 s if there was no rest."""
 
     rate_b_rad_s: Array
     sigma_rad_s: float
     duration_s: float
 
 
-def seconds(stretch: Sequence[Segment]) -> Seconds:
-    """Cut segments that follow each other in one-second bins; an incomplete last one is left out.
+def one_second_bins(stretch: Sequence[Segment]) -> Seconds:
+    """One-second bins of contiguous segments; an incomplete last bin is left out.
 
-    The angle into a segment's first row is not known: the rate of its next row stands for it.
+    The angle into a segment's first row is not known: the rate of its next row is used for it.
     """
     time_s = np.concatenate([segment.time_s for segment in stretch])
     dt_s = np.diff(time_s)
@@ -226,10 +228,10 @@ def seconds(stretch: Sequence[Segment]) -> Seconds:
     )
 
 
-def stretches(segments: Sequence[Segment]) -> list[list[Segment]]:
-    """Segments of the newest quarter of an hour, those together that follow each other.
+def contiguous_segments(segments: Sequence[Segment]) -> list[list[Segment]]:
+    """Segments of the newest quarter of an hour, grouped where they are contiguous.
 
-    Nothing from before the device's clock began anew is among them.
+    Segments from before a restart of the device's clock are left out.
     """
     found: list[list[Segment]] = []
     for segment in reversed(segments):
@@ -237,23 +239,23 @@ def stretches(segments: Sequence[Segment]) -> list[list[Segment]]:
             break
         if segment.time_s[-1] < segments[-1].time_s[-1] - _NEWEST_S:
             break
-        if found and _follows(segment, found[-1][0]):
+        if found and _are_contiguous(segment, found[-1][0]):
             found[-1].insert(0, segment)
         else:
             found.append([segment])
     return found[::-1]
 
 
-def _follows(before: Segment, after: Segment) -> bool:
-    """Whether nothing but an incomplete row is missing between them."""
+def _are_contiguous(before: Segment, after: Segment) -> bool:
+    """Whether at most an incomplete row is missing between them."""
     usual_s = float(np.median(np.diff(before.time_s)))
     same = before.averaged == after.averaged
     return same and float(after.time_s[0] - before.time_s[-1]) < _JOINED_ROWS * usual_s
 
 
-def rest(segments: Sequence[Segment]) -> Rest:
-    """Mean rate over the rest within the newest quarter of an hour."""
-    bins = [seconds(stretch) for stretch in stretches(segments)]
+def mean_rate_at_rest(segments: Sequence[Segment]) -> Rest:
+    """Mean rate at rest within the newest quarter of an hour."""
+    bins = [one_second_bins(stretch) for stretch in contiguous_segments(segments)]
     newest_s = max((float(b.time_s[-1]) for b in bins if len(b.time_s)), default=0.0)
     runs = [
         b.rate_b_rad_s[i:j]
@@ -265,15 +267,15 @@ def rest(segments: Sequence[Segment]) -> Rest:
         return Rest(np.full(3, np.nan), float("nan"), 0.0)
     rates = np.concatenate(runs)
     scatter = np.concatenate([run - run.mean(axis=0) for run in runs])
-    freedom = max(1, len(rates) - len(runs))
-    sigma = np.sqrt(np.max(np.sum(scatter**2, axis=0)) / freedom / len(rates))
+    degrees_of_freedom = max(1, len(rates) - len(runs))
+    sigma = np.sqrt(np.max(np.sum(scatter**2, axis=0)) / degrees_of_freedom / len(rates))
     return Rest(rates.mean(axis=0), float(np.hypot(sigma, _FLOOR_RAD_S)), float(len(rates)))
 
 
 def _still_runs(bins: Seconds) -> list[tuple[int, int]]:
-    """Bins at rest, in pieces of at most half a minute: a field that drifts slowly is no turn.
+    """Ranges of bins at rest, of at most half a minute: a field that drifts slowly is no turn.
 
-    What is usual is that of each piece by itself: elsewhere the vehicle may turn, as steadily.
+    Each run has its own median rate: elsewhere the vehicle may turn just as steadily.
     """
     still = bins.force_std_m_s2 < STILL_ACCEL_M_S2
     still &= np.linalg.norm(bins.rate_b_rad_s, axis=1) < MOST_BIAS_RAD_S
@@ -294,6 +296,6 @@ def _runs(true: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _drift_gauss(field: Array) -> float:
-    """Second half against first: noise averages out, a steady turn does not."""
+    """Difference of the means of both halves: noise averages out, a steady turn does not."""
     middle = len(field) // 2
     return float(np.linalg.norm(field[middle:].mean(axis=0) - field[:middle].mean(axis=0)))

@@ -1,4 +1,4 @@
-"""What the evidence remembers: averaged samples in segments, some held out, and their attitude."""
+"""History of the evidence: averaged samples in segments, some held out, and their attitude."""
 
 from __future__ import annotations
 
@@ -16,32 +16,30 @@ from ahrsd.samples import Array, SampleBlock
 
 # -- Samples in segments ---------------------------------------------------------------------------
 #
-# What the evidence remembers: averaged samples in segments, some of them held out.
-#
 # Samples are averaged to at most 25 Hz. Field, force, time and *accumulated angle* are averaged
 # with the same weights, and the angle is differenced afterwards, so all four belong to the same
-# instant whatever the stream's rate.
+# instant at any stream rate.
 #
-# Time is cut in slots of `segment_s`. Every `heldout_every`-th slot is held out: the estimator
-# never sees it. A segment is what is contiguous inside one slot: a gap, a change of role or of the
-# register epoch ends it. Memory is bounded by the number of segments; rest is forgotten before
-# motion.
+# Time is divided into slots of `segment_s`. Every `heldout_every`-th slot is held out: the
+# estimator never gets it. A segment is contiguous data inside one slot: a gap, a change of role or
+# of the register epoch ends it. The number of segments is bounded; segments at rest are dropped
+# before segments with motion.
 
 
-_CLOCK_S = 1e-6  # a sample this close before a boundary is on it
+_CLOCK_S = 1e-6  # a sample this close before a boundary counts as on it
 Role = Literal["train", "heldout"]
 
 
 @dataclass(frozen=True, slots=True)
 class HistoryParameters:
-    """How the stream is cut and how much of it is kept."""
+    """How the stream is divided and how much of it is kept."""
 
     segment_s: float = 30.0  # longer: slower vehicles show a full turn in one, later first verdict
     heldout_every: int = 4  # smaller: more proof, less data for the estimate
     rate_hz: float = 25.0  # averaged rate: larger follows faster motion, costs memory
     shortest_s: float = 5.0  # a shorter piece between two gaps is dropped
     segments: int = 120  # one hour
-    moving_deg: float = 20.0  # turned by less than this, a segment counts as rest when room is made
+    moving_deg: float = 20.0  # a segment that turned less counts as rest when one is dropped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +47,7 @@ class Segment:
     """Contiguous averaged samples of one role; `number` counts segments since the start.
 
     time_s (n,); raw_b_gauss (n, 3); angle_b_rad (n, 3): gyro integrated from the previous row to
-    this one, bias not removed, first row zero; accel_b_m_s2 (n, 3), nan where the stream has none;
+    this one, bias not removed, first row zero; accel_b_m_s2 (n, 3), nan if the stream has none;
     turned_rad: sum of the angles; averaged: samples of the stream in one row.
     """
 
@@ -68,13 +66,13 @@ class Segment:
 
 
 class SegmentHistory:
-    """Blocks in, segments out.  Deterministic: depends on device time and on what was added."""
+    """Turns blocks into segments. Deterministic: depends on device time and blocks only."""
 
     def __init__(self, parameters: HistoryParameters | None = None) -> None:
         self.parameters = parameters or HistoryParameters()
         self.segments: list[Segment] = []
         self._start_s: float | None = None
-        self._newest_s = np.inf  # nothing yet: the first block begins a segment
+        self._newest_s = np.inf  # no block yet: the first one begins a segment
         self._closed = 0
         self._open = _Averager(1)
         self._role: Role = "train"
@@ -82,17 +80,17 @@ class SegmentHistory:
         self._epoch = 0
 
     def role(self, block: SampleBlock) -> Role:
-        """Role of a block that is about to be added: that of its first sample's slot."""
+        """Role of a block that is to be added next: that of its first sample's slot."""
         if len(block) == 0:
             return self._role
         first_s = float(block.time_s[0])
-        return self._role_of(self._slot_of(first_s, self._anchor(first_s)))
+        return self._role_of(self._slot_of(first_s, self._slot_origin_s(first_s)))
 
-    def parts(self, block: SampleBlock) -> list[tuple[Role, SampleBlock]]:
-        """The block cut at slot boundaries; a part that follows another role has `gap_before`."""
+    def split(self, block: SampleBlock) -> list[tuple[Role, SampleBlock]]:
+        """The block split at slot boundaries; `gap_before` is set where the role changes."""
         if len(block) == 0:
             return []
-        start_s = self._anchor(float(block.time_s[0]))
+        start_s = self._slot_origin_s(float(block.time_s[0]))
         first, last = (self._slot_of(float(t), start_s) for t in block.time_s[[0, -1]])
         edges_s = start_s + np.arange(first + 1, last + 1) * self.parameters.segment_s
         cuts = [0, *np.searchsorted(block.time_s, edges_s - _CLOCK_S).tolist(), len(block)]
@@ -107,25 +105,25 @@ class SegmentHistory:
         return parts
 
     def add(self, block: SampleBlock) -> None:
-        """Take a block under its `role`; a row that is not finite ends the segment."""
+        """Add a block under its `role`; a row that is not finite ends the segment."""
         if len(block) == 0:
             return
         first_s = float(block.time_s[0])
-        self._start_s = self._anchor(first_s)
+        self._start_s = self._slot_origin_s(first_s)
         slot = self._slot_of(first_s, self._start_s)
         restarted = first_s <= self._newest_s
         fresh = block.gap_before or slot != self._slot or block.epoch != self._epoch
         if restarted or fresh:
-            self.interrupt()
-            self._open = _Averager(self._factor(block))
+            self.close_segment()
+            self._open = _Averager(self._averaging_factor(block))
         self._role, self._slot, self._epoch = self._role_of(slot), slot, block.epoch
         self._newest_s = float(block.time_s[-1])
         if np.isfinite(block.raw_b_gauss).all() and np.isfinite(block.gyro_b_rad_s).all():
             self._open.add(block)
         else:
-            self.interrupt()
+            self.close_segment()
 
-    def interrupt(self) -> None:
+    def close_segment(self) -> None:
         """Close the open segment."""
         segment = self._open.close(self._closed, self._role == "heldout")
         self._open = _Averager(self._open.factor)
@@ -140,14 +138,14 @@ class SegmentHistory:
             idle = [k for k, s in enumerate(older) if s.turned_rad < rest]
             del self.segments[idle[0] if idle else 0]
 
-    def _factor(self, block: SampleBlock) -> int:
+    def _averaging_factor(self, block: SampleBlock) -> int:
         known = block.dt_s[np.isfinite(block.dt_s) & (block.dt_s > 0)]
         if len(known) == 0:
             return self._open.factor
         return max(1, int(np.ceil(1.0 / (float(np.median(known)) * self.parameters.rate_hz) - 0.2)))
 
-    def _anchor(self, time_s: float) -> float:
-        """Slot 0 begins at the first sample, and again where the device's clock started again."""
+    def _slot_origin_s(self, time_s: float) -> float:
+        """Start of slot 0: the first sample, and again after a restart of the device's clock."""
         if self._start_s is None or time_s < self._start_s:
             return time_s
         return self._start_s
@@ -166,7 +164,7 @@ class _Averager:
     def __init__(self, factor: int) -> None:
         self.factor = factor
         self._rows: list[Array] = []
-        self._rest = np.empty((0, 10))
+        self._incomplete = np.empty((0, 10))
         self._angle = np.zeros(3)
         self._temperatures: list[float] = []
 
@@ -175,9 +173,9 @@ class _Averager:
         angle = self._angle + np.cumsum(block.gyro_b_rad_s * dt_s[:, None], axis=0)
         self._angle = angle[-1]
         rows = np.column_stack([block.time_s, block.raw_b_gauss, angle, block.accel_b_m_s2])
-        rows = np.vstack([self._rest, rows])
+        rows = np.vstack([self._incomplete, rows])
         whole = len(rows) // self.factor * self.factor
-        self._rest = rows[whole:]
+        self._incomplete = rows[whole:]
         if whole:
             self._rows.append(rows[:whole].reshape(-1, self.factor, 10).mean(axis=1))
         temperature = block.covariates.get("temperature_c")
@@ -189,8 +187,8 @@ class _Averager:
             return None
         rows = np.vstack(self._rows)
         angle = np.diff(rows[:, 4:7], axis=0, prepend=rows[:1, 4:7])
-        turned_rad = float(np.sum(np.linalg.norm(_smooth(angle), axis=1)))
-        rows[:, 4:7] = angle  # one table per segment: this is most of what is remembered
+        turned_rad = float(np.sum(np.linalg.norm(_sum_over_seconds(angle), axis=1)))
+        rows[:, 4:7] = angle  # one table per segment: most of the memory
         return Segment(
             number=number,
             heldout=heldout,
@@ -204,21 +202,21 @@ class _Averager:
         )
 
 
-def _smooth(angle: Array) -> Array:
-    """Angles summed over about a second, so that noise does not count as turning."""
+def _sum_over_seconds(angle: Array) -> Array:
+    """Angles summed over about one second, so that noise does not count as turning."""
     whole = max(1, len(angle) // 25 * 25)
     return np.asarray(angle[:whole].reshape(-1, min(25, whole), 3).sum(axis=1))
 
 
 # -- Attitude inside a segment ---------------------------------------------------------------------
 #
-# Attitude inside a segment: gyro integrated, gravity fitted, nothing else believed.
+# Attitude inside a segment: integrated gyro and fitted gravity only.
 #
-# For sample k of a segment, R_0k turns vectors of the sensor frame at k into the sensor frame at
-# the segment's first sample. The one unknown is where down is in frame 0: the mean of the specific
-# force seen from frame 0, in which a vehicle's own accelerations average out and gravity does not.
-# With the right calibration R_0k h_k is constant *whatever* down is, so an error of gravity never
-# turns a good calibration into a bad one.
+# For sample k of a segment, R_0k rotates vectors of the sensor frame at k into the sensor frame at
+# the segment's first sample. The one unknown is the down direction in frame 0: the mean of the
+# specific force in frame 0, in which a vehicle's own accelerations average out and gravity does
+# not. With the right calibration R_0k h_k is constant for *any* down direction, so an error of
+# gravity never makes a good calibration look bad.
 #
 # A gyro bias that differs by d from the one used here needs no new integration:
 #
@@ -231,7 +229,7 @@ def _smooth(angle: Array) -> Array:
 NODE_RATE_HZ = 5.0
 _REINTEGRATE_RAD = 0.05
 _GRAVITY_M_S2 = 9.81
-_CALM_M_S2 = 0.5  # a force that differs from gravity by this much counts half
+_CALM_M_S2 = 0.5  # a force that differs from gravity by this has half the weight
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,8 +256,8 @@ class AttitudeTrack:
         return bool(turned < _REINTEGRATE_RAD)
 
 
-def track(segment: Segment, bias_b_rad_s: Array) -> AttitudeTrack:
-    """Integrate a segment."""
+def integrate_attitude(segment: Segment, bias_b_rad_s: Array) -> AttitudeTrack:
+    """Integrate the gyro over a segment at this bias."""
     dt_s = np.diff(segment.time_s, prepend=segment.time_s[:1])
     R = so3.products(so3.exp(segment.angle_b_rad - np.outer(dt_s, bias_b_rad_s)))
     middle = (R + np.concatenate([R[:1], R[:-1]])) / 2
@@ -286,7 +284,7 @@ class Nodes:
     """All nodes of all segments, at one gyro bias.
 
     segment (N,): index of the node's segment; starts (S,): first node of each segment;
-    down_0 (S, 3): unit vector, nan where the stream has no accelerometer; heldout (S,);
+    down_0 (S, 3): unit vector, nan if the stream has no accelerometer; heldout (S,);
     rough_m_s2 (S,): rms of |force| - gravity.
     """
 
@@ -310,8 +308,8 @@ class Nodes:
         """(N, 3) down in the sensor frame at each node."""
         return np.asarray(np.einsum("nji,nj->ni", self.R_0b, self.down_0[self.segment]))
 
-    def only(self, chosen: Bools) -> Nodes | None:
-        """The segments marked in `chosen` (S,); None where there are none."""
+    def select(self, chosen: Bools) -> Nodes | None:
+        """The segments selected in `chosen` (S,); None if there are none."""
         if not chosen.any():
             return None
         rows = chosen[self.segment]
@@ -335,8 +333,8 @@ class Nodes:
         return np.asarray(np.add.reduceat(values, self.starts) / counts.reshape(shape))
 
 
-def nodes_at(tracks: Sequence[AttitudeTrack], bias_b_rad_s: Array) -> Nodes | None:
-    """Put the segments together at a gyro bias; None without segments."""
+def join_tracks(tracks: Sequence[AttitudeTrack], bias_b_rad_s: Array) -> Nodes | None:
+    """Join the segments at a gyro bias; None without segments."""
     if not tracks:
         return None
     counts = [len(t.time_s) for t in tracks]

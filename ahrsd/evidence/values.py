@@ -1,4 +1,4 @@
-"""Everything that the gates read, as one value."""
+"""The evidence: all values that the gates read."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Bools = NDArray[np.bool_]
 Regime = Literal["3D", "partial", "2D", "none", "unknown"]
 SECTOR_DEG = 10.0
 SECTORS = round(360.0 / SECTOR_DEG)
-FREE_DEG = 30.0  # of roll and of pitch, both ways: a vehicle that leans so far has shown tilt
+FREE_DEG = 30.0  # of roll and of pitch, both ways: tilt above which motion counts as 3-D
 _NAMED = 3
 _NAN = float("nan")
 CIRCLES = "drive at least two full circles in calm surroundings"
@@ -24,7 +24,7 @@ CIRCLES = "drive at least two full circles in calm surroundings"
 
 @dataclass(frozen=True, slots=True)
 class HealthFacts:
-    """The stream as the core counted it: shares of messages and samples, counts, rate."""
+    """Health of the stream: shares of messages and samples, counts, rate."""
 
     crc_error_rate: float
     drop_rate: float
@@ -35,9 +35,9 @@ class HealthFacts:
 
 @dataclass(frozen=True, slots=True)
 class BasisFacts:
-    """What the samples rest on. `changed`: a compensation register changed within the window.
+    """Origin of the samples. `changed`: a compensation register changed within the window.
 
-    stepped: hard iron or gyro bias stepped, and the estimate rests on data from before that
+    stepped: hard iron or gyro bias stepped, and the estimate uses data from before that
     """
 
     registers_read: bool
@@ -50,11 +50,11 @@ class BasisFacts:
 
 @dataclass(frozen=True, slots=True)
 class EstimateFacts:
-    """What the estimator says about itself.
+    """The estimator's own assessment.
 
-    widened_by: what makes the most of the heading's sigma and what would shrink it; empty: nothing
-    place_deg: what a field that differs by place, and all that is left over, makes of the heading,
-        1 sigma; nan: unknown
+    widened_by: the main contribution to the heading's sigma and what would reduce it; empty: none
+    place_deg: heading error, 1 sigma, due to a field that differs by place and to the residual;
+        nan: unknown
     """
 
     converged: bool
@@ -72,9 +72,9 @@ class Coverage:
     heading_deg: ten-degree sectors visited, times ten; roll_deg, pitch_deg: half of the range
     regime: 3D (tilts by 30 deg and more), 2D (within 5 deg of its mean tilt), partial (between),
     none (turned less than 45 deg), unknown (no accelerometer)
-    turn: what is missing, e.g. "turn left about 120 deg more"; empty where nothing is
-    directions: cells of `evidence.coverage` in which the corrected field was seen, none: unknown
-    down_b: mean direction of down in the sensor frame, nan where unknown
+    turn: what is missing, e.g. "turn left about 120 deg more"; empty if nothing is
+    directions: cells of `evidence.coverage` that the corrected field visited; no cells: unknown
+    down_b: mean direction of down in the sensor frame, nan if unknown
     """
 
     heading_deg: float
@@ -94,7 +94,7 @@ class Coverage:
 
     @property
     def more_tilt(self) -> str:
-        """Which tilt is still to be shown, in words, or that none is."""
+        """Which tilt is still missing, in words, or that none is."""
         shown = {"pitch": self.pitch_deg, "roll": self.roll_deg}
         missing = [name for name, half_range in shown.items() if not half_range >= FREE_DEG]
         if not missing:
@@ -108,7 +108,7 @@ UNKNOWN_MOTION = Coverage(_NAN, _NAN, _NAN, "none", "drive: nothing has been rec
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldFacts:
-    """The corrected field; nan where unknown (dip: the stream has no accelerometer).
+    """The corrected field; nan if unknown (dip: the stream has no accelerometer).
 
     spread: standard deviation over mean of the magnitude
     wander_gauss, inclination_wander_deg: largest difference of a segment from the median segment
@@ -130,9 +130,9 @@ UNKNOWN_FIELD = FieldFacts(*[float("nan")] * 8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeadingProof:
-    """Before and after on the same held-out segments, in degrees; nan where there are none.
+    """Heading errors before and after on the same held-out segments, deg; nan if there are none.
 
-    windows: held-out segments that turned enough to say anything; sectors (36,): headings seen
+    windows: held-out segments with enough turning; sectors (36,): headings visited
     closure_deg: change of the error over one full turn
     gain_lower_deg: lower end of the 95 % interval of rms before minus rms after
     """
@@ -151,7 +151,7 @@ NO_PROOF = HeadingProof(0, np.zeros(SECTORS, dtype=bool), *[float("nan")] * 5)
 
 @dataclass(frozen=True, slots=True)
 class WorldFacts:
-    """The corrected field against the world model at the configured position.
+    """The corrected field compared with the world model at the configured position.
 
     magnitude_error: share of the model's total; inclination_error_deg: absolute
     """
@@ -162,9 +162,9 @@ class WorldFacts:
 
 @dataclass(frozen=True, slots=True)
 class RefitFacts:
-    """Independent fits: two halves against each other, and a gyro-free fit against the candidate.
+    """Independent fits: two halves compared, and a gyro-free fit compared with the candidate.
 
-    hard_iron_gauss: between the halves, in the vehicle's level plane; the others are the worst
+    hard_iron_gauss: between the halves, in the vehicle's level plane; the others are the largest
     heading difference over all headings and the tilts driven.
     """
 
@@ -175,12 +175,13 @@ class RefitFacts:
 
 @dataclass(frozen=True, slots=True)
 class ChangeFacts:
-    """The proposed calibration by itself and against the one in force.
+    """The proposed calibration, and its difference from the one in force.
 
     eigenvalue_min: of the symmetric part of C; condition: of C; offset_gauss: |b|
-    scale_change: of det(C)^(1/3) against the one in force; 0 where the world model judges the scale
-    moved_unseen_gauss: hard iron's move along the vertical that the motion was too flat to see
-    step_deg: worst heading change over all headings and the tilts driven
+    scale_change: of det(C)^(1/3) from the one in force; 0 if the world model judges the scale
+    moved_unseen_gauss: change of the hard iron along the vertical, if the motion is too flat to
+        determine it
+    step_deg: largest heading change over all headings and the tilts driven
     """
 
     first_calibration: bool
@@ -196,12 +197,12 @@ class ChangeFacts:
 
 @dataclass(frozen=True, slots=True)
 class GyroFacts:
-    """The proposed gyro bias against the mean rate at rest.
+    """The proposed gyro bias compared with the mean rate at rest.
 
     sigma_share: sigma of that mean over the change that would be written
     disagreement: distance between the two over their combined sigma, of the worst axis
     apart_mrad_s: that distance, of the worst axis
-    sigma_mrad_s: the estimate's own sigma, of the axis that is known worst
+    sigma_mrad_s: the estimate's own sigma, of the worst axis
     """
 
     bias_rad_s: float
@@ -214,7 +215,7 @@ class GyroFacts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What is known about one candidate. nan: could not be measured. Units are in the names."""
+    """All evidence about one candidate. nan: could not be measured. Units are in the names."""
 
     health: HealthFacts
     basis: BasisFacts
@@ -229,7 +230,7 @@ class Evidence:
 
     @property
     def would_tell(self) -> str:
-        """What makes a heading that is not known well enough, or which motion is missing."""
+        """What makes the heading uncertain, or which motion is missing, in words."""
         return self.estimate.widened_by or f"{CIRCLES}; {self.motion.more_tilt}"
 
     @property
@@ -239,7 +240,7 @@ class Evidence:
 
     @property
     def motion_known(self) -> bool:
-        """Whether there was motion of a kind that can be judged."""
+        """Whether there was motion that can be judged."""
         return self.motion.regime in {"3D", "partial", "2D"}
 
     @property
@@ -259,7 +260,7 @@ class Evidence:
 
     @property
     def proof_coverage_deg(self) -> float:
-        """Headings seen in the held-out windows."""
+        """Headings visited in the held-out windows."""
         return float(np.count_nonzero(self.proof.sectors) * SECTOR_DEG)
 
     @property
@@ -269,17 +270,17 @@ class Evidence:
 
     @property
     def heldout_rms_deg(self) -> float:
-        """The same with the proposed one."""
+        """Heading error on held-out data with the proposed calibration."""
         return self.proof.rms_after_deg
 
     @property
     def gain_deg(self) -> float:
-        """Held-out rms before minus after."""
+        """Held-out rms error before minus after."""
         return self.proof.rms_before_deg - self.proof.rms_after_deg
 
     @property
     def gain_percent(self) -> float:
-        """The same over the rms before."""
+        """The gain relative to the rms before, in percent."""
         return 100.0 * self.gain_deg / max(self.proof.rms_before_deg, 1e-6)
 
     @property
@@ -289,7 +290,7 @@ class Evidence:
 
     @property
     def model_error_percent(self) -> float:
-        """Corrected field against the world model; nan without a position."""
+        """Magnitude error against the world model; nan without a position."""
         return float("nan") if self.world is None else 100.0 * self.world.magnitude_error
 
     @property
@@ -303,7 +304,7 @@ class Evidence:
         return float(np.degrees(self.gyro.bias_rad_s))
 
     def unmeasured(self) -> tuple[str, ...]:
-        """Paths of the numbers that are not finite ("field.spread"); judged: none may be left."""
+        """Paths of the numbers that are not finite ("field.spread"); a gate requires none."""
         return tuple(path for path, value in numbers(self) if not np.isfinite(value))
 
     @property
@@ -313,7 +314,7 @@ class Evidence:
 
     @property
     def unmeasured_names(self) -> str:
-        """The first of their paths; what each needs is said by the gate that judges it."""
+        """The first of their paths; the gate that judges a number says what it needs."""
         paths = self.unmeasured()
         rest = f" and {len(paths) - _NAMED} more" if len(paths) > _NAMED else ""
         return ", ".join(paths[:_NAMED]) + rest

@@ -1,8 +1,8 @@
-"""Batch calibration: every sample of a recording in one estimate, iterated to the end.
+"""Batch calibration: all samples of a recording in one estimate, iterated until it converges.
 
 Byte streams, tables and captures of `ahrsd capture` go through a core that holds nothing out. In a
-capture of the daemon the core must decide as it did then, so that each sample is un-mapped through
-the registers of its time; all of its samples then go through an estimator of their own.
+capture of the daemon the core must decide as it did in the run, so that each sample is
+decompensated with the registers of its time; all samples then go through a separate estimator.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ahrsd.core.estimation import Calibrator
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
 from ahrsd.events import Estimated, Event, SamplesSeen
 from ahrsd.offline.replay import Replayed, replay
-from ahrsd.offline.track import faults, without_terms
+from ahrsd.offline.track import find_faults, without_terms
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import TABLE_ROWS, on_one_thread
 from ahrsd.report.summary import BatchResult
@@ -32,10 +32,10 @@ def calibrate(
     model: RepairedModel | None = None,
     columns: ColumnMap = NO_MAP,
 ) -> BatchResult:
-    """Estimate from the whole recording; nothing is held out.  RecordingError as `replay`.
+    """Estimate from the whole recording; nothing is held out. RecordingError as `replay`.
 
-    model: what its terms add to the readings is taken out first; AhrsdError where a term needs a
-    column that the recording has not. columns: names and units of a table.
+    model: its terms are subtracted from the readings first; AhrsdError if a term needs a column
+    that the recording does not have. columns: names and units of a table.
     """
     seen: list[Event] = []
     done = replay(
@@ -51,13 +51,13 @@ def calibrate(
     left: tuple[str, ...] = ()
     if model is not None:
         seen, left = without_terms(path, seen, model)
-    calibrator = _of_everything(done, seen, again=model is not None)
+    calibrator = _calibrator_of_all_samples(done, seen, again=model is not None)
     estimate = calibrator.finish()
     if estimate is not None:
         seen.append(Estimated(done.core.at_s, done.core.at_s, estimate))
     turned = calibrator.estimator.misalignment()
     blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
-    wrong, odd = faults(blocks)
+    wrong, odd = find_faults(blocks)
     warnings = (
         *done.warnings,
         *(f"{name} is in the model and cannot be taken out" for name in left),
@@ -76,8 +76,8 @@ def calibrate(
     )
 
 
-def _of_everything(done: Replayed, seen: list[Event], *, again: bool) -> Calibrator:
-    """A calibrator that has had every sample; `again`: not as the core took them."""
+def _calibrator_of_all_samples(done: Replayed, seen: list[Event], *, again: bool) -> Calibrator:
+    """A calibrator that has taken all samples; `again`: they differ from those of the core."""
     core = done.core
     if not done.of_daemon and not again:
         return core.calibrator

@@ -1,8 +1,7 @@
-"""Any recording as one table, with what is known of it: unit, frame, clock, source, undone.
+"""Converts any recording to one table with metadata: unit, frame, clock, source, decompensation.
 
-What the device sent goes through the daemon's pipeline, so that the table holds what `calibrate`
-would use. Whether field, gyro and gravity mean the same axes is told by comparing them, never put
-right.
+Device streams go through the daemon's pipeline, so that the table holds what `calibrate` would use.
+Disagreements between the axes of field, gyro and gravity are reported, never corrected.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from ahrsd.config.config import Config
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.offline.replay import replay
-from ahrsd.offline.track import disagreements, track_of
+from ahrsd.offline.track import axis_disagreements, track_of
 from ahrsd.recording.column_names import ACCEL, GYRO, MAG, TIME
 from ahrsd.recording.foreign.sensors import Choice
 from ahrsd.recording.limits import TABLE_ROWS
@@ -36,28 +35,28 @@ _CLOCKS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Converted:
-    """columns of the table by name; facts for its metadata; notes for a person."""
+    """Columns of the table by name, facts for its metadata, notes for a person."""
 
     columns: dict[str, Array]
     facts: dict[str, str]
     notes: tuple[str, ...]
 
 
-def converted(
+def convert_recording(
     path: Path,
     choice: Choice,
     rate_hz: float | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Converted:
-    """The recording as columns.  Raises RecordingError."""
+    """Read the recording as columns. Raises RecordingError."""
     recording = open_recording(path, rate_hz, columns=choice.columns, choice=choice)
     if recording.table is not None:
         blocks, notes = list(recording.table.blocks()), list(recording.notes)
     else:
-        blocks, notes = _sent(recording, rate_hz, progress)
+        blocks, notes = _replay_samples(recording, rate_hz, progress)
     if not blocks:
         raise RecordingError(path, "holds no samples", "record again")
-    found = disagreements(track_of(blocks))
+    found = axis_disagreements(track_of(blocks))
     agree = "not compared: it turns too little" if found is None else "field and gyro agree"
     agreement = found or []
     facts = {
@@ -74,10 +73,10 @@ def converted(
         "notes": "\n".join(notes),
         "ahrsd": __version__,
     }
-    return Converted(_columns(blocks), facts, (*notes, *agreement))
+    return Converted(_join_columns(blocks), facts, (*notes, *agreement))
 
 
-def _sent(
+def _replay_samples(
     recording: Recording, rate_hz: float | None, progress: Callable[[int], None] | None
 ) -> tuple[list[SampleBlock], list[str]]:
     seen: list[SampleBlock] = []
@@ -93,8 +92,8 @@ def _sent(
     return seen, [*done.warnings, *done.core.stream.warnings]
 
 
-def _columns(blocks: list[SampleBlock]) -> dict[str, Array]:
-    """Columns of all blocks; a covariate that some have not is empty there."""
+def _join_columns(blocks: list[SampleBlock]) -> dict[str, Array]:
+    """Columns of all blocks; nan where a block lacks a covariate."""
     out = {TIME: np.concatenate([block.time_s for block in blocks])}
     for names, pick in ((MAG, "raw_b_gauss"), (GYRO, "gyro_b_rad_s"), (ACCEL, "accel_b_m_s2")):
         values = np.concatenate([getattr(block, pick) for block in blocks])
@@ -108,7 +107,7 @@ def _columns(blocks: list[SampleBlock]) -> dict[str, Array]:
 
 
 def save(table: Converted, path: Path) -> None:
-    """As Parquet; the file is there as a whole or not at all.  Raises AhrsdError."""
+    """Write the table as Parquet, completely or not at all. Raises AhrsdError."""
     part = path.with_name(f".{path.stem}.part.parquet")
     facts = {f"ahrsd.{name}": text for name, text in table.facts.items()}
     try:

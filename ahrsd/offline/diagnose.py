@@ -1,6 +1,6 @@
-"""From a recording to a diagnosis: load, align with the user's simulation, ask the engine.
+"""From a recording to a diagnosis: load it, align it with the user's simulation, run the engine.
 
-A table may have any units or axes here: that they are wrong is one of the possible answers.
+A table may have any units or axes here: wrong ones are a possible diagnosis.
 """
 
 from __future__ import annotations
@@ -21,17 +21,19 @@ from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, from_text
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
-from ahrsd.offline.track import checked, track_of
+from ahrsd.offline.track import check_track, track_of
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import TABLE_ROWS, on_one_thread
 from ahrsd.recording.opening import open_recording
 from ahrsd.samples import SampleBlock
 
-SHORTEST_S = 20.0  # below this not even the calibration can be told from anything else
+SHORTEST_S = 20.0  # a shorter recording does not even determine the calibration
 FEWEST_ROWS = 100
-RATE_AGREES = 0.05  # of a spec and the stamps' median step: clocks are closer, units are not
-#: what a spec may say, the least and the most that is believable, and its unit
+RATE_AGREES = (
+    0.05  # relative, of spec and time stamps: clock errors are smaller, unit errors larger
+)
+#: entries of a spec: smallest and largest plausible value, unit
 _SPEC_KEYS = {
     "sigma_mag_gauss": (1e-7, 0.3, "gauss per sample"),
     "sigma_gyro_rad_s": (1e-7, 1.0, "rad/s per sample"),
@@ -48,40 +50,39 @@ def load_track(
     spec: Spec | None = None,
     columns: ColumnMap = NO_MAP,
 ) -> tuple[Track, list[str]]:
-    """The recording as one track, and what a person should know of how it was read.
+    """The recording as one track, and notes on how it was read.
 
-    rate_hz: for a byte stream without a time of its own, before that of the spec; columns: names
-    and units of a table
-    Raises RecordingError where there is nothing to diagnose.
+    rate_hz: of a byte stream without time stamps; takes precedence over the spec. columns: names
+    and units of a table. Raises RecordingError if there is nothing to diagnose.
     """
     recording = open_recording(path, rate_hz, check_units=False, columns=columns)
-    said_hz = None if spec is None else spec.rate_hz
+    spec_hz = None if spec is None else spec.rate_hz
     if (table := recording.table) is not None:
         blocks, notes = list(table.blocks(len(table.rows))), list(recording.notes)
     else:
-        blocks, notes = _streamed(path, rate_hz or said_hz, progress)
-    track, said = checked(track_of(blocks))
+        blocks, notes = _replay_samples(path, rate_hz or spec_hz, progress)
+    track, more_notes = check_track(track_of(blocks))
     if len(track) < FEWEST_ROWS or track.duration_s < SHORTEST_S:
         raise RecordingError(
             path,
             f"is too short to diagnose (samples: {len(track)}, {track.duration_s:.1f} s)",
             f"record at least {SHORTEST_S:.0f} s and {FEWEST_ROWS} samples, better some minutes",
         )
-    return track, [*notes, *said, *_of_its_rate(track, said_hz)]
+    return track, [*notes, *more_notes, *_rate_notes(track, spec_hz)]
 
 
-def _of_its_rate(track: Track, said_hz: float | None) -> list[str]:
-    """One line where the time stamps and the spec's rate say different things."""
+def _rate_notes(track: Track, spec_hz: float | None) -> list[str]:
+    """One line if the time stamps and the spec's rate disagree, else nothing."""
     rate_hz = 1.0 / float(np.nanmedian(track.dt_s))
-    if said_hz is None or abs(rate_hz / said_hz - 1.0) < RATE_AGREES:
+    if spec_hz is None or abs(rate_hz / spec_hz - 1.0) < RATE_AGREES:
         return []
     return [
-        f"the spec says {said_hz:g} Hz, the time stamps {rate_hz:.4g} Hz: the stamps are used; "
+        f"the spec says {spec_hz:g} Hz, the time stamps {rate_hz:.4g} Hz: the stamps are used; "
         "check that they are in seconds"
     ]
 
 
-def _streamed(
+def _replay_samples(
     path: Path, rate_hz: float | None, progress: Callable[[int], None] | None
 ) -> tuple[list[SampleBlock], list[str]]:
     # the daemon's whole pipeline, which a table does not need
@@ -102,9 +103,9 @@ def _streamed(
 
 
 def load_spec(path: Path) -> tuple[Spec, list[str]]:
-    """What the user knows of the sensor (JSON), and one line on each entry that was not used.
+    """The user's data of the sensor (JSON), and one line on each entry that was not used.
 
-    Raises AhrsdError, one line, where it cannot be read.
+    Raises AhrsdError, one line, if it cannot be read.
     """
     try:
         body = json.loads(path.read_text(encoding="utf-8-sig"))
@@ -138,7 +139,7 @@ def _unknown_key(path: Path, key: str) -> str:
 
 
 def load_model(path: Path) -> RepairedModel:
-    """A repaired model's file.  AhrsdError in one line where it cannot be read or is none."""
+    """Read the file of a repaired model. AhrsdError, one line, if that fails."""
     try:
         return from_text(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -157,28 +158,28 @@ def diagnose_recording(
     progress: Callable[[int], None] | None = None,
     columns: ColumnMap = NO_MAP,
 ) -> Diagnosis:
-    """Where REAL and its simulation differ.  Raises RecordingError, AhrsdError.
+    """Diagnose how `real` and its simulation differ. Raises RecordingError, AhrsdError.
 
-    columns: names and units of REAL, where it is a table of another program
+    columns: names and units of `real`, if it is a table of another program
     """
     known, unused = (Spec(), []) if spec is None else load_spec(spec)
     track, notes = load_track(real, rate_hz, progress, spec=known, columns=columns)
     notes = [*unused, *notes]
     if simulation is None:
-        found = _answered(real, track, known)
+        found = _diagnose_track(real, track, known)
         return replace(found, notes=(*notes, *found.notes))
     simulated, _ = load_track(simulation, rate_hz, spec=known)
     try:
         overlap = align(track, simulated)
     except ValueError as error:
         raise RecordingError(simulation, str(error), "bring a simulation of this motion") from None
-    found = _answered(real, overlap.real, known)
-    own = _answered(simulation, overlap.simulated, Spec())
-    left = remove_common_findings(found, own)
-    return replace(left, notes=(*notes, *overlap.notes, *left.notes))
+    found = _diagnose_track(real, overlap.real, known)
+    own = _diagnose_track(simulation, overlap.simulated, Spec())
+    difference = remove_common_findings(found, own)
+    return replace(difference, notes=(*notes, *overlap.notes, *difference.notes))
 
 
-def _answered(path: Path, track: Track, spec: Spec) -> Diagnosis:
+def _diagnose_track(path: Path, track: Track, spec: Spec) -> Diagnosis:
     simulated = Path(f"{path}.truth.json").exists()  # as `ahrsd simulate` leaves it
     try:
         name = printable(path.name, 200)

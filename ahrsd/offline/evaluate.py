@@ -1,5 +1,5 @@
-"""A calibration judged on a recording: samples, calibration.json, references, position and date
-are read here, `ahrsd.evaluation` judges."""
+"""Evaluates a calibration on a recording: reads samples, calibration.json, references, position
+and date; `ahrsd.evaluation` judges them."""
 
 from __future__ import annotations
 
@@ -77,25 +77,25 @@ def evaluate(
     columns: ColumnMap | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[list[Evaluation], dict[str, str]]:
-    """The evaluations of a calibration on a recording, and by method why one is none.
+    """The evaluations of a calibration on a recording, and reasons for missing ones by method.
 
     One evaluation, or with method "all" one for each calibration in the file, in its order. Raises
     AhrsdError.
     """
     calibrations, without = read_calibrations(calibration_path, method)
-    world = place_and_date(position, date, model)  # type: ignore[arg-type]
-    track, said = read_track(recording, Config(), rate_hz, progress, columns)
-    beside, fixes, place = _beside(reference_path or gps_beside(recording), track)
+    world = world_field_at(position, date, model)  # type: ignore[arg-type]
+    track, notes = read_track(recording, Config(), rate_hz, progress, columns)
+    extended, fixes, place = _add_reference_file(reference_path or find_gps_file(recording), track)
     if place is not None and world is None and date is not None:
-        world = place_and_date(place, date, model)  # type: ignore[arg-type]
-        said.append(f"the position is that of the middle GPS fix: {place}")
-    track, fixes = beside, fixes or fixes_of_track(beside)
-    references, more = _references(track, fixes, heading_column, least_speed_m_s)
+        world = world_field_at(place, date, model)  # type: ignore[arg-type]
+        notes.append(f"the position is that of the middle GPS fix: {place}")
+    track, fixes = extended, fixes or fixes_of_track(extended)
+    references, more_notes = _references(track, fixes, heading_column, least_speed_m_s)
     found = [
         judge(
             printable(recording.name, 200),
             track,
-            replace(calibration, remarks=(*said, *more, *calibration.remarks)),
+            replace(calibration, remarks=(*notes, *more_notes, *calibration.remarks)),
             references,
             fixes=fixes,
             world=world,
@@ -106,14 +106,14 @@ def evaluate(
     return found, without
 
 
-def _beside(
+def _add_reference_file(
     path: Path | None, track: EvaluationTrack
 ) -> tuple[EvaluationTrack, Fixes | None, str | None]:
-    """The track with the columns of another file, or its fixes and the place of the middle one."""
+    """The track with the columns of another file; or the file's fixes and its middle position."""
     if path is None:
         return track, None, None
-    if not is_gps(path):
-        return with_columns_of(track, path), None, None
+    if not is_gps_file(path):
+        return add_columns(track, path), None, None
     fixes, place = read_fixes(path)
     return track, fixes, place
 
@@ -121,8 +121,8 @@ def _beside(
 def _references(
     track: EvaluationTrack, fixes: Fixes | None, heading_column: str | None, least_speed_m_s: float
 ) -> tuple[list[HeadingReference], list[str]]:
-    """What there is to compare with, best first, and why something is not."""
-    said: list[str] = []
+    """The available heading references, best first, and reasons for missing ones."""
+    notes: list[str] = []
     found: list[HeadingReference] = []
     if heading_column is not None:
         found.append(column_reference(track, heading_column))
@@ -130,9 +130,9 @@ def _references(
         try:
             found.append(course_reference(fixes, least_speed_m_s))
         except EvaluationError as error:
-            said.append(str(error))
+            notes.append(str(error))
     found += [one for one in (optical_reference(track), device_heading(track)) if one is not None]
-    return found, said
+    return found, notes
 
 
 def read_track(
@@ -142,7 +142,7 @@ def read_track(
     progress: Callable[[int], None] | None = None,
     columns: ColumnMap | None = None,
 ) -> tuple[EvaluationTrack, list[str]]:
-    """A recording's samples, and what a person should know.  RecordingError as `replay`."""
+    """Samples of a recording, and notes for a person. RecordingError as `replay`."""
     recording = open_recording(path, rate_hz, columns=columns or NO_MAP)
     if recording.table is not None:
         pieces = [(block, Affine.identity()) for block in recording.table.blocks()]
@@ -156,16 +156,16 @@ def read_track(
         most_samples=TABLE_ROWS,
         listeners=[lambda event: seen.append(event) if isinstance(event, SamplesSeen) else None],
     )
-    said = [*done.warnings, *done.core.stream.warnings]
-    return build_track([(event.block, event.present) for event in seen]), said
+    notes = [*done.warnings, *done.core.stream.warnings]
+    return build_track([(event.block, event.present) for event in seen]), notes
 
 
 def read_calibrations(
     path: Path, method: str | None
 ) -> tuple[list[StoredCalibration], dict[str, str]]:
-    """The one in calibration.json, or with the method "all" each, and why others have no answer.
+    """The calibration in the file, or all with method "all"; reasons for missing ones by method.
 
-    CalibrationFileError, EvaluationError where it cannot be read.
+    CalibrationFileError, EvaluationError if it cannot be read.
     """
     body = _json(path)
     if method == "all":
@@ -186,8 +186,8 @@ def _json(path: Path) -> object:
         ) from error
 
 
-def gps_beside(recording: Path) -> Path | None:
-    """NAME.gps.csv.gz or NAME.gps.csv beside NAME.*, if there is one."""
+def find_gps_file(recording: Path) -> Path | None:
+    """NAME.gps.csv.gz or NAME.gps.csv in the folder of NAME.*; None if there is none."""
     name = recording.name.split(".", 1)[0]
     for suffix in (_GPS_SUFFIX, _GPS_SUFFIX.removesuffix(".gz")):
         path = recording.with_name(name + suffix)
@@ -214,15 +214,15 @@ def read_fixes(path: Path) -> tuple[Fixes, str]:
     return fixes, ",".join(f"{value:.6f}" for value in place[len(place) // 2])
 
 
-def is_gps(path: Path) -> bool:
-    """Whether a reference is a file of fixes: by its header."""
+def is_gps_file(path: Path) -> bool:
+    """Whether a reference file holds GPS fixes, by its header."""
     return "lat_deg" in _text(path).split("\n", 1)[0]
 
 
-def with_columns_of(track: EvaluationTrack, path: Path) -> EvaluationTrack:
-    """The track with the further columns of a reference table, at its own instants.
+def add_columns(track: EvaluationTrack, path: Path) -> EvaluationTrack:
+    """The track with the further columns of a reference table, at the track's instants.
 
-    Quaternions and angles are taken from the nearest row, not interpolated over a turn.
+    Values are taken from the nearest row, because angles must not be interpolated over a turn.
     """
     other = read_table_columns(path)
     time_s = other.pop("time_s")
@@ -260,11 +260,11 @@ def read_table_columns(path: Path) -> dict[str, Array]:
     return {"time_s": rows.time_s, **rows.covariates}
 
 
-def place_and_date(position: str | None, date: str | None, model: Model) -> WorldField | None:
-    """The world's field by `--position LAT,LON[,ALT]` and `--date`; None without a position.
+def world_field_at(position: str | None, date: str | None, model: Model) -> WorldField | None:
+    """The world field at `--position LAT,LON[,ALT]` and `--date`; None without a position.
 
-    Raises EvaluationError where one of them is missing or unreadable, WorldFieldError where the
-    model does not hold.
+    Raises EvaluationError if one of them is missing or unreadable, WorldFieldError if the model is
+    not valid there.
     """
     if position is None:
         return None
@@ -287,7 +287,7 @@ def place_and_date(position: str | None, date: str | None, model: Model) -> Worl
 
 
 def decimal_year(date: str) -> float:
-    """Of YYYY-MM-DD.  EvaluationError for anything else."""
+    """Decimal year of a date YYYY-MM-DD. EvaluationError for anything else."""
     try:
         day = datetime.date.fromisoformat(date)
     except ValueError as error:

@@ -1,8 +1,9 @@
 """Replay: a recording through the same shell and core as a live run.
 
-A capture of the daemon is fed its own inputs, ticks and answers included, so the decisions are
-those of the run. Everything else has nobody to talk to and is taken as a passive run over what it
-holds; the registers that `ahrsd capture` read first hold for the bytes that came meanwhile, too.
+For a capture of the daemon, the core gets the recorded inputs, including ticks and journal answers,
+so it takes the decisions of that run. Any other recording has no device to communicate with and is
+processed as a passive run. Registers that `ahrsd capture` read first are applied from the first
+byte on.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _PASSIVE = WriteBackPolicy(mode=Mode.PASSIVE)
 
 @dataclass(slots=True)
 class Replayed:
-    """What a replay leaves behind."""
+    """Result of a replay."""
 
     core: Core
     recording: Recording
@@ -42,7 +43,7 @@ class Replayed:
 
     @property
     def of_daemon(self) -> bool:
-        """Whether it is a capture of the daemon, which decided for itself what to do."""
+        """Whether it is a capture of the daemon, which has its own configuration."""
         return CONFIG_KEY in self.recording.header
 
 
@@ -62,12 +63,12 @@ def replay(
     most_samples: float = math.inf,
     opened: Recording | None = None,
 ) -> Replayed:
-    """Feed a recording to a core; speed 0 is as fast as it goes, 1 real time.
+    """Feed a recording to a core; speed 0 is as fast as possible, 1 real time.
 
-    settings: of the core, else those of `config`; a capture of the daemon brings its own
-    configuration, and its own `held_out`. columns: names and units of a table. most_samples: for
-    who keeps them all. opened: the recording at `path`, where it is open already. Raises
-    RecordingError where nothing in the recording can be calibrated.
+    settings: of the core; None: those of `config`, but a capture of the daemon has its own
+    configuration and `held_out`. columns: names and units of a table. most_samples: limit for
+    callers that keep all samples. opened: the recording at `path`, if it is open already. Raises
+    RecordingError if nothing in the recording can be calibrated.
     """
     if rate_hz is not None and not math.isfinite(rate_hz):
         raise RecordingError(path, f"a rate of {rate_hz} Hz is none", "give --rate in Hz")
@@ -89,7 +90,7 @@ def replay(
             break
     _refuse_empty(core, path)
     done.warnings += [note for note in recording.notes if note not in done.warnings]
-    if recording.kind is RecordingKind.BYTES and _cut_off(core):
+    if recording.kind is RecordingKind.BYTES and _ends_mid_message(core):
         done.warnings.append("the recording ends in the middle of a message")
     return done
 
@@ -97,7 +98,7 @@ def replay(
 def _settings(
     recording: Recording, config: Config, rate_hz: float | None, held_out: bool
 ) -> CoreSettings:
-    """A capture of the daemon says itself how it was made; the others are passive."""
+    """Settings from a capture of the daemon; other recordings are passive."""
     if text := recording.header.get(CONFIG_KEY):
         own = recorded_config(text)
         if config not in (Config(), own):
@@ -105,14 +106,14 @@ def _settings(
         return replace(core_settings(own), beside=BESIDE_KEY in recording.header)
     if recording.kind is not RecordingKind.BYTES:
         return core_settings(config, policy=_PASSIVE, held_out=held_out)
-    found = None if rate_hz is not None else recording.told_rate()
-    rate = rate_hz if found is None else found[0]
+    known = None if rate_hz is not None else recording.told_rate()
+    rate = rate_hz if known is None else known[0]
     settings = core_settings(config, stream_rate_hz=rate, policy=_PASSIVE, held_out=held_out)
-    return settings if found is None else replace(settings, stream_rate_source=found[1])
+    return settings if known is None else replace(settings, stream_rate_source=known[1])
 
 
 def _registers_first(recording: Recording) -> Iterator[Input]:
-    """The inputs; registers that were read at the beginning are known from the first byte on."""
+    """The inputs, with registers that were read at the beginning moved to the front."""
     if recording.kind is not RecordingKind.CAPTURE:
         yield from recording.inputs()
         return
@@ -125,7 +126,7 @@ def _registers_first(recording: Recording) -> Iterator[Input]:
 
 
 def _paced(items: Iterator[Input], core: Core, speed: float) -> Iterator[Input]:
-    """Hold inputs back so that device time passes `speed` times as fast as real time."""
+    """Delay inputs so that device time passes `speed` times as fast as real time."""
     start = time.monotonic()
     for item in items:
         if speed > 0 and isinstance(item, Received | Samples):
@@ -135,8 +136,8 @@ def _paced(items: Iterator[Input], core: Core, speed: float) -> Iterator[Input]:
         yield item
 
 
-def _cut_off(core: Core) -> bool:
-    """Whether bytes were left that begin a message; silence cannot cut one in a byte stream."""
+def _ends_mid_message(core: Core) -> bool:
+    """Whether the bytes end inside a message; a byte stream has no silence to end one."""
     deframer = core.device_session.session.deframer
     return deframer.pending > 0 or Cause.CUT in deframer.counters.damage
 

@@ -1,5 +1,5 @@
-"""Recordings that are simulated: effects in an experiment, a repaired model along a measured
-motion, and the files that hold them."""
+"""Simulated recordings: effects in an experiment, a repaired model along a measured motion, and
+their files."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from ahrsd.simulation import Experiment, scenarios
 STREAM_SUFFIXES = (".vnraw", ".vnraw.gz")
 
 
-def with_effects(
+def add_effects(
     experiment: Experiment, wanted: Sequence[str], seed: int
 ) -> tuple[Experiment, list[dict[str, object]]]:
-    """The experiment with the wanted effects and the covariates they need, and the terms for the
-    truth.  AhrsdError in one line for a request that cannot be."""
+    """The experiment with the requested effects and the covariates they need, and the terms for the
+    truth. AhrsdError, one line, for an invalid request."""
     try:
         requests = [injection.parse_request(text) for text in wanted]
         effects = [one.effect for one in requests]
@@ -36,12 +36,12 @@ def with_effects(
     return inject_terms(experiment, readings, terms), terms_json(terms)
 
 
-def along(
+def simulate_along_motion(
     model: RepairedModel, recording: Path, read: Track, seed: int
 ) -> tuple[dict[str, Array], list[str]]:
-    """A table's columns: what the repaired model reads along the motion of a recording.
+    """Columns of a table: readings of the repaired model along the motion of a recording.
 
-    `read` is the recording's own track. AhrsdError where a term needs a column that there is not.
+    `read` is the recording's own track. AhrsdError if a term needs a column that is missing.
     """
     track, refused = roles.prepare_columns(read)
     try:
@@ -61,7 +61,7 @@ def along(
 
 
 def write_experiment(path: Path, experiment: Experiment) -> None:
-    """A table, or a byte stream of VNYMR sentences, as the name says.  AhrsdError otherwise."""
+    """Write a table, or a byte stream of VNYMR sentences, by the file's suffix; else AhrsdError."""
     further = experiment.samples.covariates
     if is_table(path):
         write_columns(path, {**scenarios.columns(experiment), **further})
@@ -81,7 +81,7 @@ def write_experiment(path: Path, experiment: Experiment) -> None:
 
 
 def write_columns(path: Path, columns: Mapping[str, Array]) -> None:
-    """A table.  AhrsdError where it cannot be written."""
+    """Write a table. AhrsdError if that fails."""
     try:
         write_table(path, columns)
     except OSError as error:

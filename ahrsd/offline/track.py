@@ -1,7 +1,7 @@
-"""Samples of a recording as the diagnosis sees them: a track, and what is wrong with it.
+"""Samples of a recording as a track for the diagnosis, and faults of the recording.
 
-What no sensor gives is left out, what cannot be as recorded is said, and what the terms of a
-repaired model add is taken out.
+Impossible readings are left out, impossible units or axes are reported, and the terms of a repaired
+model are subtracted.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ahrsd.events import Event, SamplesSeen
 from ahrsd.printable import counted
 from ahrsd.samples import Array, SampleBlock
 
-_FEW_MISSING = 0.02  # of the rows, whose acceleration is filled from their neighbours
+_FEW_MISSING = 0.02  # share of rows with missing acceleration that is interpolated
 _ACCEL_UNITS = (("g", GRAVITY_M_S2), ("mg", 1e-3 * GRAVITY_M_S2))
 
 
@@ -63,16 +63,21 @@ def track_of(blocks: list[SampleBlock]) -> Track:
     )
 
 
-def checked(track: Track) -> tuple[Track, list[str]]:
-    """The track without what no sensor gives, and one line for each such thing."""
-    track, jumped = without_clock_jumps(track)
+def check_track(track: Track) -> tuple[Track, list[str]]:
+    """The track without impossible readings, and one line on each kind."""
+    track, jump_notes = without_clock_jumps(track)
     track, notes = without_impossible_readings(track)
-    accel, said = _acceleration(track)
-    return replace(track, accel_b_m_s2=accel), [*jumped, *notes, *dead_axis_notes(track), *said]
+    accel, accel_notes = _usable_acceleration(track)
+    return replace(track, accel_b_m_s2=accel), [
+        *jump_notes,
+        *notes,
+        *dead_axis_notes(track),
+        *accel_notes,
+    ]
 
 
-def _acceleration(track: Track) -> tuple[Array | None, list[str]]:
-    """(N, 3) m/s^2, short holes filled; None where it cannot be used; one line on what was done."""
+def _usable_acceleration(track: Track) -> tuple[Array | None, list[str]]:
+    """(N, 3) m/s^2 with short gaps filled, None if unusable; and one line on what was done."""
     accel = track.accel_b_m_s2
     if accel is None:
         return None, []
@@ -93,19 +98,19 @@ def _acceleration(track: Track) -> tuple[Array | None, list[str]]:
     return accel, notes
 
 
-def faults(blocks: list[SampleBlock]) -> tuple[list[str], list[str]]:
-    """Units, axes, signs and times that cannot be as recorded, and what is odd, in words.
+def find_faults(blocks: list[SampleBlock]) -> tuple[list[str], list[str]]:
+    """In words: impossible units, axes, signs and times; and other anomalies.
 
-    A clock that jumps where a run begins (a restart of the device) is no wrong time.
+    A clock that jumps at the start of a run (a restart of the device) is no fault.
     """
     facts = find_facts(without_clock_jumps(track_of(blocks))[0]) if blocks else ()
     wrong = [fact.words for fact in facts if fact.stops]
     return wrong, [fact.words for fact in facts if not fact.stops and is_finding(fact)]
 
 
-def disagreements(track: Track) -> list[str] | None:
-    """Where field, gyro and gravity do not mean the same axes; None: it turns too little to tell
-    anything, and nothing else is wrong."""
+def axis_disagreements(track: Track) -> list[str] | None:
+    """Where the axes of field, gyro and gravity disagree; None: too little turning to decide, and
+    no other fault."""
     found = [fact.words for fact in axis_and_unit_errors(track)]
     return found if found or window_equations(track) else None
 
@@ -113,14 +118,14 @@ def disagreements(track: Track) -> list[str] | None:
 def without_terms(
     path: Path, seen: list[Event], model: RepairedModel
 ) -> tuple[list[Event], tuple[str, ...]]:
-    """The events, their samples without what the model's terms add; and what stays in them.
+    """The events with the model's terms subtracted from the samples; and the terms that remain.
 
-    AhrsdError where a term needs a column that the recording has not.
+    AhrsdError if a term needs a column that the recording does not have.
     """
     blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
     if not blocks:
         return seen, ()
-    track, refused = prepare_columns(checked(track_of(blocks))[0])
+    track, refused = prepare_columns(check_track(track_of(blocks))[0])
     try:
         track, left = remove_terms(track, model.calibration, model.terms)
     except ValueError as error:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ahrsd.calibration_json import UNKNOWN_HEADING_DEG
-from ahrsd.evidence.coverage import CELLS, cells_of, centres
+from ahrsd.evidence.coverage import CELLS, cell_centres, cells_of
 from ahrsd.evidence.values import Bools
 from ahrsd.gates import GATES, guards_a_write
 from ahrsd.printable import counted, line
@@ -387,7 +387,7 @@ class Dots:
 
 def dots(shown: Shown, fresh: Bools, *, circle: bool, tilts: bool) -> Dots:
     """The dots of what was shown. circle, tilts: whether more of them is wanted."""
-    at = project(centres(), shown.frame_b)
+    at = project(cell_centres(), shown.frame_b)
     wanted = ((shown.level & circle) | (shown.tilted & tilts)) & ~shown.seen
     new = fresh & ~shown.seen
     rest = ~shown.seen & ~new & ~wanted

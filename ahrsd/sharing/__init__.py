@@ -1,4 +1,4 @@
-"""Other programs on the device's port: what they may do, who is asked next, whose answer it is.
+"""Other programs on the device's port: permissions, order of commands, routing of answers.
 
 Pure: bytes, policies and time in, answers out. The ports themselves are in `daemon.shares`.
 """

@@ -1,37 +1,37 @@
-"""What a client's command may do, whose command is next on the wire, and to whom an answer goes.
+"""Decides what a client may send, whose command is sent next, and which client gets an answer.
 
-A client is another program's driver that believes to have the device to itself. Pure; time is an
-argument.
+A client is the driver of another program; it assumes that it has the device to itself. Pure; time
+is an argument.
 
-**What a client may have.** Its commands are read like the device reads them, so what goes out on
-its behalf is always a command of `drivers.vn100.commands`, and nothing else can.
+**Permissions.** A client's commands are parsed as the device parses them, so only a command of
+`drivers.vn100.commands` can be sent on its behalf.
 
 | what | answer |
 |---|---|
 | read of registers 1 to 4 (who the device is) | from memory, once it is known |
-| VNASY | by the port: only this client's stream stops and goes on |
-| register 5 (baud rate) | as if it had worked; the line to the device stays as it is |
-| registers 23, 25, 26, 43, 44, 74, 84 and the words that change them | VNERR 09: they are ahrsd's |
+| VNASY | by the port: only this client's stream stops and resumes |
+| register 5 (baud rate) | success; the line to the device is not changed |
+| registers 23, 25, 26, 43, 44, 74, 84 and the words that change them | VNERR 09: ahrsd owns them |
 | the same registers, for an owner with `calibration_writes = "pass"` | the device's |
 | VNWNV, VNRST | as the share's policy says |
 | VNRFS and the words of vendor tools | VNERR 09 |
 | any other read | the device's |
-| any other write, VNKMD, VNKAD | the device's for the owner; VNERR 09 for everybody else |
-| a write that would be VNERR 09, of what the register holds already | as if it had worked |
+| any other write, VNKMD, VNKAD | the device's for the owner; VNERR 09 for other clients |
+| a write that would get VNERR 09, of the values that the register already holds | success |
 
-The last is how VectorNav's SDK finds out what belongs into a saved configuration: it writes back
-what it has just read. The register is read instead, and only what differs is refused.
+VectorNav's SDK needs the last row: to find out what belongs in a saved configuration it writes back
+what it has just read. The register is read instead, and the write is refused only if it differs.
 
-Sources: UM001 "System Commands"; what drivers send at their start
+Sources: UM001 "System Commands"; what drivers send when they start
 (tests/support/devices/drivers_at_start.py).
 
-**Turns.** One command is on the wire at a time, the clients' in the order in which they came, and
-the daemon's own in between. What a client asks again while its question waits is absorbed: drivers
-repeat after 50 ms what takes 60. A question that waited for longer than any driver waits for its
-answer is dropped: an answer that comes later would be taken for one to something else.
+**Order.** One command is on the wire at a time: clients' commands in order of arrival, the daemon's
+own between them. A command that repeats one of the same client's pending commands is absorbed:
+drivers repeat after 50 ms what takes 60. A command that waited longer than any driver waits for an
+answer is dropped, because the driver would take a later answer for that of another command.
 
-A client that floods the port, sends half a line for ever or goes away costs nobody else anything:
-its line buffer and its questions are bounded.
+A client that floods the port, sends an endless line or disconnects does not affect the others: its
+line buffer and its queue are bounded.
 """
 
 from __future__ import annotations
@@ -58,18 +58,18 @@ from drivers.vn100.registers import (
     same,
 )
 
-# -- What a client may have ------------------------------------------------------------------------
+# -- Permissions -----------------------------------------------------------------------------------
 
 
 IDENTITY: Final = (1, 2, 3, 4)
 LINE_RATE: Final = 5
-_OF_PORTS: Final = frozenset({5, 6, 7})  # which the device holds for each of its ports
+_PER_PORT: Final = frozenset({5, 6, 7})  # the device has one of each per port
 
 BAD_CHECKSUM, BAD_COMMAND, TOO_FEW, BAD_REGISTER, UNAUTHORIZED = 0x03, 0x04, 0x05, 0x08, 0x09
 
 
 class Kind(Enum):
-    """What is to be done with a client's command."""
+    """How to handle a client's command."""
 
     MEMORY = "answer from memory"
     STREAM = "this client's own stream"
@@ -87,7 +87,7 @@ _WORDS: Final[dict[str, Kind]] = {
     "VNWNV": Kind.SAVE,
     "VNRST": Kind.RESET,
     "VNASY": Kind.STREAM,
-    "VNKMD": Kind.WRITE,  # the disturbances that the device's own filter is told of
+    "VNKMD": Kind.WRITE,  # known disturbances, for the device's own filter
     "VNKAD": Kind.WRITE,
 }
 _FORBIDDEN: Final = frozenset(
@@ -99,12 +99,12 @@ _FORBIDDEN: Final = frozenset(
 class SharePolicy:
     """What one share allows.
 
-    name:  how people and the log call it: the path of its port
-    owner: its output registers are the device's; at most one share is
-    save:  what becomes of VNWNV: refused, or sent once nothing unproven is in the device's RAM
-    reset: what becomes of VNRST: refused, or sent and told
-    calibration_writes: what becomes of the owner's writes of what calibrates: refused, or journaled
-           and sent
+    name:  for people and the log: the path of its port
+    owner: it may set the device's output registers; at most one share is the owner
+    save:  VNWNV is refused, or sent once the device's RAM holds no unproven values
+    reset: VNRST is refused, or sent and reported
+    calibration_writes: the owner's writes of calibration registers are refused, or journaled and
+           sent
     """
 
     name: str
@@ -114,17 +114,17 @@ class SharePolicy:
     calibration_writes: Literal["guard", "pass"] = "guard"
 
     def passes(self, number: int) -> bool:
-        """Whether a write of this register, which calibrates, is the owner's to make."""
+        """Whether this share may write this calibration register."""
         return self.owner and self.calibration_writes == "pass" and number in PASSABLE
 
 
 @dataclass(frozen=True, slots=True)
 class ClientCommand:
-    """A command that a client may have.
+    """A command that a client may send.
 
     body:    as the client wrote it, between $ and *
-    command: what would go to the device
-    unless:  of a write that is only compared: what it wants, and the answer where that differs
+    command: what would be sent to the device
+    unless:  for a write that is only compared: the wanted values, and the refusal if they differ
     """
 
     kind: Kind
@@ -134,25 +134,25 @@ class ClientCommand:
 
     @property
     def purpose(self) -> Purpose:
-        """What the gate in front of the device is asked for."""
+        """The purpose for which `writeback.permissions` must permit the command."""
         calibrates = self.kind is Kind.CALIBRATE
         return Purpose.CLIENT_CALIBRATION if calibrates else Purpose.CLIENT
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """The VNERR that answers; `why` is for the log, empty where the client's line was wrong."""
+    """A VNERR as the answer; `why` is for the log, empty if the client's line was malformed."""
 
     code: int
     why: str = ""
 
 
-def understand(body: str, policy: SharePolicy) -> ClientCommand | Refusal:
-    """What a client's line, without frame and checksum, asks for by this policy."""
+def parse_client_command(body: str, policy: SharePolicy) -> ClientCommand | Refusal:
+    """Parse a client's line, without frame and checksum, under this policy."""
     word, _, rest = body.partition(",")
     tokens = rest.split(",") if rest else []
     if word in ("VNRRG", "VNWRG"):
-        return _register(word, tokens, body, policy)
+        return _parse_register_command(word, tokens, body, policy)
     if word in _FORBIDDEN:
         return Refusal(UNAUTHORIZED, f"{word} is nothing that a client may send")
     if (kind := _WORDS.get(word)) is None:
@@ -170,7 +170,7 @@ def understand(body: str, policy: SharePolicy) -> ClientCommand | Refusal:
     return ClientCommand(kind, body, command)
 
 
-def _register(
+def _parse_register_command(
     word: str, tokens: list[str], body: str, policy: SharePolicy
 ) -> ClientCommand | Refusal:
     if not tokens or not tokens[0].isascii() or not tokens[0].isdigit():
@@ -179,11 +179,11 @@ def _register(
     if number not in REGISTERS:
         return Refusal(BAD_REGISTER)
     if word == "VNRRG":
-        return _read(number, tokens[1:], body)
+        return _parse_read(number, tokens[1:], body)
     passes = policy.passes(number)
     if number in GUARDED and number != LINE_RATE and not passes:
         why = f"register {number} was not written for a client: what calibrates is ahrsd's"
-        return _unless_held(number, tokens[1:], body, Refusal(UNAUTHORIZED, why))
+        return _compare_or_refuse(number, tokens[1:], body, Refusal(UNAUTHORIZED, why))
     if not REGISTERS[number].writable:
         return Refusal(UNAUTHORIZED)
     try:
@@ -194,15 +194,15 @@ def _register(
         return ClientCommand(Kind.RATE, body, command)
     if not policy.owner:
         why = f"writes of register {number} are for the share with owner"
-        return _unless_held(number, tokens[1:], body, Refusal(UNAUTHORIZED, why))
+        return _compare_or_refuse(number, tokens[1:], body, Refusal(UNAUTHORIZED, why))
     return ClientCommand(Kind.CALIBRATE if passes else Kind.WRITE, body, command)
 
 
-def _unless_held(
+def _compare_or_refuse(
     number: int, tokens: list[str], body: str, refusal: Refusal
 ) -> ClientCommand | Refusal:
-    """A write that is refused, but where the register holds these values already."""
-    if number in _OF_PORTS or not REGISTERS[number].writable:
+    """A write that is refused unless the register already holds these values."""
+    if number in _PER_PORT or not REGISTERS[number].writable:
         return refusal
     try:
         values = parse(number, tokens)
@@ -211,7 +211,7 @@ def _unless_held(
     return ClientCommand(Kind.COMPARE, body, Read(number), (values, refusal))
 
 
-def _read(number: int, tokens: list[str], body: str) -> ClientCommand | Refusal:
+def _parse_read(number: int, tokens: list[str], body: str) -> ClientCommand | Refusal:
     try:
         command = Read(number, int(tokens[0]) if tokens else None)
     except ValueError:
@@ -221,27 +221,27 @@ def _read(number: int, tokens: list[str], body: str) -> ClientCommand | Refusal:
     return ClientCommand(Kind.RATE if number == LINE_RATE else Kind.READ, body, command)
 
 
-def _holds(reply: Reply, values: Values) -> bool:
-    """Whether a device that replied so holds these values in the register that was read."""
+def _reply_matches(reply: Reply, values: Values) -> bool:
+    """Whether the reply shows these values in the register that was read."""
     if reply.register is None:
         return False
     try:
         return same(reply.register, values, parse(reply.register, reply.tokens))
-    except RegisterValueError:  # a reply that is damaged says nothing
+    except RegisterValueError:  # a damaged reply proves nothing
         return False
 
 
-# -- Turns -----------------------------------------------------------------------------------------
+# -- Order of commands -----------------------------------------------------------------------------
 
 
-PATIENCE_S = 2.5  # the longest that a known driver waits for an answer
-MOST_WAITING = 16  # commands of one client
+PATIENCE_S = 2.5  # the longest time that a known driver waits for an answer
+MOST_WAITING = 16  # pending commands of one client
 COUNTED = ("commands", "answered", "refused", "absorbed", "dropped", "unanswered")
 
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """A command that waits for its turn, or is on the wire; `gone`: its client does not listen."""
+    """A command that is queued or on the wire; `gone`: its client has disconnected."""
 
     client: str
     asked: ClientCommand
@@ -253,11 +253,11 @@ class Waiting:
 class _Client:
     policy: SharePolicy
     lines: Deframer = field(default_factory=lambda: Deframer(host_side=True))
-    rate: Values | None = None  # of the line, as this client set it
+    rate: Values | None = None  # line rate, as this client set it
 
 
 class Arbiter:
-    """See the module. `counts`: by client and one of `COUNTED`."""
+    """See the module. `counts` is indexed by client and a member of `COUNTED`."""
 
     def __init__(self, policies: Iterable[SharePolicy]) -> None:
         self.counts: Counter[tuple[str, str]] = Counter()
@@ -269,7 +269,7 @@ class Arbiter:
 
     @property
     def deadline_s(self) -> float | None:
-        """When the oldest question has waited for too long."""
+        """When the oldest queued command expires."""
         return self._queue[0].since_s + PATIENCE_S if self._queue else None
 
     @property
@@ -278,151 +278,157 @@ class Arbiter:
         return self._under_way
 
     def take_answers(self) -> list[SendToClient]:
-        """What is due to clients since the last call."""
+        """Answers to clients since the last call."""
         answers, self._answers = self._answers, []
         return answers
 
     def take_notes(self) -> list[str]:
-        """What a person should know of, since the last call."""
+        """Messages for a person since the last call."""
         notes, self._notes = self._notes, []
         return notes
 
     # -- from the clients --------------------------------------------------------------------------
 
-    def received(self, name: str, data: bytes, identity: Identity | None, now_s: float) -> None:
-        """Bytes of a client, cut anywhere. `identity` is the device's, where it is known."""
+    def receive(self, name: str, data: bytes, identity: Identity | None, now_s: float) -> None:
+        """Take bytes of a client, cut anywhere. `identity`: of the device; None if unknown."""
         client = self._clients.get(name)
         if client is None:
             return
-        found = client.lines.feed(data)
+        sentences = client.lines.feed(data)
         for piece in client.lines.take_skipped():
             if piece.cause is Cause.CHECKSUM:
                 self._refuse(name, Refusal(BAD_CHECKSUM))
             if piece.data.strip():
                 self._notes.append(f"{name} sends what is no command of a VN-100")
-        for sentence in found:
-            asked = understand(getattr(sentence, "body", ""), client.policy)
+        for sentence in sentences:
+            request = parse_client_command(getattr(sentence, "body", ""), client.policy)
             self.counts[name, "commands"] += 1
-            if isinstance(asked, Refusal):
-                self._refuse(name, asked)
-            elif self._answered_here(name, client, asked, identity):
+            if isinstance(request, Refusal):
+                self._refuse(name, request)
+            elif self._answer_locally(name, client, request, identity):
                 self.counts[name, "answered"] += 1
             else:
-                self._wait(Waiting(name, asked, now_s))
+                self._enqueue(Waiting(name, request, now_s))
 
-    def left(self, name: str) -> None:
-        """The client closed its port: what it asked is nobody's any more."""
+    def disconnect(self, name: str) -> None:
+        """The client closed its port: drop its commands and discard a pending reply."""
         if (client := self._clients.get(name)) is not None:
             self._clients[name] = _Client(client.policy)
         self._queue = deque(one for one in self._queue if one.client != name)
         if self._under_way is not None and self._under_way.client == name:
             self._under_way = replace(self._under_way, gone=True)
 
-    def _answered_here(
-        self, name: str, client: _Client, asked: ClientCommand, identity: Identity | None
+    def _answer_locally(
+        self, name: str, client: _Client, request: ClientCommand, identity: Identity | None
     ) -> bool:
-        """Answer what needs no device; whether that was possible."""
-        if asked.kind is Kind.STREAM:
-            self._say(name, encode(asked.body), asked.body.endswith("1"))
-        elif asked.kind is Kind.RATE and isinstance(asked.command, Write):
-            client.rate = asked.command.values
-            self._say(name, encode(asked.body))
-        elif asked.kind is Kind.RATE and client.rate is not None:
-            self._say(name, encode(f"VNRRG,{format_reply(5, client.rate)}"))
-        elif isinstance(asked.command, Read) and asked.kind is Kind.MEMORY and identity is not None:
-            return self._identify(name, asked.command.register, identity)
+        """Answer without the device if possible; returns whether it was."""
+        if request.kind is Kind.STREAM:
+            self._send(name, encode(request.body), request.body.endswith("1"))
+        elif request.kind is Kind.RATE and isinstance(request.command, Write):
+            client.rate = request.command.values
+            self._send(name, encode(request.body))
+        elif request.kind is Kind.RATE and client.rate is not None:
+            self._send(name, encode(f"VNRRG,{format_reply(5, client.rate)}"))
+        elif (
+            isinstance(request.command, Read)
+            and request.kind is Kind.MEMORY
+            and identity is not None
+        ):
+            return self._answer_identity(name, request.command.register, identity)
         else:
             return False
         return True
 
-    def _identify(self, name: str, number: int, identity: Identity) -> bool:
+    def _answer_identity(self, name: str, number: int, identity: Identity) -> bool:
         known = (identity.model, identity.hardware, identity.serial, identity.firmware)
         value = dict(zip(IDENTITY, known, strict=True))[number]
         if value is None:
             return False
-        self._say(name, encode(f"VNRRG,{format_reply(number, (value,))}"))
+        self._send(name, encode(f"VNRRG,{format_reply(number, (value,))}"))
         return True
 
-    def _wait(self, waiting: Waiting) -> None:
-        mine = [one for one in self._all() if one.client == waiting.client]
-        if any(one.asked.body == waiting.asked.body for one in mine):
+    def _enqueue(self, waiting: Waiting) -> None:
+        pending = [one for one in self._pending() if one.client == waiting.client]
+        if any(one.asked.body == waiting.asked.body for one in pending):
             self.counts[waiting.client, "absorbed"] += 1
-        elif len(mine) >= MOST_WAITING:
+        elif len(pending) >= MOST_WAITING:
             self.counts[waiting.client, "dropped"] += 1
             self._notes.append(f"{waiting.client} sends faster than the device answers")
         else:
             self._queue.append(waiting)
 
-    def _all(self) -> list[Waiting]:
+    def _pending(self) -> list[Waiting]:
         return [*([] if self._under_way is None else [self._under_way]), *self._queue]
 
     # -- to and from the device --------------------------------------------------------------------
 
-    def first(self, now_s: float) -> Waiting | None:
-        """The next command for the wire, where none is on it; what waited too long is dropped."""
+    def next_command(self, now_s: float) -> Waiting | None:
+        """The next command to send, None while one is on the wire. Drops expired commands."""
         while self._queue and now_s - self._queue[0].since_s >= PATIENCE_S:
-            late = self._queue.popleft()
-            self.counts[late.client, "dropped"] += 1
-            self._notes.append(f"{late.client}: {late.asked.command} got no turn in time")
+            expired = self._queue.popleft()
+            self.counts[expired.client, "dropped"] += 1
+            self._notes.append(f"{expired.client}: {expired.asked.command} got no turn in time")
         return self._queue[0] if self._queue and self._under_way is None else None
 
-    def begin(self) -> Waiting:
-        """The first one goes on the wire. IndexError where nothing waits."""
+    def start_next(self) -> Waiting:
+        """Mark the next command as on the wire. IndexError if the queue is empty."""
         self._under_way = self._queue.popleft()
         return self._under_way
 
-    def ended(self, result: object, error: Exception | None) -> Waiting | None:
-        """What is on the wire was answered, refused, or not answered; returns it."""
+    def finish_current(self, result: object, error: Exception | None) -> Waiting | None:
+        """The command on the wire was answered, refused or not answered; returns it."""
         done, self._under_way = self._under_way, None
         if done is None:
             return None
         if done.gone:
             return done
         if done.asked.unless is not None:
-            self._compared(done.client, *done.asked.unless, result)
+            self._answer_comparison(done.client, *done.asked.unless, result)
         elif isinstance(result, Reply):
-            self._reply(done.client, result.word, result)
+            self._forward_reply(done.client, result.word, result)
         elif isinstance(error, DeviceRefused):
-            self._say(done.client, encode(f"VNERR,{error.code:02X}"))
+            self._send(done.client, encode(f"VNERR,{error.code:02X}"))
         else:
             self.counts[done.client, "unanswered"] += 1
         return done
 
-    def _compared(self, name: str, wanted: Values, refusal: Refusal, result: object) -> None:
-        """A write that is not sent: as if it had worked where the register holds that already."""
-        if isinstance(result, Reply) and _holds(result, wanted):
-            self._reply(name, "VNWRG", result)
+    def _answer_comparison(
+        self, name: str, wanted: Values, refusal: Refusal, result: object
+    ) -> None:
+        """Answer a write that is not sent: success if the register already holds the values."""
+        if isinstance(result, Reply) and _reply_matches(result, wanted):
+            self._forward_reply(name, "VNWRG", result)
         else:
             self._refuse(name, refusal)
 
-    def _reply(self, name: str, word: str, reply: Reply) -> None:
-        """What the device answered, behind the word of the question."""
+    def _forward_reply(self, name: str, word: str, reply: Reply) -> None:
+        """Send the device's answer, with the word of the client's command."""
         self.counts[name, "answered"] += 1
         number = [] if reply.register is None else [f"{reply.register:02d}"]
-        self._say(name, encode(",".join([word, *number, *reply.tokens])))
+        self._send(name, encode(",".join([word, *number, *reply.tokens])))
 
-    def again(self) -> None:
-        """What is on the wire was not sent after all: it is the first one again."""
-        held, self._under_way = self._under_way, None
-        if held is not None and not held.gone:
-            self._queue.appendleft(held)
+    def requeue_current(self) -> None:
+        """The command on the wire was not sent: put it back at the head of the queue."""
+        unsent, self._under_way = self._under_way, None
+        if unsent is not None and not unsent.gone:
+            self._queue.appendleft(unsent)
 
-    def refuse_first(self, refusal: Refusal) -> None:
-        """The first one is not to be sent, for this reason."""
+    def refuse_next(self, refusal: Refusal) -> None:
+        """Refuse the next command instead of sending it."""
         if self._queue:
             self._refuse(self._queue.popleft().client, refusal)
 
-    def tell_all(self, body: str) -> None:
-        """Something that the device said by itself."""
+    def broadcast(self, body: str) -> None:
+        """Send every client a message that the device sent unasked."""
         for name in self._clients:
-            self._say(name, encode(body))
+            self._send(name, encode(body))
 
     def _refuse(self, name: str, refusal: Refusal) -> None:
         self.counts[name, "refused"] += 1
         if refusal.why:
             self._notes.append(f"{name}: {refusal.why}")
-        self._say(name, encode(f"VNERR,{refusal.code:02X}"))
+        self._send(name, encode(f"VNERR,{refusal.code:02X}"))
 
-    def _say(self, name: str, data: bytes, stream: bool | None = None) -> None:
+    def _send(self, name: str, data: bytes, stream: bool | None = None) -> None:
         if name in self._clients:
             self._answers.append(SendToClient(name, data, stream))

@@ -9,13 +9,14 @@ C (temperature, units C). PITCH is positive with the bow up, ROLL with the right
 names are those of the standard's list of 2019 (Pitch, Roll), in capitals, as older programs compare
 them.
 
-**Attitude** for them. Which way is up, sample by sample, in the frame of the device's outputs
-(body).
+**Attitude** for these sentences: the up direction of each sample, in the frame of the device's
+outputs (body).
 
-Where the stream has the device's own pitch and roll, they say it. Else the specific force says it,
-carried on by the gyro: one sample of a vehicle that brakes or turns is no plumb line, so each
-corrects the direction by dt / 5 s only, and one that is not of about 1 g not at all. That takes
-5 s of samples to settle, after each gap again.
+If the stream has the device's own pitch and roll, they are used. Otherwise the up direction is
+propagated with the gyro and corrected towards the specific force. One sample of a vehicle that
+brakes or turns does not show the vertical, so each sample corrects by dt / 5 s only, and a sample
+whose specific force is not about 1 g does not correct at all. The filter needs 5 s of samples to
+settle, at the start and after each gap.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from drivers.vn100.messages import encode
 
 @dataclass(frozen=True, slots=True)
 class Transducer:
-    """One measurement of an XDR sentence; `value` None: not known, an empty field."""
+    """One measurement of an XDR sentence; `value` None: unknown, an empty field."""
 
     type: str
     value: float | None
@@ -43,49 +44,49 @@ class Transducer:
 
 
 def hdm(heading_deg: float | None) -> bytes:
-    """The magnetic heading; None: not known."""
+    """The sentence of the magnetic heading; None: unknown."""
     if heading_deg is None:
         return encode("HCHDM,,M")
     return encode(f"HCHDM,{round(heading_deg % 360.0, 1) % 360.0:05.1f},M")
 
 
 def xdr(transducers: list[Transducer]) -> bytes:
-    """Measurements of transducers; at most four fit into the 82 characters of a sentence."""
-    fields = [f"{t.type},{_number(t.value)},{t.units},{t.name}" for t in transducers]
+    """The sentence of these transducers; at most four fit in its 82 characters."""
+    fields = [f"{t.type},{_format_number(t.value)},{t.units},{t.name}" for t in transducers]
     return encode("YXXDR," + ",".join(fields))
 
 
-def attitude(
+def attitude_transducers(
     pitch_deg: float | None, roll_deg: float | None, temperature_c: float | None
 ) -> list[Transducer]:
-    """Pitch and roll, and the sensor's temperature where there is one."""
+    """Transducers of pitch and roll, and of the sensor's temperature if it is known."""
     found = [Transducer("A", pitch_deg, "D", "PITCH"), Transducer("A", roll_deg, "D", "ROLL")]
     if temperature_c is not None:
         found.append(Transducer("C", temperature_c, "C", "TEMP"))
     return found
 
 
-def _number(value: float | None) -> str:
+def _format_number(value: float | None) -> str:
     return "" if value is None else f"{round(value, 1) + 0.0:.1f}"  # no -0.0
 
 
-# -- Which way is up -------------------------------------------------------------------------------
+# -- Up direction ----------------------------------------------------------------------------------
 
 
-SETTLED_S = 5.0  # memory of the specific force, and when the direction is first believed
-_LOST_S = 15.0  # without a believable specific force
+SETTLED_S = 5.0  # time constant of the correction, and time until the direction is used
+_LOST_S = 15.0  # without a specific force of about 1 g
 _LONGEST_STEP_S = 0.5
 _G_M_S2, _NEAR_G = 9.81, 0.1
-_STEEP = math.sin(math.radians(60.0))  # pitch beyond which there is no heading: it turns to roll
+_STEEP = math.sin(math.radians(60.0))  # pitch above which heading is undefined: it turns into roll
 
 
 class Tilt:
-    """Of one stream; samples in order."""
+    """Estimates the up direction of one stream; samples in order."""
 
     def __init__(self) -> None:
         self._up: tuple[float, float, float] | None = None
         self._rate = [0.0, 0.0, 0.0]
-        self._at_s = self._age_s = self._without_s = 0.0
+        self._at_s = self._age_s = self._without_gravity_s = 0.0
 
     def up(
         self,
@@ -94,40 +95,40 @@ class Tilt:
         accel_body_m_s2: Array,
         pitch_roll_rad: tuple[Array, Array] | None = None,
     ) -> Array:
-        """(N, 3) unit vectors that point up, nan where nobody knows."""
+        """(N, 3) unit vectors that point up, nan if unknown."""
         if pitch_roll_rad is not None:
             pitch, roll = pitch_roll_rad
             level = np.cos(pitch)
             return np.stack([np.sin(pitch), -level * np.sin(roll), -level * np.cos(roll)], axis=1)
         rows = zip(time_s.tolist(), gyro_body_rad_s.tolist(), accel_body_m_s2.tolist(), strict=True)
-        return np.array([self._next(*row) for row in rows]).reshape(-1, 3)
+        return np.array([self._update(*row) for row in rows]).reshape(-1, 3)
 
-    def _next(self, at_s: float, rate: list[float], force: list[float]) -> tuple[float, ...]:
+    def _update(self, at_s: float, rate: list[float], force: list[float]) -> tuple[float, ...]:
         dt_s, self._at_s = at_s - self._at_s, at_s
         before, self._rate = self._rate, rate
-        size = math.sqrt(sum(part * part for part in force))  # nan where the stream has none
-        believable = abs(size / _G_M_S2 - 1.0) < _NEAR_G
+        size = math.sqrt(sum(part * part for part in force))  # nan if the stream has none
+        gravity_like = abs(size / _G_M_S2 - 1.0) < _NEAR_G
         if self._up is None or not 0.0 < dt_s < _LONGEST_STEP_S:
-            self._up = (force[0] / size, force[1] / size, force[2] / size) if believable else None
-            self._age_s = self._without_s = 0.0
+            self._up = (force[0] / size, force[1] / size, force[2] / size) if gravity_like else None
+            self._age_s = self._without_gravity_s = 0.0
             return (math.nan,) * 3
-        turned = [0.5 * dt_s * (a + b) for a, b in zip(before, rate, strict=True)]
-        x, y, z = _turned_back(self._up, turned)
-        if believable:
-            share = min(dt_s / SETTLED_S, 1.0)
-            x, y, z = (u + share * (f / size - u) for u, f in zip((x, y, z), force, strict=True))
+        angle = [0.5 * dt_s * (a + b) for a, b in zip(before, rate, strict=True)]
+        x, y, z = _rotate_back(self._up, angle)
+        if gravity_like:
+            gain = min(dt_s / SETTLED_S, 1.0)
+            x, y, z = (u + gain * (f / size - u) for u, f in zip((x, y, z), force, strict=True))
         length = math.sqrt(x * x + y * y + z * z)
         self._up = (x / length, y / length, z / length)
         self._age_s += dt_s
-        self._without_s = 0.0 if believable else self._without_s + dt_s
-        if self._without_s > _LOST_S:
+        self._without_gravity_s = 0.0 if gravity_like else self._without_gravity_s + dt_s
+        if self._without_gravity_s > _LOST_S:
             self._up = None
         known = self._up is not None and self._age_s >= SETTLED_S
         return self._up if known and self._up is not None else (math.nan,) * 3
 
 
-def _turned_back(u: tuple[float, float, float], by_rad: list[float]) -> tuple[float, float, float]:
-    """What stands still, seen from a frame that turned by this small vector; to second order."""
+def _rotate_back(u: tuple[float, float, float], by_rad: list[float]) -> tuple[float, float, float]:
+    """A fixed vector in a frame that turned by this small rotation vector; to second order."""
     first = _cross(by_rad, u)
     second = _cross(by_rad, first)
     return (
@@ -152,5 +153,5 @@ def roll_deg(up_body: Array) -> Array:
 
 
 def has_heading(up_body: Array) -> Array:
-    """(N,) whether up is known and the pitch at most 60 deg."""
+    """(N,) whether up is known and the pitch is below 60 deg."""
     return np.asarray(np.abs(up_body[:, 0]) < _STEEP)

@@ -1,12 +1,12 @@
-"""What a share hands on of the device's bytes, and how it stands.
+"""What a share forwards of the device's bytes, and its status.
 
-**Messages.** Device bytes into whole messages for clients, without the replies to commands.
+**Messages.** Splits device bytes into whole messages for clients, without replies to commands.
 
-A driver needs a whole message before it can use any of it, so handing messages on when their last
-byte is there costs no time, and an answer of ours fits between any two of them. Every byte comes
-out, in order and once: in a message, as damage or noise where it stood, or as a reply, which is for
-whoever asked. A message that is the next one and ends with what was read, as nearly all are, comes
-out before the rest of the work (`ahead`).
+A driver needs a whole message before it can use any of it, so forwarding a message when its last
+byte arrives costs no time, and an answer of ours fits between any two messages. Every byte is
+accounted for in order and once: in a message, as damage or noise at its place, or in a reply, which
+goes to the client that sent the command. If the next message ends with the bytes just read, as
+nearly all do, it is forwarded before the rest of the work (`completed_message`).
 """
 
 from __future__ import annotations
@@ -23,65 +23,65 @@ _REPLIES = REGISTER_WORDS | COMMAND_WORDS | {"VNERR"}
 
 
 def is_reply(body: str) -> bool:
-    """Whether a line with this body answers a command."""
+    """Whether a line with this body is the reply to a command."""
     return body[:5] in _REPLIES
 
 
 class MessageSplitter:
-    """Of one link. `replies`: how many were kept back."""
+    """Splits the bytes of one link. `replies`: number of replies left out."""
 
     def __init__(self) -> None:
         self.replies = 0
         self._deframer = Deframer()
-        self._held = b""  # bytes that did not come out yet
-        self._base = 0  # offset of the first of them in the stream
-        self._ahead = False  # the next message has come out already
+        self._pending = b""  # bytes not yet returned
+        self._base = 0  # their offset in the stream
+        self._sent_ahead = False  # the next message was returned by `completed_message`
 
-    def ahead(self, chunk: bytes) -> bytes:
-        """The message for the clients that these bytes complete, where that is all they do.
+    def completed_message(self, chunk: bytes) -> bytes:
+        """The message that these bytes complete, if they complete exactly one and add nothing else.
 
-        `feed` must be given the same bytes next, and leaves it out. Empty says nothing.
+        `feed` must be given the same bytes next, and leaves that message out. Empty: undecided.
         """
         body = self._deframer.completes(chunk)
         if body is None or is_reply(body):
             return b""
-        self._ahead = True
-        return self._held + chunk if self._held else chunk
+        self._sent_ahead = True
+        return self._pending + chunk if self._pending else chunk
 
     def feed(self, chunk: bytes) -> list[bytes]:
-        """Take bytes, cut anywhere; whole messages, and what is none, for the clients."""
-        self._held += chunk
+        """Take bytes, cut anywhere; returns whole messages, and damage or noise, for clients."""
+        self._pending += chunk
         frames = self._deframer.feed(chunk)
         pieces = sorted([*frames, *self._deframer.take_skipped()], key=lambda it: it.offset)
         out = []
         for piece in pieces:
             length = len(piece.data) if isinstance(piece, Skipped) else piece.length
-            data, self._held = self._held[:length], self._held[length:]
+            data, self._pending = self._pending[:length], self._pending[length:]
             self._base += length
             if isinstance(piece, Sentence) and is_reply(piece.body):
                 self.replies += 1
-            elif not self._ahead:
+            elif not self._sent_ahead:
                 out.append(data)
-            self._ahead = False
+            self._sent_ahead = False
         return out
 
-    def silence(self) -> list[bytes]:
-        """Nothing came for a while: what waits for more bytes is no message and comes out."""
+    def flush(self) -> list[bytes]:
+        """The line was silent: return incomplete bytes, which are no message."""
         self._deframer.drop_pending()
         return self.feed(b"")
 
 
-# -- How a share stands ----------------------------------------------------------------------------
+# -- Status of a share -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class ShareFacts:
-    """One `[[share]]`.
+    """Status of one `[[share]]`.
 
-    send:    what it sends: measurements and answers where it is empty (a pty)
-    readers: programs that have it open; None where nobody knows (udp)
+    send:    what it sends; empty (a pty): measurements and answers
+    readers: programs that have it open; None if unknown (udp)
     lost_bytes: of whole messages that a reader did not take in time
-    turned_away: connections beyond the limit; ignored_bytes: what readers of tcp sent
+    turned_away: connections beyond the limit; ignored_bytes: bytes that readers sent over tcp
     """
 
     name: str

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ahrsd.evidence.coverage import CELLS, centres
+from ahrsd.evidence.coverage import CELLS, cell_centres
 from ahrsd.evidence.segments import HistoryParameters
 from ahrsd.evidence.values import Bools
 from ahrsd.samples import Array
@@ -84,7 +84,7 @@ def shown_of(status: Mapping[str, Any]) -> Shown | None:
     seen = np.array([cell == "1" for cell in cells])
     frame_b = _level_frame(np.array(motion["down_b"], dtype=float))
     ring_deg = 90.0 - float(motion["dip_deg"])
-    from_down = np.degrees(np.arccos(np.clip(centres() @ frame_b[2], -1.0, 1.0)))
+    from_down = np.degrees(np.arccos(np.clip(cell_centres() @ frame_b[2], -1.0, 1.0)))
     level = np.abs(from_down - ring_deg) <= _LEVEL_DEG
     tilted = (np.abs(from_down - ring_deg) <= REACH_DEG) & ~level
     return Shown(seen, level, tilted, frame_b, ring_deg)
@@ -118,7 +118,7 @@ def drive_next(status: Mapping[str, Any]) -> str:
 def _lean(shown: Shown, heading_deg: float | None) -> str:
     """The quarter in which most tilts are missing, with the turn that leads there."""
     ahead, right, down = shown.frame_b
-    middle = centres()
+    middle = cell_centres()
     quarter = (
         np.round(np.degrees(np.arctan2(middle @ right, middle @ ahead)) / 90.0).astype(int) % 4
     )

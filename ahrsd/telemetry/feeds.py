@@ -24,7 +24,15 @@ from ahrsd.calibration import Affine, Estimate
 from ahrsd.core.core import Core
 from ahrsd.heading import tilt_compensated_heading
 from ahrsd.samples import Array, SampleBlock
-from ahrsd.sharing.nmea import Tilt, attitude, has_heading, hdm, pitch_deg, roll_deg, xdr
+from ahrsd.sharing.nmea import (
+    Tilt,
+    attitude_transducers,
+    has_heading,
+    hdm,
+    pitch_deg,
+    roll_deg,
+    xdr,
+)
 from ahrsd.stream.decompensation import Compensation
 from ahrsd.telemetry.protocol import Record, line_of
 from ahrsd.telemetry.words import STATES, estimator_trouble, stream_trouble
@@ -351,7 +359,7 @@ class Feed:
                 continue
             self._next_s = at_s + _NMEA_S
             heading, *rest = (value if np.isfinite(value) else None for value in row)
-            self.outlet.write([hdm(heading), xdr(attitude(*rest))], 0, b"")
+            self.outlet.write([hdm(heading), xdr(attitude_transducers(*rest))], 0, b"")
 
 
 def _pitch_roll(block: SampleBlock) -> tuple[Array, Array] | None:

@@ -266,7 +266,7 @@ def _write_back(core: Core) -> dict[str, object]:
     proposal = writeback.proposal
     return {
         "state": writeback.state.value,
-        "holds": [*filter(None, [core.warm.holds]), *writeback.holds()],
+        "holds": [*filter(None, [core.warm.holds]), *writeback.obstacles()],
         "proposal": None
         if proposal is None
         else {

@@ -1,10 +1,10 @@
-"""What the write-back asks of the core, to be carried out in the order in which it is given.
+"""Actions of the write-back, which the core carries out in the given order.
 
-JournalAppend is carried out with fsync *before* the next action runs, and its end is told with
+AppendToJournal is carried out with fsync *before* the next action runs; its result is reported with
 `on_journal_ok` or `on_journal_failed`, whose own actions come before the rest of the list.
 RunProcedure waits until the session is idle; CancelProcedure throws Cancelled into the running one.
 
-`ActionOutbox` collects them, with what the write-back knows of time and journal.
+`ActionOutbox` collects the actions, and holds the present time and the journal's history.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from drivers.vn100.registers import Unit, Values
 
 @dataclass(frozen=True, slots=True)
 class RunProcedure:
-    """Have the session carry out `make()`. `gate` is asked for each command, just before it goes.
+    """Have the session carry out `make()`. `gate` must allow each command just before it is sent.
 
-    `name` is unique; the end is told with `on_procedure_finished` or `on_procedure_failed`.
+    `name` is unique; the end is reported with `on_procedure_finished` or `on_procedure_failed`.
     """
 
     name: str
@@ -46,14 +46,14 @@ class RunProcedure:
 
 @dataclass(frozen=True, slots=True)
 class CancelProcedure:
-    """End the procedure of this name, if it runs or waits; its end need not be told."""
+    """Cancel the procedure of this name, if it runs or waits; its end need not be reported."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class AppendToJournal:
-    """Make this record durable."""
+    """Write this record to the journal durably."""
 
     kind: RecordKind
     facts: Mapping[str, Any]
@@ -61,31 +61,31 @@ class AppendToJournal:
 
 @dataclass(frozen=True, slots=True)
 class Emit:
-    """A fact for the log, the viewer and the report."""
+    """An event for the log, the viewer and the report."""
 
     event: Event
 
 
 @dataclass(frozen=True, slots=True)
 class InForce:
-    """From now on the device applies these registers; None: nobody knows, samples are unusable."""
+    """The device applies these registers from now on; None: unknown, samples are unusable."""
 
     registers: Mapping[int, Values] | None
 
 
 @dataclass(frozen=True, slots=True)
 class SetUpStream:
-    """The user's own outputs were put back for a save: set the session's up again."""
+    """Set the session's outputs up again: the user's were restored for a save."""
 
 
 @dataclass(frozen=True, slots=True)
 class IdentifyAgain:
-    """Identify the device, read its registers and tell `on_device`."""
+    """Identify the device, read its registers and report to `on_device`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Ask who answers and what it holds, when nothing else runs, and tell `on_looked`."""
+    """Read identity and registers when nothing else runs, and report to `on_looked`."""
 
     unit: Unit
     expected: Mapping[int, Values]
@@ -93,7 +93,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class CalibrateAnew:
-    """What was un-mapped until now may have been so through registers that were not in force."""
+    """Calibrate anew: samples may have been decompensated with the wrong registers."""
 
     reason: str
 
@@ -115,51 +115,51 @@ Action = (
 
 
 JOURNAL_AGAIN_S = 30.0
-_ANNOUNCED = (
+_RECORDED_BEFORE_ACTION = (
     RecordKind.PREPARED,
     RecordKind.RAM_VERIFIED,
     RecordKind.FLASH_SENT,
     RecordKind.CLIENT_WRITES,
-)  # not on the disk: not done
+)  # the action that they precede is not done unless they are on the disk
 
 
 class ActionOutbox:
-    """Outgoing actions in order, each stamped with the newest time; the history beside them.
+    """Actions in order, the clocks and the journal's history.
 
-    A record that says what was done (a rollback) and that the disk did not take is kept and asked
-    for again until it does: otherwise the next start would have to guess.
+    A record of a completed step (a rollback) that could not be written to disk is kept and retried
+    until it is: otherwise the next start would have to guess.
     """
 
     def __init__(self, allow: Callable[[Command, Purpose, float], bool]) -> None:
         self.host_s = self.at_s = 0.0
-        self.device_s: float | None = None  # the device's time since its start-up, as last heard
+        self.device_s: float | None = None  # the device's newest time since its start-up
         self.history = JournalHistory()
         self.running = ""
         self._allow = allow
         self._wall_offset_s: float | None = None
-        self._least_offset_s: float | None = None  # of every wall clock that may have been right
-        self._boot: tuple[str, float | None] = ("", None)  # and what to add to `host_s`
+        self._least_offset_s: float | None = None  # of all plausible wall clock readings
+        self._boot: tuple[str, float | None] = ("", None)  # boot id, and offset from `host_s`
         self._serial: int | None = None
         self._bound_s = 0.0
-        self._asked: deque[tuple[RecordKind, dict[str, Any], JournalHistory]] = deque()
+        self._requested: deque[tuple[RecordKind, dict[str, Any], JournalHistory]] = deque()
         self._unjournaled: list[tuple[RecordKind, dict[str, Any]]] = []
-        self._journal_again_s = 0.0
+        self._journal_retry_s = 0.0
         self._runs = 0
         self._out: list[Action] = []
         self._last_note = ""
 
     @property
     def wall_s(self) -> float:
-        """The wall clock now, for people to read; the monotonic one while it is unknown."""
+        """The wall clock now, for people; the monotonic clock while it is unknown."""
         return self.host_s + (self._wall_offset_s or 0.0)
 
     @property
     def stamp(self) -> Stamp:
-        """The present by every clock, for a record."""
+        """The present by all clocks, for a record."""
         return self.stamp_at(self.host_s)
 
     def stamp_at(self, host_s: float) -> Stamp:
-        """That moment by every clock of the host, and the device's time as last heard."""
+        """`host_s` by all clocks of the host, and the newest device time."""
         (boot_id, boot_s), wall_s = self._boot, self._wall_offset_s
         return Stamp(
             wall_s=None if wall_s is None else host_s + wall_s,
@@ -170,7 +170,7 @@ class ActionOutbox:
 
     @property
     def now(self) -> Now:
-        """The present for a budget: by the earliest wall clock that this run was told."""
+        """The present for a budget, by the earliest plausible wall clock of this run."""
         stamp, least_s = self.stamp, None
         if self._least_offset_s is not None:
             since_s = self.host_s if stamp.boot_s is None else stamp.boot_s
@@ -178,7 +178,7 @@ class ActionOutbox:
         return Now(replace(stamp, wall_s=least_s), self.host_s - self._bound_s)
 
     def set_clocks(self, wall_s: float, boot_id: str = "", boot_s: float | None = None) -> None:
-        """The host's other clocks at this moment; the wall clock may have been set since."""
+        """Set the host's other clocks; the wall clock may have been adjusted."""
         self._wall_offset_s = wall_s - self.host_s
         if plausible(wall_s):
             offset_s = wall_s - (self.host_s if boot_s is None else boot_s)
@@ -187,10 +187,10 @@ class ActionOutbox:
         self._boot = (boot_id, None if boot_s is None else boot_s - self.host_s)
 
     def bind(self, serial: int, journal: Sequence[JournalRecord] | None) -> None:
-        """Another device, or the same one again: its journal is what counts.
+        """Take the journal of the device that is there now.
 
-        Where it cannot be read, what is remembered of an open transaction is better than nothing;
-        and what the disk has not taken yet comes behind what it has.
+        If it cannot be read, an open transaction in memory is kept. Records that are not on the
+        disk yet are appended to the history.
         """
         if serial != self._serial and self._unjournaled:
             self.note(
@@ -204,18 +204,18 @@ class ActionOutbox:
             for kind, facts in self._unjournaled:
                 self.history = self.history.with_record(kind, facts)
 
-    def take(self) -> list[Action]:
+    def take_actions(self) -> list[Action]:
         """The actions since the last call."""
         out, self._out = self._out, []
         return out
 
-    def ask(self, action: Action) -> None:
+    def append(self, action: Action) -> None:
         """Append an action."""
         self._out.append(action)
 
     def record(self, kind: RecordKind, **facts: object) -> None:
-        """Append a record behind those still missing on the disk; the history counts it at once."""
-        self.journal_again()
+        """Append a record after those still missing on disk; the history includes it at once."""
+        self.retry_journal()
         transaction = self.history.open
         complete = {
             **({} if transaction is None else {"txn": transaction.id}),
@@ -225,22 +225,22 @@ class ActionOutbox:
         before, self.history = self.history, self.history.with_record(kind, complete)
         self._append(kind, complete, before)
 
-    def journaled(self, kind: RecordKind) -> bool:
-        """A record of this kind is on the disk; returns whether none is missing any more."""
-        self._answered(kind)
-        self.journal_again()
-        return not self._unjournaled and not self._asked
+    def on_journaled(self, kind: RecordKind) -> bool:
+        """A record of this kind is on the disk; returns whether none is missing now."""
+        self._take_request(kind)
+        self.retry_journal()
+        return not self._unjournaled and not self._requested
 
-    def not_journaled(self, kind: RecordKind) -> None:
-        """A record of this kind is not on the disk: what it announced does not happen."""
-        asked = self._answered(kind)
-        if asked is None:
+    def on_journal_failed(self, kind: RecordKind) -> None:
+        """A record of this kind could not be written: keep it, or undo what it announced."""
+        request = self._take_request(kind)
+        if request is None:
             return
-        _, facts, before = asked
-        if kind not in _ANNOUNCED:
+        _, facts, before = request
+        if kind not in _RECORDED_BEFORE_ACTION:
             self._unjournaled.append((kind, facts))
-            self._journal_again_s = self.host_s + JOURNAL_AGAIN_S
-        elif kind is RecordKind.PREPARED:  # nothing was opened
+            self._journal_retry_s = self.host_s + JOURNAL_AGAIN_S
+        elif kind is RecordKind.PREPARED:  # no transaction was opened
             self.history = replace(
                 self.history,
                 open=before.open,
@@ -250,55 +250,55 @@ class ActionOutbox:
             )
 
     @property
-    def journal_again_s(self) -> float | None:
-        """When the records that the disk did not take are tried again."""
-        return self._journal_again_s if self._unjournaled else None
+    def journal_retry_s(self) -> float | None:
+        """When failed records are retried; None if there are none."""
+        return self._journal_retry_s if self._unjournaled else None
 
-    def journal_again(self) -> None:
-        """Try the missing records again, in their order."""
+    def retry_journal(self) -> None:
+        """Retry the missing records, in order."""
         waiting, self._unjournaled = self._unjournaled, []
         for kind, facts in waiting:
             self._append(kind, facts, self.history)
 
     def _append(self, kind: RecordKind, facts: dict[str, Any], before: JournalHistory) -> None:
-        self._asked.append((kind, facts, before))
-        self.ask(AppendToJournal(kind, facts))
+        self._requested.append((kind, facts, before))
+        self.append(AppendToJournal(kind, facts))
 
-    def _answered(
+    def _take_request(
         self, kind: RecordKind
     ) -> tuple[RecordKind, dict[str, Any], JournalHistory] | None:
-        asked = next((one for one in self._asked if one[0] is kind), None)
-        if asked is not None:
-            self._asked.remove(asked)
-        return asked
+        request = next((one for one in self._requested if one[0] is kind), None)
+        if request is not None:
+            self._requested.remove(request)
+        return request
 
     def note(self, level: str, text: str) -> None:
-        """One line for the log; not the same one twice in a row."""
+        """Log one line; a repetition of the last one is left out."""
         if text != self._last_note:
-            self.ask(Emit(Noted(self.at_s, self.host_s, level, text)))
+            self.append(Emit(Noted(self.at_s, self.host_s, level, text)))
         self._last_note = text
 
-    def changed(self, old: str, new: str, reason: str) -> None:
-        """The state changed."""
-        self.ask(Emit(StateChanged(self.at_s, self.host_s, old, new, reason)))
+    def emit_state_change(self, old: str, new: str, reason: str) -> None:
+        """Emit a change of state."""
+        self.append(Emit(StateChanged(self.at_s, self.host_s, old, new, reason)))
 
-    def written(
+    def emit_register_writes(
         self, before: Mapping[int, Values], after: Mapping[int, Values], outcome: str
     ) -> None:
-        """Registers were written, refused or undone."""
+        """Emit that registers were written, refused or undone."""
         for number in after:
             old, new = (tuple(float(v) for v in side[number]) for side in (before, after))
-            self.ask(Emit(RegisterWritten(self.at_s, self.host_s, number, old, new, outcome)))
+            self.append(Emit(RegisterWritten(self.at_s, self.host_s, number, old, new, outcome)))
 
-    def in_force(self, registers: Mapping[int, Values] | None) -> None:
+    def set_in_force(self, registers: Mapping[int, Values] | None) -> None:
         """The device applies these registers from now on; None: unknown."""
-        self.ask(InForce(None if registers is None else dict(registers)))
+        self.append(InForce(None if registers is None else dict(registers)))
 
     def run(self, what: str, purpose: Purpose, make: Callable[[], Procedure[object]]) -> None:
-        """Start a procedure; the gate judges each command at the newest host time."""
+        """Start a procedure; its gate checks each command at the newest host time."""
         self._runs += 1
         self.running = f"{what} {self._runs}"
-        self.ask(
+        self.append(
             RunProcedure(
                 self.running,
                 purpose,
@@ -307,8 +307,8 @@ class ActionOutbox:
             )
         )
 
-    def stop_running(self) -> None:
-        """End the procedure that runs, if any."""
+    def cancel_running(self) -> None:
+        """Cancel the running procedure, if any."""
         if self.running:
-            self.ask(CancelProcedure(self.running))
+            self.append(CancelProcedure(self.running))
         self.running = ""

@@ -1,9 +1,9 @@
-"""From an estimate of the raw sensor and the registers in force to the registers to write.
+"""The registers to write, from an estimate of the raw sensor and the registers in force.
 
-The estimate is of the *raw* sensor: every sample was un-mapped through the registers in force when
-it was taken (`decompensation`). So nothing is left to compose but the scale::
+The estimate is of the *raw* sensor: every sample was decompensated with the registers in force when
+it was taken (`stream.decompensation`). So only the scale remains to be determined::
 
-    register 23:  C' = s A^-1,  B' = b          whatever stood in 23 and 26 before
+    register 23:  C' = s A^-1,  B' = b          for any previous values of 23 and 26
     register 84:  C' = C84,     B' = w_b        the gyro's matrix is not estimated
 
 The scale s.  Without a known field det A = 1 is a convention, not a measurement: the fit cannot
@@ -11,12 +11,12 @@ tell a strong field from a sensitive sensor. The device's present scale is kept,
 unlike a ratio of mean field strengths it does not depend on the hard iron or on the data, so a
 second run on the written device proposes the same. With a known field (world model), s = 1.
 
-Where the estimate is of a stream whose registers act on it, C' = C2 C23 and B' = B23 + C23^-1 B2
-(with register 26: C' = R^T C2 R C23, B' = B23 + C23^-1 R^T B2) is the same thing; `Affine.after`
+For an estimate of a stream that its registers compensate, C' = C2 C23 and B' = B23 + C23^-1 B2
+(with register 26: C' = R^T C2 R C23, B' = B23 + C23^-1 R^T B2) is equivalent; `Affine.after`
 and tests/core/test_fixed_point.py show it.
 
-Numbers are rounded to the six digits that the device prints: what it stores then equals what it
-shows, and a restart reads back exactly what was written. Six digits are 3e-4 deg of heading.
+Numbers are rounded to the six digits that the device prints, so the stored values equal the printed
+ones, and after a restart exactly the written values are read. Six digits are 3e-4 deg of heading.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from ahrsd.samples import Array
 from drivers.vn100.registers import Values, as_stored, register_lines
 
 MAG, GYRO = 23, 84
-MAX_CONDITION: Final = 8.0  # daemon.md 4.3 G9: hard limits, not a person's to loosen
+MAX_CONDITION: Final = 8.0  # daemon.md 4.3 G9: hard limits, not configurable
 MAX_OFFSET_GAUSS: Final = 1.3
 MAX_GYRO_BIAS_RAD_S: Final = 0.175  # 10 deg/s, what the data sheet allows a cold sensor
-HELD_WITHIN_SIGMA: Final = 0.5  # an undetermined direction stays where the device has it
-HELD_WITHIN: Final = 1e-5  # and what rounding on the wire may move
+HELD_WITHIN_SIGMA: Final = 0.5  # an undetermined direction must stay within this
+HELD_WITHIN: Final = 1e-5  # and for rounding on the wire
 DIGITS: Final = 6
 
 _NAMES: Final = (
@@ -48,15 +48,15 @@ _NAMES: Final = (
 
 
 class UnwritableError(ValueError):
-    """The estimate must not reach a device; the text says why, in one line."""
+    """The estimate must not be written to a device; the text says why, in one line."""
 
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """What would be written. `old` and `new` have the same registers: 23, 84, both or none.
+    """A proposed write. `old` and `new` have the same registers: 23, 84, both or none.
 
-    id:                  eight hex digits of a hash of the lines: what a person types to approve
-    lines:               the very text that would be sent, checksum included
+    id:                  eight hex digits of a hash of the lines, typed to approve it
+    lines:               the exact text that would be sent, checksum included
     heading_change_deg:  largest change of heading, level, over all headings
     gyro_change_rad_s:   length of the change of the gyro bias
     """
@@ -72,21 +72,21 @@ class Proposal:
 def compose(
     estimate: Estimate, registers: Mapping[int, Values], *, gyro_is_raw: bool = True
 ) -> Proposal:
-    """The registers that `estimate` asks for, given the ones in force.
+    """The registers to write for `estimate`, given the ones in force.
 
-    gyro_is_raw: false where the stream was AngularRate, from which the device's filter has taken
-    its own, unknown bias: register 84 then stays. Raises UnwritableError.
+    gyro_is_raw: False if the stream was AngularRate, from which the device's filter has subtracted
+    its own, unknown bias: register 84 is not changed then. Raises UnwritableError.
     """
     present = _affine(registers, MAG)
     present_gyro = _affine(registers, GYRO)
     _refuse_unusable(estimate)
-    _refuse_moved(estimate, present, present_gyro)
-    proposed = {MAG: _wire(MAG, correction(estimate, present))}
+    _refuse_undetermined_changes(estimate, present, present_gyro)
+    proposed = {MAG: _to_wire(MAG, correction(estimate, present))}
     if gyro_is_raw:
-        proposed[GYRO] = _wire(GYRO, Affine(present_gyro.matrix, estimate.gyro_bias_rad_s))
+        proposed[GYRO] = _to_wire(GYRO, Affine(present_gyro.matrix, estimate.gyro_bias_rad_s))
     written = Affine.from_register(_floats(proposed[MAG]))
     _refuse_out_of_bounds(written, estimate.gyro_bias_rad_s)
-    new = {n: v for n, v in proposed.items() if not _is_there(registers[n], v)}
+    new = {n: v for n, v in proposed.items() if not _equals_present(registers[n], v)}
     lines = register_lines(new)
     return Proposal(
         id=hashlib.sha256("\n".join(lines).encode()).hexdigest()[:8],
@@ -99,9 +99,9 @@ def compose(
 
 
 def heading_change_deg(present: Affine, proposed: Affine, estimate: Estimate) -> float:
-    """Largest difference of heading between two corrections over all headings, level, in degrees.
+    """Largest heading difference between two corrections over all headings, level, in degrees.
 
-    The field is taken to dip by 60 deg, as in middle latitudes; `proposed` is taken as true.
+    Assumes a dip of 60 deg, as in middle latitudes, and that `proposed` is true.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
     dip = np.radians(60.0)
@@ -116,8 +116,8 @@ def heading_change_deg(present: Affine, proposed: Affine, estimate: Estimate) ->
     return float(np.degrees(np.max(np.abs(difference))))
 
 
-def apart_deg(one: Proposal, other: Proposal, estimate: Estimate) -> float:
-    """How far two proposals are apart, as a change of heading."""
+def proposal_distance_deg(one: Proposal, other: Proposal, estimate: Estimate) -> float:
+    """Difference of two proposals, as a change of heading."""
     if MAG not in one.new or MAG not in other.new:
         return 0.0 if MAG not in one.new and MAG not in other.new else 180.0
     first, second = (Affine.from_register(_floats(p.new[MAG])) for p in (one, other))
@@ -125,29 +125,29 @@ def apart_deg(one: Proposal, other: Proposal, estimate: Estimate) -> float:
 
 
 def _scale(written: Affine, estimate: Estimate) -> float:
-    """How much larger the written correction makes the field than A^-1 does."""
+    """Factor of the written correction's field over that of A^-1."""
     return float(np.cbrt(np.linalg.det(written.matrix) * np.linalg.det(estimate.soft_iron)))
 
 
 def correction(estimate: Estimate, present: Affine) -> Affine:
-    """What register 23 would be by this estimate, the scale s by the rule above, not rounded."""
-    return Affine(_matrix(estimate, present), estimate.hard_iron_gauss)
+    """Register 23 for this estimate, with the scale s by the rule above, not rounded."""
+    return Affine(_scaled_inverse(estimate, present), estimate.hard_iron_gauss)
 
 
-def _matrix(estimate: Estimate, present: Affine) -> Array:
+def _scaled_inverse(estimate: Estimate, present: Affine) -> Array:
     inverse = np.linalg.inv(estimate.soft_iron)
     if estimate.field_known:
         return np.asarray(inverse)
     return np.asarray(inverse * np.cbrt(np.linalg.det(present.matrix) / np.linalg.det(inverse)))
 
 
-def _wire(number: int, affine: Affine) -> Values:
-    """As the device will store and print it."""
+def _to_wire(number: int, affine: Affine) -> Values:
+    """The values as the device stores and prints them."""
     rounded = tuple(float(f"{value:.{DIGITS}g}") for value in affine.to_register())
     return as_stored(number, rounded)
 
 
-def _is_there(present: Values, proposed: Values) -> bool:
+def _equals_present(present: Values, proposed: Values) -> bool:
     """Whether they differ by no more than the rounding of one of them (of C: six digits near 1)."""
     difference = np.abs(np.array(_floats(present)) - np.array(_floats(proposed)))
     return bool(difference[:9].max() < 1.2e-5 and difference[9:].max() < 1e-6)
@@ -183,31 +183,37 @@ def _refuse_unusable(estimate: Estimate) -> None:
         raise UnwritableError("the estimated soft iron is not symmetric and positive definite")
 
 
-def _refuse_moved(estimate: Estimate, present: Affine, present_gyro: Affine) -> None:
-    """Directions that the motion did not determine must be where the device has them."""
+def _refuse_undetermined_changes(estimate: Estimate, present: Affine, present_gyro: Affine) -> None:
+    """Refuse changes in directions that the motion did not determine."""
     inverse = np.linalg.inv(present.matrix)
     soft_iron = 0.5 * (inverse + inverse.T) / np.cbrt(np.linalg.det(inverse))
-    held = _named(soft_iron, present.offset, present_gyro.offset)
-    found = _named(estimate.soft_iron, estimate.hard_iron_gauss, estimate.gyro_bias_rad_s)
-    sigma = dict(zip(held, estimate.sigma.tolist(), strict=True))
-    blind = {name for text in estimate.observability.unobservable for name in text.split(" + ")}
-    for name in sorted(blind & held.keys()):
-        if abs(found[name] - held[name]) > HELD_WITHIN_SIGMA * sigma[name] + HELD_WITHIN:
+    current = _numbers_by_name(soft_iron, present.offset, present_gyro.offset)
+    estimated = _numbers_by_name(
+        estimate.soft_iron, estimate.hard_iron_gauss, estimate.gyro_bias_rad_s
+    )
+    sigma = dict(zip(current, estimate.sigma.tolist(), strict=True))
+    undetermined = {
+        name for text in estimate.observability.unobservable for name in text.split(" + ")
+    }
+    for name in sorted(undetermined & current.keys()):
+        if abs(estimated[name] - current[name]) > HELD_WITHIN_SIGMA * sigma[name] + HELD_WITHIN:
             raise UnwritableError(
-                f"{name} is not determined by the motion and yet moved from {held[name]:.4f} to "
-                f"{found[name]:.4f}"
+                f"{name} is not determined by the motion and yet moved from {current[name]:.4f} to "
+                f"{estimated[name]:.4f}"
             )
 
 
-def _named(soft_iron: Array, hard_iron_gauss: Array, gyro_bias_rad_s: Array) -> dict[str, float]:
-    """The twelve numbers of an estimate by name, in the order of its covariance."""
+def _numbers_by_name(
+    soft_iron: Array, hard_iron_gauss: Array, gyro_bias_rad_s: Array
+) -> dict[str, float]:
+    """The twelve parameters of an estimate by name, in the order of its covariance."""
     upper = soft_iron[np.triu_indices(3)]
     numbers = np.concatenate([upper, hard_iron_gauss, gyro_bias_rad_s])
     return dict(zip(_NAMES, numbers.tolist(), strict=True))
 
 
 def refuse_unsafe(values: Mapping[int, Values]) -> None:
-    """Raise UnwritableError where registers 23 and 84 hold what is refused whoever asks for it."""
+    """Raise UnwritableError if registers 23 and 84 exceed the hard limits."""
     mag, gyro = (_affine(values, number) for number in (MAG, GYRO))
     _refuse_out_of_bounds(mag, gyro.offset)
 

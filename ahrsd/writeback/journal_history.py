@@ -1,20 +1,20 @@
-"""What a device's journal amounts to: kinds and times of its records, transactions, the summary.
+"""Summary of a device's journal: kinds and times of its records, transactions, history.
 
 `JournalHistory` is the summary: the open transaction, the budget, the locks. It is built record by
 record, in the same way from a file at the start and from each new record later, so a restart can
-never change what the write-back believes.
+never change the state of the write-back.
 
-**Times** (`Stamp`): a proven restart, a time that passed. A record is stamped by three clocks. The
-wall clock can be wrong by any amount and can be set at any moment. The time since the host's boot
-(CLOCK_BOOTTIME) cannot be set, but only means something within one boot, which the boot id names.
-The device's own time since its start-up falls when, and only when, the device restarts.
+**Times** (`Stamp`) prove a restart and give the age of a record. A record is stamped by three
+clocks. The wall clock can be wrong by any amount and can be set at any moment. The time since the
+host's boot (CLOCK_BOOTTIME) cannot be set, but is only valid within one boot, identified by the
+boot id. The device's own time since its start-up falls if, and only if, the device restarts.
 
 * A restart of the device is proven within one boot of the host by boottime and the device's time,
-  across boots by the device's time alone. The wall clock is never asked.
-* How long ago a budgeted write was is read cautiously: the least that the clocks leave possible.
-  Within one boot boottime says it, and a wall clock that shows less makes it less. Across boots the
-  host has been up at least since its boot, and the wall clock counts less `WALL_ERROR_S`, and only
-  where both of its readings are of this age (a computer without a battery starts in 1970 or 2000).
+  across boots by the device's time alone. The wall clock is never used.
+* The age of a budgeted write is a lower bound from all clocks. Within one boot it is boottime,
+  reduced if the wall clock shows less. Across boots the host has been up at least since its boot,
+  and the wall clock counts less `WALL_ERROR_S`, and only if both of its readings are plausible (a
+  computer without a battery starts in 1970 or 2000).
 
 A record without boot id is of another boot: old journals and recordings have none.
 """
@@ -32,15 +32,15 @@ from drivers.vn100.registers import Profile, Unit, Values, profile_of, register_
 # -- Times of records ------------------------------------------------------------------------------
 
 
-PLAUSIBLE_FROM_S: Final = 1577836800.0  # 2020: an earlier wall clock was never set
-WALL_ERROR_S: Final = 7500.0  # an hour behind then and an hour ahead now, and some minutes
-LATENCY_S: Final = 0.5  # what a message of the device may take to get here
-CLOCK_RATE: Final = 1e-3  # how much slower or faster than the host a device's clock may run
+PLAUSIBLE_FROM_S: Final = 1577836800.0  # 2020: a wall clock before that was never set
+WALL_ERROR_S: Final = 7500.0  # one hour slow then and one hour fast now, plus some minutes
+LATENCY_S: Final = 0.5  # longest delay of a message from the device
+CLOCK_RATE: Final = 1e-3  # largest relative error of a device's clock against the host's
 
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """One moment by every clock that was there; None or "": not known.
+    """One moment by all available clocks; None or "": unknown.
 
     boot_s:   time since the host's boot `boot_id`
     device_s: the device's own time since its start-up, at most: its newest sample
@@ -53,13 +53,13 @@ class Stamp:
 
     @staticmethod
     def of(facts: Mapping[str, Any]) -> Stamp:
-        """From a journal record, whatever is in it."""
+        """From a journal record; missing or invalid values become unknown."""
         boot_id = facts.get("boot_id")
         return Stamp(
-            wall_s=_number(facts.get("wall_s")),
+            wall_s=_finite_or_none(facts.get("wall_s")),
             boot_id=boot_id if isinstance(boot_id, str) else "",
-            boot_s=_number(facts.get("boot_s")),
-            device_s=_number(facts.get("device_s")),
+            boot_s=_finite_or_none(facts.get("boot_s")),
+            device_s=_finite_or_none(facts.get("device_s")),
         )
 
     def facts(self) -> dict[str, Any]:
@@ -77,19 +77,19 @@ UNKNOWN: Final = Stamp()
 
 @dataclass(frozen=True, slots=True)
 class Now:
-    """The present by the same clocks, and how long ago this run last read the whole journal."""
+    """The present by the same clocks; `run_s`: time since this run read the whole journal."""
 
     stamp: Stamp
     run_s: float = 0.0
 
 
-def _number(value: object) -> float | None:
+def _finite_or_none(value: object) -> float | None:
     plain = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if plain and math.isfinite(value) else None  # type: ignore[arg-type]
 
 
-def same_boot_s(record: Stamp, now: Stamp) -> float | None:
-    """The age of the record by boottime; None where it is of another boot, or claims to be ahead"""
+def age_by_boottime_s(record: Stamp, now: Stamp) -> float | None:
+    """The age of the record by boottime; None if it is of another boot, or in the future."""
     if not record.boot_id or record.boot_id != now.boot_id:
         return None
     if record.boot_s is None or now.boot_s is None or now.boot_s < record.boot_s:
@@ -100,50 +100,50 @@ def same_boot_s(record: Stamp, now: Stamp) -> float | None:
 def restarted_since(record: Stamp, now: Stamp, uptime_s: float | None) -> bool:
     """Whether a device with this time since its start-up must have restarted after the record.
 
-    A device whose clock is a thousandth slow is not taken for one that restarted. A time that fell
-    to more than has passed since the record is a clock that jumped, and no restart.
+    Allows for a device clock that is slow by `CLOCK_RATE`. A time that fell, but to more than the
+    age of the record, is a clock that jumped and no restart.
     """
     if uptime_s is None or not math.isfinite(uptime_s) or uptime_s < 0.0:
         return False
     fell = record.device_s is not None and uptime_s < record.device_s - LATENCY_S
     if not record.boot_id or record.boot_id != now.boot_id:
         return fell
-    age_s = same_boot_s(record, now)
+    age_s = age_by_boottime_s(record, now)
     if age_s is None:
         return False
     started_later = uptime_s < age_s * (1.0 - CLOCK_RATE) - LATENCY_S
     return started_later or (fell and uptime_s <= age_s * (1.0 + CLOCK_RATE) + LATENCY_S)
 
 
-def passed_s(records: Sequence[Stamp], now: Now) -> list[float]:
-    """For each record, oldest first, the least time that must have passed since; at least 0.
+def least_ages_s(records: Sequence[Stamp], now: Now) -> list[float]:
+    """For each record, oldest first, a lower bound of its age; at least 0.
 
-    A record is at least as old as every record behind it.
+    A record is at least as old as every later record.
     """
     least: list[float] = []
     newest_s = 0.0
     for record in reversed(records):
-        newest_s = max(newest_s, _passed_s(record, now))
+        newest_s = max(newest_s, _least_age_s(record, now))
         least.append(newest_s)
     return least[::-1]
 
 
-def _passed_s(record: Stamp, now: Now) -> float:
+def _least_age_s(record: Stamp, now: Now) -> float:
     wall_s = None
     if plausible(record.wall_s) and plausible(now.stamp.wall_s):
         wall_s = (now.stamp.wall_s or 0.0) - (record.wall_s or 0.0)
     if record.boot_id and record.boot_id == now.stamp.boot_id:
-        age_s = same_boot_s(record, now.stamp)
+        age_s = age_by_boottime_s(record, now.stamp)
         known = [s for s in (age_s, wall_s) if s is not None]
         return min(known) if age_s is not None else 0.0
     up_s = 0.0
-    if now.stamp.boot_id:  # what this run writes has its boot id: this was there before
+    if now.stamp.boot_id:  # records of this run have its boot id, so this one is older
         up_s = now.run_s if not record.boot_id else now.stamp.boot_s or 0.0
     return max(up_s, 0.0 if wall_s is None else wall_s - WALL_ERROR_S)
 
 
 def plausible(wall_s: float | None) -> bool:
-    """Whether somebody has set this wall clock."""
+    """Whether this wall clock was ever set."""
     return wall_s is not None and wall_s >= PLAUSIBLE_FROM_S
 
 
@@ -205,11 +205,11 @@ OF_OTHERS: Final = (  # say nothing about a transaction
 
 @dataclass(frozen=True, slots=True)
 class Transaction:
-    """What a write changes. `old` and `new` have the same registers.
+    """A write of registers. `old` and `new` have the same registers.
 
-    snapshot: every configuration register as the user has it, before the daemon touched anything
-    approver: who said yes: "operator" or "auto"
-    model:    of the device; empty in records from before it was kept
+    snapshot: every configuration register with the user's value before the daemon changed any
+    approver: "operator" or "auto"
+    model:    of the device; empty in old records, which do not have it
     """
 
     id: str
@@ -232,7 +232,7 @@ class Transaction:
         return profile_of(self.firmware)
 
     def facts(self) -> dict[str, Any]:
-        """As the journal holds it, with lines that a person can type to go back."""
+        """Facts for the journal, with the lines that restore the old values by hand."""
         return {
             "txn": self.id,
             "serial": self.serial,
@@ -249,7 +249,7 @@ class Transaction:
 
     @staticmethod
     def from_facts(facts: Mapping[str, Any]) -> Transaction:
-        """Back from a PREPARED record; KeyError, TypeError or ValueError where it is not one."""
+        """From a PREPARED record; KeyError, TypeError or ValueError if it is not one."""
         return Transaction(
             id=str(facts["txn"]),
             serial=int(facts["serial"]),
@@ -293,20 +293,20 @@ _HOLDS_OLD: Final = (
 
 
 class JournalRecord(Protocol):
-    """One record, as the journal gives it back."""
+    """One record, as read from the journal."""
 
     @property
     def kind(self) -> str:
-        """One of `RecordKind`; others (of other commands) are passed over."""
+        """One of `RecordKind`; others (of other commands) are ignored."""
 
     @property
     def facts(self) -> Mapping[str, Any]:
-        """What was recorded; `Stamp` reads the time from it."""
+        """The recorded facts; `Stamp` reads the time from them."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoredRecord:
-    """A journal record out of `JournalOpened`."""
+    """A journal record from `JournalOpened`."""
 
     kind: str
     facts: dict[str, Any]
@@ -319,15 +319,15 @@ class StoredRecord:
 
 @dataclass(frozen=True, slots=True)
 class JournalHistory:
-    """A journal, summed up.
+    """Summary of a journal.
 
-    open:      the transaction that no record ended yet, the kind and time of its newest record
+    open:      the transaction that no record has ended; `last`, `last_at`: its newest record
     newest_at: the time of the newest record of any kind
-    rollbacks: since the last proven write or unlock; each says that a calibration was bad
-    holds:     what the device must hold after the newest transaction, where that is known
-    values:    registers and values that a write found or meant, also one by hand
-    trials:    registers and values that a write meant, and that no save of ours nor a person kept
-    broken:    the kind of a record that could not be understood; then nothing may be written
+    rollbacks: since the last proven write or unlock; each means that a calibration was bad
+    holds:     what the device must hold after the newest transaction, if known
+    values:    registers with old and new values of writes, including those by hand
+    trials:    registers with new values of writes that were neither saved nor kept by a person
+    broken:    the kind of a record that could not be parsed; then nothing may be written
     """
 
     open: Transaction | None = None
@@ -348,7 +348,7 @@ class JournalHistory:
 
     @staticmethod
     def of(records: Iterable[JournalRecord]) -> JournalHistory:
-        """The history that these records tell, oldest first."""
+        """The history of these records, oldest first."""
         history = JournalHistory()
         for record in records:
             if record.kind in RecordKind.__members__:
@@ -364,24 +364,26 @@ class JournalHistory:
         at = Stamp.of(facts)
         now = replace(self, newest_at=at)
         if kind is RecordKind.CLIENT_WRITES:  # in RAM: the next start may bring either value
-            return now._with_values(facts)._not_sure_of(facts)._without_trials(facts)
+            return now._with_values(facts)._without_holds_of(facts)._without_trials(facts)
         if kind is RecordKind.LOCKED:
             return replace(now, locked=str(facts.get("reason", "no reason given")))
         if kind is RecordKind.UNLOCKED:
             return replace(now, locked=None, torn=False, rollbacks=0, trials=())
         if kind is RecordKind.PREPARED:
             try:
-                return now._begun(Transaction.from_facts(facts), at)._with_values(facts)
+                return now._with_open_transaction(Transaction.from_facts(facts), at)._with_values(
+                    facts
+                )
             except (KeyError, TypeError, ValueError):
                 return replace(now, broken=kind.value)
-        return now._counted(kind, facts, at)._with_transaction_at(kind, facts, at)
+        return now._with_counts(kind, facts, at)._with_transaction_at(kind, facts, at)
 
-    def tried(self, number: int, values: Values) -> bool:
-        """Whether a write meant this register to have these values, and nothing kept them."""
+    def is_trial_value(self, number: int, values: Values) -> bool:
+        """Whether a write set this register to these values, and they were not kept."""
         return any(n == number and same(n, known, values) for n, known in self.trials)
 
-    def knows(self, number: int, values: Values) -> bool:
-        """Whether a record has these values of this register, as found or as meant."""
+    def has_value(self, number: int, values: Values) -> bool:
+        """Whether a record has these values of this register, as old or new ones."""
         return any(n == number and same(n, known, values) for n, known in self.values)
 
     def _with_values(self, facts: Mapping[str, Any]) -> JournalHistory:
@@ -395,29 +397,29 @@ class JournalHistory:
             return self
         return replace(self, values=tuple(dict.fromkeys((*self.values, *found)))[-TIMES_KEPT:])
 
-    def _begun(self, transaction: Transaction, at: Stamp) -> JournalHistory:
-        """With this transaction open. KeyError or ValueError where its values are no registers'."""
+    def _with_open_transaction(self, transaction: Transaction, at: Stamp) -> JournalHistory:
+        """With this transaction open. KeyError or ValueError if its values do not fit registers."""
         changed = [(n, v) for n, v in transaction.new.items() if not same(n, v, transaction.old[n])]
-        trials = (*self.trials, *((n, v) for n, v in changed if not self.tried(n, v)))
+        trials = (*self.trials, *((n, v) for n, v in changed if not self.is_trial_value(n, v)))
         return replace(
             self, open=transaction, last=RecordKind.PREPARED, last_at=at, holds=None,
             trials=trials[-TIMES_KEPT:],
         )  # fmt: skip
 
     def _without_trials(self, facts: Mapping[str, Any]) -> JournalHistory:
-        """Somebody wrote these values: they are that person's, or program's."""
+        """Another program or person wrote these values: they are no trial values of ours."""
         try:
-            return replace(self, trials=_without(self.trials, _from_json(facts["new"])))
+            return replace(self, trials=_drop_kept(self.trials, _from_json(facts["new"])))
         except (KeyError, TypeError, ValueError, AttributeError):
             return self
 
-    def _not_sure_of(self, facts: Mapping[str, Any]) -> JournalHistory:
+    def _without_holds_of(self, facts: Mapping[str, Any]) -> JournalHistory:
         written = {str(number) for number in facts.get("new", ())}
         left = {n: v for n, v in (self.holds or {}).items() if str(n) not in written}
         return replace(self, holds=left or None)
 
-    def _counted(self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp) -> JournalHistory:
-        """Budgets and rollbacks."""
+    def _with_counts(self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp) -> JournalHistory:
+        """With budgets and rollbacks updated."""
         changes: dict[str, Any] = {}
         if kind in _TOUCHED_RAM and self.last is RecordKind.PREPARED:
             changes["ram_writes_at"] = (*self.ram_writes_at, at)[-TIMES_KEPT:]
@@ -439,13 +441,13 @@ class JournalHistory:
     def _with_transaction_at(
         self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp
     ) -> JournalHistory:
-        """Where the open transaction stands; a record of another one says nothing about it."""
+        """With the state of the open transaction updated; ignores records of another one."""
         if self.open is None or facts.get("txn", self.open.id) != self.open.id:
             return self
         holds, trials = self.holds, self.trials
         if kind in _HOLDS_NEW:
             holds = self.open.new
-            trials = _without(trials, self.open.new)
+            trials = _drop_kept(trials, self.open.new)
         elif kind in _HOLDS_OLD:
             saved = kind is RecordKind.REVERTED and self.last in (
                 RecordKind.FLASH_SENT,
@@ -459,14 +461,14 @@ class JournalHistory:
         )
 
 
-def _without(
+def _drop_kept(
     trials: Iterable[tuple[int, Values]], kept: Mapping[int, Values]
 ) -> tuple[tuple[int, Values], ...]:
     return tuple((n, v) for n, v in trials if n not in kept or not same(n, kept[n], v))
 
 
-def of_another_device(records: Iterable[JournalRecord], serial: int) -> str:
-    """Which record is of a device with another serial number; empty where none is."""
+def find_record_of_other_device(records: Iterable[JournalRecord], serial: int) -> str:
+    """Which record is of a device with another serial number; empty if none is."""
     for number, record in enumerate(records, start=1):
         device = record.facts.get("device")
         theirs = record.facts.get(

@@ -1,19 +1,19 @@
-"""The one gate: which command may become bytes, by mode and purpose.  Everything else may not.
+"""The only gate: which commands may be sent, by mode and purpose. No other command may.
 
 | purpose | who | from mode |
 |---|---|---|
 | READ | identification, configuration, checks | observe |
-| STREAM | output set up for the session and put back | observe, with `configure_stream` |
+| STREAM | output set up for the session and restored | observe, with `configure_stream` |
 | STAGE | a transaction writes registers 23 and 84 in RAM | stage |
-| ROLL_BACK | a transaction puts them back | stage |
-| SAVE | session settings put back (with `configure_stream`), then VNWNV | commit |
-| CLIENT | what a program on a shared port asked for (`sharing.arbiter`) | passive |
+| ROLL_BACK | a transaction restores them | stage |
+| SAVE | session settings restored (with `configure_stream`), then VNWNV | commit |
+| CLIENT | command of a program on a shared port (`sharing.arbiter`) | passive |
 | CLIENT_CALIBRATION | the same, of the owner with `calibration_writes = "pass"` | stage |
 
-A client's settings, in RAM for its session, are put back for a save like the daemon's own.
+A client's settings, in RAM for its session, are restored for a save like the daemon's own.
 
-A mode is a ceiling that a person sets; what the machine does below it is decided elsewhere, and
-the interlock is asked there. This function is total: a command that no row names is refused.
+A mode is an upper limit that a person sets. What the write-back does within it, and the interlock,
+are decided elsewhere. The function is total: a command that no row names is refused.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from drivers.vn100.commands import Command, Pause, Read, Word, Write
 from drivers.vn100.registers import REGISTERS, SESSION_SETTINGS
 
 CALIBRATION: Final = (23, 84)
-GUARDED: Final = (5, 23, 25, 26, 43, 44, 74, 84)  # for no client: line rate and calibration
-PASSABLE: Final = tuple(n for n in GUARDED if n != 5)  # but for one whose share says so
+GUARDED: Final = (5, 23, 25, 26, 43, 44, 74, 84)  # not for clients: line rate and calibration
+PASSABLE: Final = tuple(n for n in GUARDED if n != 5)  # unless the client's share lets them pass
 
 NEEDS: Final[dict[Purpose, Mode]] = {
     Purpose.READ: Mode.OBSERVE,
@@ -76,7 +76,7 @@ def permitted(
     if mode < NEEDS[purpose] or (purpose is Purpose.STREAM and not configure_stream):
         return False
     if isinstance(command, Write):
-        if purpose is Purpose.SAVE:  # put back before VNWNV saves all
+        if purpose is Purpose.SAVE:  # restored before VNWNV saves all of RAM
             ours = SESSION_SETTINGS if configure_stream else ()
             return command.register in ours or command.register in set(clients) - set(GUARDED)
         return command.register in WRITES[purpose]

@@ -1,8 +1,8 @@
-"""When a write is allowed: what a person sets, and the reasons that hold a write back now.
+"""When a write is allowed: the policy that a person sets, and the present obstacles to a write.
 
-**Safeguards**: what must be true of device, vehicle and journal for anything to be sent. They fail
-closed: what is not known, not fresh or not readable counts as no. Whether the vehicle stands still
-(`Stillness`) is judged from its own samples.
+**Safeguards**: conditions on device, vehicle and journal for anything to be sent. They fail closed:
+what is unknown, stale or unreadable counts as a no. Whether the vehicle is at rest (`Stillness`) is
+judged from its own samples.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from ahrsd.calibration import Estimate
 from ahrsd.events import GateResult
 from ahrsd.samples import Array, SampleBlock
 from ahrsd.writeback.composition import GYRO, MAG, Proposal
-from ahrsd.writeback.journal_history import JournalHistory, Now, passed_s
+from ahrsd.writeback.journal_history import JournalHistory, Now, least_ages_s
 from ahrsd.writeback.states import Mode, Purpose
 from ahrsd.writeback.trial import TrialPolicy
 from drivers.vn100.commands import Command, Identity, Word, Write
 from drivers.vn100.registers import Values, same
 
-# -- What a person sets, and what holds a write back -----------------------------------------------
+# -- Policy and budgets ----------------------------------------------------------------------------
 
 
 DAY_S: Final = 86400.0
 CLEAR_SIGMAS: Final = 4.0
-VERDICT_AGE_S: Final = 600.0  # a save must be of what is true now, as an approval must
+VERDICT_AGE_S: Final = 600.0  # a save, like an approval, needs a recent verdict
 
 
 @dataclass(frozen=True, slots=True)
 class StillPolicy:
-    """Our own proof that the vehicle stands, for VNWNV: it starves the attitude filter.
+    """Conditions of rest for VNWNV, during which the device's attitude filter gets no data.
 
-    gyro_rad_s, accel_m_s2: rate less bias, and standard deviation of the specific force, below
-    which it rests [0.01, 0.05]; duration_s: for so long [3 s]; max_age_s: the newest sample may be
-    this old when VNWNV goes out, because the output is paused before it [2 s]
+    gyro_rad_s, accel_m_s2: limits on the rate less bias, and on the standard deviation of the
+    specific force [0.01, 0.05]; duration_s: for this long [3 s]; max_age_s: largest age of the
+    newest sample when VNWNV is sent, because the output is paused before it [2 s]
     """
 
     gyro_rad_s: float = 0.01
@@ -49,27 +49,27 @@ class StillPolicy:
 
 @dataclass(frozen=True, slots=True)
 class WriteBackPolicy:
-    """What a person sets about writing. The defaults write nothing.
+    """Settings of the write-back. The defaults write nothing.
 
-    mode:              ceiling of what may be sent [OBSERVE]
+    mode:              upper limit of what may be sent [OBSERVE]
     configure_stream:  session settings (registers 6, 7, 75 to 77) may be changed [False]
-    approval:          who says yes: "operator" types the candidate's id, "auto" needs no one and
+    approval:          who approves: "operator" types the candidate's id, "auto" needs no one and
                        is limited to `max_change_auto_deg` [operator]
-    armed_at_start:    begin a run armed; else a person's word in that run must come first: `arm`,
-                       or an approval [False]
-    commit_unattended: flash without an operator's yes [False]
-    serial:            write only to this device; None: the first one seen in this run [None]
+    armed_at_start:    start a run armed; else an operator must send `arm` or an approval in that
+                       run first [False]
+    commit_unattended: write flash without an operator's approval [False]
+    serial:            write only to this device; None: the first one of this run [None]
     keep_on_stop:      leave unsaved values in RAM when the daemon stops [False: they are undone]
     min_change_deg, min_gyro_change_rad_s: smaller changes are not worth a write [0.5, 0.002]
     max_change_auto_deg: larger changes of heading need an operator [5]
     min_interval_s, ram_writes_per_day, flash_writes_per_day, flash_writes_lifetime: budget
     cooldown_s:        no write for this long after a rollback [86400]
-    margin_after_rollback: and then only for changes so many times as large [2]
+    margin_after_rollback: factor on the required change after a rollback [2]
     rollbacks_to_lock: so many in a row lock the write-back [2]
-    interlock_max_age_s: an older word of the vehicle counts as no [1]
+    interlock_max_age_s: an older interlock signal counts as no [1]
     reply_timeout_s:   how long one reply may take [0.4]
-    recheck_s:         who answers and what it holds is read again so often, beside the running
-                       output, in every mode but passive [10 s]
+    recheck_s:         interval of reading identity and registers again while the output runs, in
+                       every mode but passive [10 s]
     """
 
     mode: Mode = Mode.OBSERVE
@@ -97,12 +97,12 @@ class WriteBackPolicy:
 
 
 def margin(policy: WriteBackPolicy, history: JournalHistory) -> float:
-    """How much larger a change or a gain must be than usual: more after a rollback."""
+    """Factor on the required change or gain: larger after a rollback."""
     return policy.margin_after_rollback if history.rollbacks else 1.0
 
 
 def worth_writing(policy: WriteBackPolicy, history: JournalHistory, proposal: Proposal) -> bool:
-    """Whether the change is large enough."""
+    """Whether the change is large enough for a write."""
     factor = margin(policy, history)
     return (
         proposal.heading_change_deg >= factor * policy.min_change_deg
@@ -111,9 +111,9 @@ def worth_writing(policy: WriteBackPolicy, history: JournalHistory, proposal: Pr
 
 
 def contradicts(policy: WriteBackPolicy, proposal: Proposal, estimate: Estimate) -> bool:
-    """Whether an estimate clearly speaks against the values that are in force.
+    """Whether an estimate clearly contradicts the values in force.
 
-    By twice what is worth a write, and beyond its own uncertainty.
+    By twice the change that is worth a write, and beyond its own uncertainty.
     """
     heading_deg = max(2.0 * policy.min_change_deg, CLEAR_SIGMAS * estimate.heading_sigma_deg)
     gyro_rad_s = max(
@@ -125,18 +125,18 @@ def contradicts(policy: WriteBackPolicy, proposal: Proposal, estimate: Estimate)
 def ram_budget(
     policy: WriteBackPolicy, history: JournalHistory, now: Now, *, again: bool = False
 ) -> list[str]:
-    """Why RAM must not be written now; empty where it may. Times as `passed_s` reads them:
-    no clock that was wrong, or was set, makes one longer.
+    """Why RAM must not be written now; empty if it may. Ages by `least_ages_s`: a clock that
+    was wrong or was set cannot make one longer.
 
-    again: the values were in RAM just now and were undone for a client's save, so the pause between
-           two writes is not waited for; the write counts in the day's number all the same
+    again: the values were in RAM just now and were undone for a client's save, so the minimum
+           interval is not required; the write still counts in the day's number
     """
     reasons: list[str] = []
     if history.locked is not None:
         reasons.append(f"locked: {history.locked}; unlock to go on")
     if history.broken is not None:
         reasons.append(f"the journal's {history.broken} record cannot be understood")
-    *writes_s, _ = passed_s((*history.ram_writes_at, history.newest_at), now)
+    *writes_s, _ = least_ages_s((*history.ram_writes_at, history.newest_at), now)
     if writes_s and not again and writes_s[-1] < policy.min_interval_s:
         reasons.append(
             f"the last write was {writes_s[-1]:.0f} s ago, wait for {policy.min_interval_s:.0f} s"
@@ -145,7 +145,7 @@ def ram_budget(
     if today >= policy.ram_writes_per_day:
         reasons.append(f"{today} RAM writes in a day, limit {policy.ram_writes_per_day}")
     if history.rollback_at is not None:
-        since_s, _ = passed_s((history.rollback_at, history.newest_at), now)
+        since_s, _ = least_ages_s((history.rollback_at, history.newest_at), now)
         if since_s < policy.cooldown_s:
             reasons.append(
                 f"a rollback was {since_s / 3600.0:.1f} h ago, wait for "
@@ -155,9 +155,9 @@ def ram_budget(
 
 
 def flash_budget(policy: WriteBackPolicy, history: JournalHistory, now: Now) -> list[str]:
-    """Why flash must not be written now; empty where it may."""
+    """Why flash must not be written now; empty if it may."""
     reasons: list[str] = []
-    *flashes_s, _ = passed_s((*history.flashes_at, history.newest_at), now)
+    *flashes_s, _ = least_ages_s((*history.flashes_at, history.newest_at), now)
     today = sum(passed < DAY_S for passed in flashes_s)
     if today >= policy.flash_writes_per_day:
         reasons.append(f"{today} flash writes in a day, limit {policy.flash_writes_per_day}")
@@ -168,48 +168,48 @@ def flash_budget(policy: WriteBackPolicy, history: JournalHistory, now: Now) -> 
     return reasons
 
 
-# -- Whether the vehicle stands still --------------------------------------------------------------
+# -- Rest of the vehicle ---------------------------------------------------------------------------
 
 
-_SLOTS_PER_WINDOW = 30  # the window is kept as sums of so many parts: memory does not grow
+_SLOTS_PER_WINDOW = 30  # the window is stored as sums over this many parts: bounded memory
 
 
 class Stillness:
-    """A window of `duration_s` over rate (less bias) and specific force.
+    """Whether the vehicle is at rest, by rate (less bias) and force in a window of `duration_s`.
 
-    Without an accelerometer, without samples, after a gap or with a rate over the limit it is not
-    still.
+    It does not count as at rest without an accelerometer, without samples, after a gap or with a
+    rate over the limit.
     """
 
     def __init__(self, policy: StillPolicy) -> None:
         self._policy = policy
-        self._since_s: float | None = None  # device time of the first sample of the still run
+        self._since_s: float | None = None  # device time of the first sample at rest
         self._device_s = self._host_s = -np.inf
         self._slots: deque[tuple[float, int, Array, Array]] = deque()
 
     def reset(self) -> None:
-        """Nothing is known any more."""
+        """Forget the window."""
         self._since_s = None
         self._slots.clear()
 
     def update(self, block: SampleBlock, gyro_bias_rad_s: Array) -> None:
-        """Take N further samples of the raw sensor."""
+        """Take samples of the raw sensor."""
         if not len(block):
             return
         if block.gap_before:
             self.reset()
         rate = np.linalg.norm(block.gyro_b_rad_s - gyro_bias_rad_s, axis=1)
-        quiet = (rate < self._policy.gyro_rad_s) & np.isfinite(block.accel_b_m_s2).all(axis=1)
-        loud = np.flatnonzero(~quiet)
-        if len(loud):
+        at_rest = (rate < self._policy.gyro_rad_s) & np.isfinite(block.accel_b_m_s2).all(axis=1)
+        moving = np.flatnonzero(~at_rest)
+        if len(moving):
             self.reset()
-        first = int(loud[-1]) + 1 if len(loud) else 0
+        first = int(moving[-1]) + 1 if len(moving) else 0
         if first < len(block):
             self._extend(block.time_s[first:], block.accel_b_m_s2[first:])
         self._device_s, self._host_s = float(block.time_s[-1]), float(block.host_s[-1])
 
-    def why_not(self, host_s: float) -> str | None:
-        """Why the vehicle does not count as still at this instant, None where it does."""
+    def find_motion(self, host_s: float) -> str | None:
+        """Why the vehicle does not count as at rest at this instant; None if it does."""
         policy = self._policy
         age_s = host_s - self._host_s
         if not age_s <= policy.max_age_s:
@@ -236,48 +236,48 @@ class Stillness:
             self._slots.popleft()
 
     def _spread(self) -> float:
-        """Standard deviation of the window, of the worst axis."""
+        """Standard deviation over the window, of the worst axis."""
         count = sum(slot[1] for slot in self._slots)
         mean = np.sum([slot[2] for slot in self._slots], axis=0) / count
         variance = np.sum([slot[3] for slot in self._slots], axis=0) / count - mean**2
         return float(np.sqrt(max(float(variance.max()), 0.0)))
 
 
-# -- What must be true -----------------------------------------------------------------------------
+# -- Safeguards ------------------------------------------------------------------------------------
 
 
 HSI_CONTROL, HSI_APPLIED = 44, 3
-UNEXAMINED_S = 2.0  # samples that the estimate has not seen yet may hold a step
-SAVE_CHECKS_S = 0.5  # what stands before VNWNV reads every register, and no sample comes meanwhile
-SAVE_CHECKS_PER_ASKING = 6.0  # four to five times the answers of asking it who it is
-ASKINGS = 5  # of so many the quickest had no late answer; more, and a line that slowed is not seen
+UNEXAMINED_S = 2.0  # samples not yet in the estimate may contain a step
+SAVE_CHECKS_S = 0.5  # checks before VNWNV read every register, without samples meanwhile
+SAVE_CHECKS_PER_ASKING = 6.0  # these checks need four to five times the replies of a look
+ASKINGS = 5  # looks considered: the quickest had no late reply; more would hide a slower line
 NOT_ARMED = "nobody has armed this run: `ahrsd operator arm`"
 
 
 class Safeguards:
-    """Device, vehicle and journal as they were last told; each question takes the present time."""
+    """The last known state of device, vehicle and journal; questions take the present time."""
 
     def __init__(self, policy: WriteBackPolicy) -> None:
         self.policy = policy
         self.stillness = Stillness(policy.still)
         self.journal_ok = False
-        self.journal_read = False  # that of the device that was read
+        self.journal_read = False  # the journal of the device that was read
         self.stopping = False
         self.armed = policy.armed_at_start
         self.gates: tuple[GateResult, ...] = ()
         self.flash_gates: tuple[GateResult, ...] = ()
         self.doubt_s = float("-inf")  # host time of the last doubt about what is in force
         self.judged_s = float("-inf")  # host time of the newest verdict's samples
-        self.void = ""  # why the transaction's values hold no more
-        self.disagrees = ""  # how the newest estimate differs from them, or a gate does
+        self.void = ""  # why the transaction's values are void
+        self.disagrees = ""  # how the newest estimate, or a gate, contradicts them
         self.proof_waits = ""  # why they must be proven again
         self.sampled_s: float | None = None  # host time of the newest sample
         self.examined_s: float | None = None  # and of the newest one in the estimate
-        self._asking_s: deque[float] = deque(maxlen=ASKINGS)  # until it had said who it is
+        self._look_durations_s: deque[float] = deque(maxlen=ASKINGS)  # durations of looks
         self.save_from_s = float("-inf")  # when the save was decided
-        self.theirs: frozenset[int] = frozenset()  # registers that others changed in RAM
-        self.client_wrote: dict[int, Values] = {}  # and held before a client wrote and did not save
-        self.client_registers: frozenset[int] = frozenset()  # and those of clients' sessions
+        self.changed_by_others: frozenset[int] = frozenset()  # registers, in RAM
+        self.client_wrote: dict[int, Values] = {}  # values before unsaved client writes
+        self.client_registers: frozenset[int] = frozenset()  # of clients' sessions
         self._serial = policy.serial
         self._limits: list[str] = ["no device yet"]
         self._is_ours = False
@@ -286,20 +286,20 @@ class Safeguards:
 
     @property
     def mode(self) -> Mode:
-        """The policy's mode, observe at most while the device or its journal is in doubt."""
+        """The policy's mode, at most observe while the device or its journal is in doubt."""
         return min(self.policy.mode, Mode.OBSERVE) if self._limits else self.policy.mode
 
-    def no_device(self, why: str) -> None:
-        """Nothing can be asked, so nothing can be written."""
+    def set_no_device(self, why: str) -> None:
+        """There is no device, so nothing can be written."""
         self._limits, self._is_ours = [why], False
 
     def bind(
         self, identity: Identity, registers: Mapping[int, Values], journal_readable: bool
     ) -> None:
-        """Judge a device that was identified and read; the first one is the one to write to."""
+        """Check a device that was identified and read; writes are bound to the first one."""
         self.journal_ok = self.journal_read = journal_readable
-        self.gates = self.flash_gates = ()  # what was judged before is of before
-        self._asking_s.clear()
+        self.gates = self.flash_gates = ()  # earlier verdicts no longer count
+        self._look_durations_s.clear()
         hsi = registers.get(HSI_CONTROL)
         self._hsi_applied = hsi is None or hsi[1] == HSI_APPLIED
         self._serial = identity.serial if self._serial is None else self._serial
@@ -316,38 +316,40 @@ class Safeguards:
         if not journal_readable:
             self._limits.append("the journal cannot be read; see its error")
 
-    def arm(self, armed: bool) -> str:
-        """Whether this run may begin a write or a save; in words."""
+    def set_armed(self, armed: bool) -> str:
+        """Set whether this run may begin a write or a save; returns that in words."""
         self.armed = armed
         return "armed: this run may write" if armed else NOT_ARMED
 
-    def client_writes(self, number: int, before: Values) -> None:
-        """A client wrote this register; what it held before is its own as long as nobody knows."""
+    def record_client_write(self, number: int, before: Values) -> None:
+        """A client wrote this register: store the value before the first such write."""
         self.client_wrote.setdefault(number, before)
 
-    def read_again(self, theirs: frozenset[int], registers: Mapping[int, Values]) -> frozenset[int]:
-        """Registers that others changed, without those that hold what they held before a client."""
+    def update_changed_by_others(
+        self, changed: frozenset[int], registers: Mapping[int, Values]
+    ) -> frozenset[int]:
+        """Set the registers changed by others, except those back at their previous value."""
         returned = {
             n for n, before in self.client_wrote.items() if same(n, before, registers.get(n, ()))
         }
-        self.theirs = theirs - returned
-        left = self.client_wrote.keys() & self.theirs
+        self.changed_by_others = changed - returned
+        left = self.client_wrote.keys() & self.changed_by_others
         self.client_wrote = {n: self.client_wrote[n] for n in left}
-        return self.theirs
+        return self.changed_by_others
 
-    def doubt(self, host_s: float) -> None:
-        """What was judged of samples until now is of before a doubt: nothing is saved by it."""
+    def mark_doubt(self, host_s: float) -> None:
+        """Earlier samples are from before a doubt: no save by their verdict."""
         if self.examined_s is not None:
             self.examined_s = min(self.examined_s, host_s)
         self.flash_gates, self.doubt_s = (), host_s
         self.stillness.reset()
 
-    def hear_interlock(self, safe: bool, host_s: float) -> None:
-        """The vehicle's word."""
+    def set_interlock(self, safe: bool, host_s: float) -> None:
+        """Take the interlock signal."""
         self._interlock = (safe, host_s)
 
-    def interlock_holds(self, host_s: float) -> str:
-        """Why the vehicle does not allow a write now; empty where it does."""
+    def interlock_obstacle(self, host_s: float) -> str:
+        """Why the interlock does not allow a write now; empty if it does."""
         if self._interlock is None:
             return "the vehicle has not said that a write is safe"
         safe, since_s = self._interlock
@@ -357,20 +359,20 @@ class Safeguards:
             return f"the vehicle's word is {host_s - since_s:.1f} s old"
         return ""
 
-    def interlock_broken(self, host_s: float, since_s: float) -> str:
-        """Why what began at `since_s` must end: the vehicle withdrew its word, or fell silent.
+    def interlock_failure(self, host_s: float, since_s: float) -> str:
+        """Why what began at `since_s` must end: the interlock says no, or is stale; empty if not.
 
-        A daemon that has just started gives the vehicle as long to speak as a word lasts.
+        After a start the vehicle has `interlock_max_age_s` to send its first signal.
         """
         begun = self._interlock is None or self._interlock[0]
         if begun and host_s - since_s <= self.policy.interlock_max_age_s:
             return ""
-        return self.interlock_holds(host_s)
+        return self.interlock_obstacle(host_s)
 
-    def write_holds(
+    def write_obstacles(
         self, history: JournalHistory, host_s: float, now: Now, *, again: bool = False
     ) -> list[str]:
-        """Why no write may begin now, but for the approval. `again`: see `policy.ram_budget`."""
+        """Why no write may begin now, apart from the approval. `again`: see `ram_budget`."""
         reasons = list(self._limits)
         if self.policy.mode < Mode.STAGE:
             reasons.append(
@@ -389,19 +391,19 @@ class Safeguards:
                 "wrote and did not save: let it save that, or switch the device off and on"
             )
         reasons += ram_budget(self.policy, history, now, again=again)
-        return reasons + self._always(host_s)
+        return reasons + self._common_obstacles(host_s)
 
-    def again_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
-        """Why what was set aside may not be written again now: its approval must still hold."""
+    def rewrite_obstacles(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
+        """Why values that were set aside may not be written again now."""
         reasons = [word for word in (self.void, self.disagrees) if word]
         if not self.armed:
             reasons.append(NOT_ARMED)
-        reasons += self._old_verdict(host_s)
-        more = self.write_holds(history, host_s, now, again=True)
+        reasons += self._stale_verdict(host_s)
+        more = self.write_obstacles(history, host_s, now, again=True)
         return list(dict.fromkeys([*reasons, *more]))
 
-    def save_holds(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
-        """Why the flash may not be written now."""
+    def save_obstacles(self, history: JournalHistory, host_s: float, now: Now) -> list[str]:
+        """Why flash may not be written now."""
         reasons = [] if self.mode >= Mode.COMMIT else ["only the mode commit may write flash"]
         if not self.armed:
             reasons.append(NOT_ARMED)
@@ -412,43 +414,43 @@ class Safeguards:
         if not self.flash_gates:
             reasons.append("no gate has judged for flash yet")
         reasons += flash_budget(self.policy, history, now)
-        reasons += self._not_as_judged(host_s)
-        if still := self.stillness.why_not(host_s):
+        reasons += self._validity_obstacles(host_s)
+        if still := self.stillness.find_motion(host_s):
             reasons.append(still)
-        return reasons + self._always(host_s)
+        return reasons + self._common_obstacles(host_s)
 
-    def _not_as_judged(self, host_s: float) -> list[str]:
-        """Why what is in force may not be what was judged, or not be right any more."""
+    def _validity_obstacles(self, host_s: float) -> list[str]:
+        """Why the values in force may differ from the judged ones, or be void."""
         reasons = [word for word in (self.void, self.disagrees, self.proof_waits) if word]
-        if self.theirs:
-            which = ", ".join(map(str, sorted(self.theirs)))
+        if self.changed_by_others:
+            which = ", ".join(map(str, sorted(self.changed_by_others)))
             reasons.append(
                 f"somebody else changed register {which} in this run, and a save would make it "
                 "permanent; once it is right, switch the device off and on"
             )
-        return reasons + self._old_verdict(host_s) + self.unexamined()
+        return reasons + self._stale_verdict(host_s) + self.unexamined_obstacles()
 
-    def _old_verdict(self, host_s: float) -> list[str]:
+    def _stale_verdict(self, host_s: float) -> list[str]:
         old_s = host_s - self.judged_s
         return [f"the newest verdict is {old_s:.0f} s old"] if old_s > VERDICT_AGE_S else []
 
-    def asking_took(self, took_s: float) -> None:
-        """The device was asked who it is and what it holds, and answered as it ought to."""
-        self._asking_s.append(took_s)
+    def record_look_duration(self, took_s: float) -> None:
+        """Record how long a successful look took."""
+        self._look_durations_s.append(took_s)
 
     @property
-    def _on_this_line_s(self) -> float:
-        """How long it takes to ask that, where no answer is late; samples wait meanwhile."""
-        return min(self._asking_s, default=0.0)
+    def _quickest_look_s(self) -> float:
+        """Duration of a look without late replies; samples wait meanwhile."""
+        return min(self._look_durations_s, default=0.0)
 
     def save_too_late(self, host_s: float) -> str:
-        """Why what was judged when the save was decided is too old by now; empty where it is not.
+        """Why the decision to save is too old by now; empty if it is not.
 
-        The checks before VNWNV pause the stream, so nobody sees what happens to the vehicle. They
-        may last as long as they do on this line with no answer late, and as one reply may take
-        where the vehicle's word holds for so long.
+        The checks before VNWNV pause the stream, so nothing shows what happens to the vehicle.
+        They may last as long as on this line without late replies, and as long as one reply may
+        take if the interlock signal is valid for that time.
         """
-        on_this_line_s = SAVE_CHECKS_PER_ASKING * self._on_this_line_s
+        on_this_line_s = SAVE_CHECKS_PER_ASKING * self._quickest_look_s
         reply_s = min(self.policy.reply_timeout_s, self.policy.interlock_max_age_s)
         most_s = max(SAVE_CHECKS_S, on_this_line_s, reply_s)
         if (took_s := host_s - self.save_from_s) <= most_s:
@@ -458,44 +460,46 @@ class Safeguards:
             f"decided, {most_s:.1f} s are allowed"
         )
 
-    def examined(self, to_s: float) -> bool:
+    def has_examined(self, to_s: float) -> bool:
         """Whether the estimate has taken the samples up to this host time into account."""
         return self.examined_s is None or self.examined_s >= to_s
 
-    def unexamined(self) -> list[str]:
-        """Whether the estimate lags behind the samples, which wait for the device's answer."""
+    def unexamined_obstacles(self) -> list[str]:
+        """Obstacle if the estimate lags behind the samples, which wait for the device."""
         if self.sampled_s is None or self.examined_s is None:
             return []
         late_s = self.sampled_s - self.examined_s
-        if late_s <= UNEXAMINED_S + self._on_this_line_s:
+        if late_s <= UNEXAMINED_S + self._quickest_look_s:
             return []
         return [f"the newest {late_s:.0f} s of samples are not judged yet"]
 
     def mode_for(self, purpose: Purpose) -> Mode:
-        """The mode by which a command is judged: a rollback on our own device needs no journal."""
+        """The mode for a command of this purpose: a rollback on our own device needs no journal."""
         if purpose is Purpose.ROLL_BACK and self._is_ours:
             return self.policy.mode
         return self.mode
 
     def allow(self, command: Command, purpose: Purpose, host_s: float) -> bool:
-        """Whether vehicle, journal and verdict let a command of the write-back out now.
+        """Whether interlock, journal and verdict allow a command of the write-back now.
 
-        A rollback asks neither the vehicle nor the journal: the old values are what it lived with.
+        A rollback needs neither interlock nor journal: the vehicle worked with the old values.
         """
         if isinstance(command, Write) and purpose is not Purpose.ROLL_BACK:
-            return (self.armed or purpose is not Purpose.STAGE) and not self.interlock_holds(host_s)
+            return (self.armed or purpose is not Purpose.STAGE) and not self.interlock_obstacle(
+                host_s
+            )
         if isinstance(command, Word) and command.word == "VNWNV":
             return (
                 self.armed
                 and self.journal_ok
-                and not (self.void or self.disagrees or self.proof_waits or self.theirs)
-                and not (self.interlock_holds(host_s) or self.stillness.why_not(host_s))
+                and not (self.void or self.disagrees or self.proof_waits or self.changed_by_others)
+                and not (self.interlock_obstacle(host_s) or self.stillness.find_motion(host_s))
                 and not self.save_too_late(host_s)
             )
         return True
 
-    def _always(self, host_s: float) -> list[str]:
-        reasons = [word] if (word := self.interlock_holds(host_s)) else []
+    def _common_obstacles(self, host_s: float) -> list[str]:
+        reasons = [word] if (word := self.interlock_obstacle(host_s)) else []
         if not self.journal_ok:
             reasons.append("the journal cannot be written; free the disk, then unlock")
         if self.stopping:

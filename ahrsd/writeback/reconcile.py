@@ -1,14 +1,15 @@
-"""After an interruption: what the journal says last, what the device holds, what follows.
+"""Recovery after an interruption, by the journal's last record and the device's registers.
 
-A transaction can end at any point: the power, the link or this program goes. RAM that was written
-and not saved is lost with the device's power and keeps living with the program's, so "the device
-holds the old values" is always a safe end. The one dangerous stretch is VNWNV itself, between
+A transaction can be interrupted at any point by loss of power, link or program. Values in RAM that
+were not saved are lost if the device loses power, and remain if only the program ends. So "the
+device holds the old values" is always a safe end. The one dangerous phase is VNWNV itself, between
 FLASH_SENT and the next reading after a reset.
 
-The table is total over (last record, what the device holds, whether it is proven that the device
-restarted since that record). Where they contradict each other it raises an alarm; it never writes
-flash. After a restart that is proven the device holds what is in its flash, so what is neither the
-old values nor saved from here was saved by somebody: it is never written over without a person.
+The table is total over (last record, contents of the device, whether a restart of the device since
+that record is proven). If they contradict each other, it raises an alarm; it never writes flash.
+After a proven restart the device holds what is in its flash, so values that are neither the old
+ones nor saved by ahrsd were saved by another program: they are never overwritten without an
+operator.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from drivers.vn100.registers import Values, same
 
 
 class DeviceContents(Enum):
-    """What the device holds in the registers of a transaction; a restart counts if it is proven."""
+    """Contents of the registers of a transaction; only a proven restart counts as one."""
 
     OLD = "the old values"
     OLD_AFTER_RESTART = "the old values after a restart"
@@ -37,7 +38,7 @@ class DeviceContents(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Resolution:
-    """What follows: the signal, the record that says so (if any), the level and text of a note."""
+    """The resulting signal, journal record (None: none), and level and text of the note."""
 
     signal: Signal
     record: RecordKind | None
@@ -45,13 +46,13 @@ class Resolution:
     text: str
 
 
-def found(
+def compare_contents(
     old: Mapping[int, Values],
     new: Mapping[int, Values],
     device: Mapping[int, Values],
     restarted: bool,
 ) -> DeviceContents:
-    """Compare register by register, as the device prints them. A register not read is neither."""
+    """Compare the registers as the device prints them. An unread register is neither."""
     is_old = {n: n in device and same(n, old[n], device[n]) for n in new}
     is_new = {n: n in device and same(n, new[n], device[n]) for n in new}
     if all(is_old.values()):
@@ -63,7 +64,7 @@ def found(
     return DeviceContents.NEITHER
 
 
-def _foreign(what: str) -> Resolution:
+def _report_foreign(what: str) -> Resolution:
     return Resolution(
         Signal.FOREIGN,
         RecordKind.FOREIGN,
@@ -77,7 +78,7 @@ def _undo(level: str, text: str) -> Resolution:
     return Resolution(Signal.UNDO, RecordKind.ROLLBACK, level, text)
 
 
-def _closed(record: RecordKind, level: str, text: str) -> Resolution:
+def _close(record: RecordKind, level: str, text: str) -> Resolution:
     return Resolution(Signal.NOTHING_OPEN, record, level, text)
 
 
@@ -108,10 +109,10 @@ _BACK: Final = (
 
 TABLE: Final[dict[RecordKind, dict[DeviceContents, Resolution]]] = {
     RecordKind.PREPARED: {
-        DeviceContents.OLD: _closed(
+        DeviceContents.OLD: _close(
             RecordKind.ABORTED, "info", "a write was prepared and never made"
         ),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.ABORTED,
             "info",
             "a write was prepared; the device restarted with its old values",
@@ -125,24 +126,24 @@ TABLE: Final[dict[RecordKind, dict[DeviceContents, Resolution]]] = {
         DeviceContents.NEW_AFTER_RESTART: _saved_by_others("a write was prepared"),
         DeviceContents.MIXED: _undo("warning", "a write was interrupted between its registers"),
         DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("a write was prepared"),
-        DeviceContents.NEITHER: _foreign("a write was prepared"),
+        DeviceContents.NEITHER: _report_foreign("a write was prepared"),
     },
     RecordKind.RAM_FAILED: {
-        DeviceContents.OLD: _closed(RecordKind.ROLLED_BACK, "info", "a failed write is undone"),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD: _close(RecordKind.ROLLED_BACK, "info", "a failed write is undone"),
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.ROLLED_BACK, "info", "a failed write is undone"
         ),
         DeviceContents.NEW: _undo("warning", "a failed write was not undone"),
         DeviceContents.NEW_AFTER_RESTART: _saved_by_others("a write failed"),
         DeviceContents.MIXED: _undo("warning", "a failed write was not undone"),
         DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("a write failed"),
-        DeviceContents.NEITHER: _foreign("a write failed"),
+        DeviceContents.NEITHER: _report_foreign("a write failed"),
     },
     RecordKind.RAM_VERIFIED: {
-        DeviceContents.OLD: _closed(
+        DeviceContents.OLD: _close(
             RecordKind.REVERTED, "warning", f"a trial was under way; {_BACK}"
         ),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.LOST,
             "warning",
             "the device restarted during the trial and has its old values: safe",
@@ -153,13 +154,13 @@ TABLE: Final[dict[RecordKind, dict[DeviceContents, Resolution]]] = {
         DeviceContents.NEW_AFTER_RESTART: _saved_by_others("a trial was under way"),
         DeviceContents.MIXED: _undo("warning", "one of two registers went back by itself"),
         DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("a trial was under way"),
-        DeviceContents.NEITHER: _foreign("a trial was under way"),
+        DeviceContents.NEITHER: _report_foreign("a trial was under way"),
     },
     RecordKind.PROVEN: {
-        DeviceContents.OLD: _closed(
+        DeviceContents.OLD: _close(
             RecordKind.REVERTED, "warning", f"proven values waited to be saved; {_BACK}"
         ),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.LOST,
             "warning",
             "the device restarted before the proven values were saved and has its old ones: safe",
@@ -175,26 +176,26 @@ TABLE: Final[dict[RecordKind, dict[DeviceContents, Resolution]]] = {
         ),
         DeviceContents.MIXED: _undo("warning", "one of two registers went back by itself"),
         DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("proven values waited to be saved"),
-        DeviceContents.NEITHER: _foreign("proven values waited to be saved"),
+        DeviceContents.NEITHER: _report_foreign("proven values waited to be saved"),
     },
     RecordKind.ROLLBACK: {
-        DeviceContents.OLD: _closed(RecordKind.ROLLED_BACK, "info", "a rollback is complete"),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD: _close(RecordKind.ROLLED_BACK, "info", "a rollback is complete"),
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.ROLLED_BACK, "info", "a rollback is complete"
         ),
         DeviceContents.NEW: _undo("warning", "a rollback was interrupted"),
         DeviceContents.NEW_AFTER_RESTART: _saved_by_others("a rollback was interrupted"),
         DeviceContents.MIXED: _undo("warning", "a rollback was interrupted"),
         DeviceContents.MIXED_AFTER_RESTART: _saved_by_others("a rollback was interrupted"),
-        DeviceContents.NEITHER: _foreign("a rollback was interrupted"),
+        DeviceContents.NEITHER: _report_foreign("a rollback was interrupted"),
     },
     RecordKind.FLASH_SENT: {
-        DeviceContents.OLD: _closed(
+        DeviceContents.OLD: _close(
             RecordKind.REVERTED,
             "warning",
             f"saving was interrupted; {_BACK}; its flash may hold either, the next restart tells",
         ),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.NOT_SAVED,
             "warning",
             "saving was interrupted and the device has its old values: not saved, safe",
@@ -212,12 +213,12 @@ TABLE: Final[dict[RecordKind, dict[DeviceContents, Resolution]]] = {
         DeviceContents.NEITHER: _TORN,
     },
     RecordKind.FLASH_ACKED: {
-        DeviceContents.OLD: _closed(
+        DeviceContents.OLD: _close(
             RecordKind.REVERTED,
             "warning",
             f"the new values were saved; {_BACK}; the next restart tells what its flash holds",
         ),
-        DeviceContents.OLD_AFTER_RESTART: _closed(
+        DeviceContents.OLD_AFTER_RESTART: _close(
             RecordKind.NOT_SAVED,
             "error",
             "the device acknowledged the save and still has its old values",

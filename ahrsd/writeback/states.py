@@ -1,38 +1,37 @@
-"""The write-back's vocabulary: modes, purposes, states, and every way from one state to another.
+"""Modes, purposes, states and transitions of the write-back.
 
-`Mode` is how much a person allows, `Purpose` is why a command is sent (`permissions` is the table
-of both); the rest is the state machine.
+`Mode` is how much an operator allows, `Purpose` is why a command is sent (`permissions` is the
+table of both); the rest is the state machine.
 
 Theory of operation
 ===================
 
-A proposal for registers 23 and 84 is watched until it is worth a write (CANDIDATE) and every gate
-is green (QUALIFIED). Approval opens a *transaction*. From PREPARING on the journal knows about it
-before the device does: nothing is sent until the record of what the device held is on the disk.
+A proposal for registers 23 and 84 waits until it is worth a write (CANDIDATE) and every gate has
+passed (QUALIFIED). Approval opens a *transaction*. From PREPARING on, each step is journaled before
+it is taken: nothing is sent until the record of the old register values is on the disk.
 
-    CHECKING      async off, all registers read again, equal to the record? no byte was changed yet
+    CHECKING      async off, all registers read again and compared; nothing was changed yet
     STAGING       23 and 84 written and read back; from here on only ROLLING_BACK leads out
-    STAGED        the device holds the new values in RAM; waits for the journal to say so too
-    TRIAL         lives with them, is judged against the old ones on the same samples
-    PROVEN        was better, or not worse, for long enough, and goes on being judged; what voids a
-                  trial ends it too; in mode `stage` it rests here
-    SAVE_PREPARING waits for the journal to say that the flash is about to be written
-    SAVING        session settings put back, every register compared, then VNWNV: one procedure
-    COMMITTED     the device acknowledged; only a reading after its next reset says CONFIRMED
-    SET_ASIDE     what was on trial is undone for a client's save or reset, and is written again
-                  behind it; a reset leads through RECONCILING, where the device is read again
+    STAGED        the device holds the new values in RAM; waits for the journal record of that
+    TRIAL         the new values are compared with the old ones on the same samples
+    PROVEN        better, or not worse, for long enough; still judged, and ended by whatever ends
+                  a trial; the last state in mode `stage`
+    SAVE_PREPARING waits for the journal record that flash is about to be written
+    SAVING        session settings restored, every register compared, then VNWNV: one procedure
+    COMMITTED     the device acknowledged; only a reading after its next reset gives CONFIRMED
+    SET_ASIDE     values on trial are undone for a client's save or reset, and written again after
+                  it; a reset leads through RECONCILING, where the device is read again
 
 "verified", "proven", "committed" and "confirmed" are different words on purpose.
 
-RECONCILING is entered at the start, whenever the link or the device went away, and whenever another
-device answers or this one holds what it should not: the registers are read and compared with the
-journal (`reconcile`), which says where to go on. FAULT is a device in a
-state that this program cannot mend alone; FLASH_TORN one whose flash holds neither the old nor the
-new values. Neither ends by itself. LOCKED: no writes until a person unlocks. In FAULT "unlock"
-means: look again.
+RECONCILING is entered at the start, whenever the link or the device was lost, and whenever another
+device answers or this one has unexpected registers: the registers are read and compared with the
+journal (`reconcile`), which gives the next state. FAULT is a device in a state that this program
+cannot repair alone; FLASH_TORN one whose flash holds neither the old nor the new values. Neither
+ends by itself. LOCKED: no writes until an operator unlocks. In FAULT "unlock" means: read again.
 
 A signal that a state does not name is ignored there (and noted), never an error.
-Power may go at any point; `reconcile` lists what is found then.
+Power may be lost at any point; `reconcile` lists what may be found then.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ from typing import Final
 
 
 class Mode(IntEnum):
-    """How much a person allows; the order is the order of harm."""
+    """How much an operator allows, in order of increasing risk."""
 
     PASSIVE = 0
     OBSERVE = 1
@@ -68,7 +67,7 @@ class Purpose(Enum):
 
 
 class State(StrEnum):
-    """Where the write-back stands; the value is what people and the journal see."""
+    """State of the write-back; people and the journal see the value."""
 
     RECONCILING = "RECONCILING"
     OBSERVING = "OBSERVING"
@@ -93,7 +92,7 @@ class State(StrEnum):
 
 
 class Signal(StrEnum):
-    """What can happen to the write-back."""
+    """Events for the state machine."""
 
     WORTH_WRITING = "worth writing"
     NOT_WORTH_WRITING = "not worth writing"
@@ -249,8 +248,8 @@ TABLE: Final[dict[State, dict[Signal, State]]] = {
     S.LOCKED: {**_AWAY, E.UNLOCK: S.OBSERVING},
 }
 
-# States that wait for something which may never come, how long, and where silence leads: the
-# table's own TIMEOUT edge, repeated here so that a reader sees all of them at once.
+# States with a time limit, the limit, and the next state: the TIMEOUT edges of the table, repeated
+# here so that a reader sees all of them at once.
 ON_TIMEOUT: Final[dict[State, tuple[float, State]]] = {
     S.RECONCILING: (30.0, S.RECONCILING),  # keeps waiting for the device, says so once
     S.QUALIFIED: (600.0, S.CANDIDATE),  # an approval must be of what is true now
@@ -266,7 +265,7 @@ ON_TIMEOUT: Final[dict[State, tuple[float, State]]] = {
     S.SET_ASIDE: (30.0, S.ROLLED_BACK),  # a later write would be a new one, with a new approval
 }
 
-# The device's RAM may hold values of a transaction, not yet in flash: the vehicle runs on them.
+# The device's RAM may hold values of a transaction that are not in flash; the vehicle uses them.
 CHANGED_IN_RAM: Final = frozenset(
     {
         S.STAGING,
@@ -278,13 +277,13 @@ CHANGED_IN_RAM: Final = frozenset(
         S.ROLLING_BACK,
     }
 )
-# The vehicle lives with new values that may still be undone: whatever voids them ends it.
+# The vehicle uses new values that may still be undone: whatever voids them ends these states.
 LIVED_WITH: Final = frozenset({S.TRIAL, S.PROVEN, S.SAVE_PREPARING, S.SAVING})
 WITHOUT_TRANSACTION: Final = frozenset(
     {S.OBSERVING, S.CANDIDATE, S.QUALIFIED, S.COMMITTED, S.CONFIRMED, S.ROLLED_BACK}
 )
 
 
-def after(state: State, signal: Signal) -> State:
+def next_state(state: State, signal: Signal) -> State:
     """The state that `signal` leads to; `state` itself where it is ignored."""
     return TABLE[state].get(signal, state)

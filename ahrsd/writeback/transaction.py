@@ -1,12 +1,12 @@
 """The procedures of a transaction: check, stage in RAM, roll back, save to flash.
 
-Each procedure keeps the device's output paused while it lasts and returns whether the device
-was as expected; everything else is an error that the session reports. None of them undoes what it
-did: that is a procedure of its own, so that the gate knows a rollback from a write.
+Each procedure keeps the device's output paused and returns whether the device was as expected;
+anything else is an error that the session reports. None of them undoes its changes: that is a
+separate procedure, so that the gate can distinguish a rollback from a write.
 
-A cable can be moved to another device between any two commands. So each procedure asks who
-answers before it compares, before every attempt to write a register, and before the save; what is
-judged of one device is never written into another.
+The cable can be moved to another device between any two commands. So each procedure reads the
+identity before it compares, before every attempt to write a register, and before the save: a
+calibration of one device is never written to another.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ from drivers.vn100.commands import (
 from drivers.vn100.errors import DeviceRefused
 from drivers.vn100.registers import Unit, Values, parse, same
 
-BEHIND_TRIES = 5  # to have a serial number and the command right behind it
-HSI_RESULT = 47  # changes by itself while the on-board estimator runs; nobody's setting
+BEHIND_TRIES = 5  # to read the serial number and send the command immediately after it
+HSI_RESULT = 47  # changes while the on-board estimator runs; not a setting
 
 
 @dataclass(frozen=True, slots=True)
 class ProcedureOutcome:
-    """How a procedure ended: as expected, or which registers were not, or what was refused.
+    """Result of a procedure: as expected, or which registers differ, or why not.
 
-    other:   who answered, where it was not the transaction's device
+    other:   the unit that answered, if it was not the transaction's device
     written: whether a write may have gone out
     """
 
@@ -69,17 +69,17 @@ class ProcedureOutcome:
 
 
 def check(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[ProcedureOutcome]:
-    """Everything is still as the journal will say it was. Changes nothing.
+    """Check that all registers are as the journal record says. Changes nothing.
 
-    session_keys: settings that the daemon itself changed for the session; they may differ.
+    session_keys: settings that the daemon changed for the session; they may differ.
     """
     return quiet(_check(transaction, session_keys))
 
 
 def stage(transaction: Transaction) -> Procedure[ProcedureOutcome]:
-    """Write the new values, each read back, then all of them together with who answers.
+    """Write the new values and read back each; then read all of them and the identity.
 
-    Nothing is written where the old values are gone.
+    Nothing is written if the old values are no longer there.
     """
     return quiet(_stage(transaction))
 
@@ -87,30 +87,30 @@ def stage(transaction: Transaction) -> Procedure[ProcedureOutcome]:
 def roll_back(
     transaction: Transaction, *, only_ours: bool, left: Mapping[int, Values] | None = None
 ) -> Procedure[ProcedureOutcome]:
-    """The old values again, read back; a register that has them is not written.
+    """Restore the old values and read them back; a register that has them is not written.
 
-    Every register is tried before a failure is reported, and all of them also where the device does
-    not let its output be paused: that makes replies slower, and is no reason to leave values in it.
+    Every register is tried before a failure is reported, even if the output of the device cannot be
+    paused: that makes replies slower, but is no reason to leave values in the device.
 
-    only_ours: nothing is written where a register holds neither the old nor the new value, nor
-               what is `left`, for then somebody else wrote it
-    left:      by register, what the device made of a value of ours
+    only_ours: nothing is written if a register holds neither the old nor the new value nor that
+               in `left`, because another program wrote it then
+    left:      by register, a value of ours as the device altered it
     """
     return _roll_back(transaction, only_ours, left or {})
 
 
 def save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[ProcedureOutcome]:
-    """VNWNV saves all of RAM, so: session settings put back, every register compared, then VNWNV.
+    """Restore session settings, compare every register, then VNWNV, which saves all of RAM.
 
-    Only the registers of the transaction may differ from what the user had, and they must hold the
-    new values; otherwise nothing is saved and the outcome says why. An error that is raised means
-    that VNWNV may have been carried out.
+    Only the registers of the transaction may differ from the user's values, and they must hold the
+    new values; otherwise nothing is saved and the outcome says why. If an error is raised, VNWNV
+    may have been carried out.
     """
     return quiet(_save(transaction, session_keys))
 
 
-def _other(transaction: Transaction) -> Procedure[Unit | None]:
-    """Who answers, where it is another device; asked twice, for a reply may be altered."""
+def _find_other_device(transaction: Transaction) -> Procedure[Unit | None]:
+    """The unit that answers, if it is another device; read twice, as a reply may be damaged."""
     unit = yield from read_unit()
     if transaction.is_of(unit):
         return None
@@ -118,15 +118,15 @@ def _other(transaction: Transaction) -> Procedure[Unit | None]:
     return None if transaction.is_of(unit) else unit
 
 
-def _other_by_serial(transaction: Transaction) -> Procedure[Unit | None]:
-    """The same within a procedure that has asked already: the serial number is enough."""
+def _find_other_by_serial(transaction: Transaction) -> Procedure[Unit | None]:
+    """The same for a procedure that has read the identity before: by serial number only."""
     if int((yield from read(3))[0]) == transaction.serial:
         return None
-    return (yield from _other(transaction))
+    return (yield from _find_other_device(transaction))
 
 
-def _changed(expected: Mapping[int, Values]) -> Procedure[tuple[int, ...]]:
-    """Registers that do not hold what is expected, in two readings."""
+def _read_differences(expected: Mapping[int, Values]) -> Procedure[tuple[int, ...]]:
+    """Registers that differ from the expected values in two readings."""
     changed = differences(expected, (yield from read_registers(expected)))
     if changed:
         changed = differences(expected, (yield from read_registers(expected)))
@@ -134,7 +134,7 @@ def _changed(expected: Mapping[int, Values]) -> Procedure[tuple[int, ...]]:
 
 
 def _check(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[ProcedureOutcome]:
-    if (other := (yield from _other(transaction))) is not None:
+    if (other := (yield from _find_other_device(transaction))) is not None:
         return ProcedureOutcome(False, other=other)
     return (yield from _compare(transaction, transaction.old, session_keys))
 
@@ -149,9 +149,9 @@ def _compare(
 
 
 def _stage(transaction: Transaction) -> Procedure[ProcedureOutcome]:
-    if (other := (yield from _other(transaction))) is not None:
+    if (other := (yield from _find_other_device(transaction))) is not None:
         return ProcedureOutcome(False, other=other)
-    if changed := (yield from _changed(transaction.old)):
+    if changed := (yield from _read_differences(transaction.old)):
         return ProcedureOutcome(False, changed)
     written = False
     for number, values in transaction.new.items():
@@ -159,7 +159,7 @@ def _stage(transaction: Transaction) -> Procedure[ProcedureOutcome]:
         if refused is not None:
             return refused
         written = True
-    return (yield from _read_all_back(transaction, transaction.new))
+    return (yield from _verify_all(transaction, transaction.new))
 
 
 def _roll_back(
@@ -169,47 +169,47 @@ def _roll_back(
     try:
         with suppress(NoReply, DeviceRefused):
             yield QUIET
-        return (yield from _put_back(transaction, only_ours, left))
-    except GeneratorExit:  # dropped without an end: nobody is there to carry out a command
+        return (yield from _restore_old_values(transaction, only_ours, left))
+    except GeneratorExit:  # dropped before its end: no command can be carried out
         abandoned = True
         raise
     finally:
         if not abandoned:
-            with suppress(NoReply, DeviceRefused):  # the registers are what the outcome is about
+            with suppress(NoReply, DeviceRefused):  # only the registers matter for the outcome
                 yield from resume()
 
 
-def _read_all_back(
+def _verify_all(
     transaction: Transaction, expected: Mapping[int, Values]
 ) -> Procedure[ProcedureOutcome]:
-    """Both registers in one reading, and whose they are: a restart between two writes shows."""
-    if (other := (yield from _other_by_serial(transaction))) is not None:
+    """Read identity and registers together, which shows a restart between two writes."""
+    if (other := (yield from _find_other_by_serial(transaction))) is not None:
         return ProcedureOutcome(False, other=other, written=True)
-    changed = yield from _changed(expected)
+    changed = yield from _read_differences(expected)
     return ProcedureOutcome(not changed, changed, written=True)
 
 
 def _write(
     transaction: Transaction, number: int, before: Values, values: Values, written: bool
 ) -> Procedure[ProcedureOutcome | None]:
-    """Write a register of the transaction's device; the outcome where another one answers.
+    """Write a register of the transaction's device; returns an outcome if another one answers.
 
-    before: what it held until now; written: whether something was written before
+    before: its value until now; written: whether something was written before
 
-    Each attempt is one command, and who answers is asked right before it: what takes over the cable
-    in the silence behind an attempt is not written. There is another attempt only where the
-    register still holds what it held: anything else is what the device made of the values, or
-    what somebody wrote or a restart brought back. Raises VerifyFailed.
+    Each attempt is one command, sent immediately after reading the serial number, so a device that
+    takes over the cable after an attempt is not written. Another attempt is made only if the
+    register still holds `before`: any other value is our value altered by the device, or was
+    written by another program or restored by a restart. Raises VerifyFailed.
     """
     echo: list[Values] = []
     for attempt in range(1, WRITE_TRIES + 1):
-        command = _written_once(number, values, echo)
-        if (other := (yield from _right_behind(transaction, command))) is not None:
+        command = _make_single_write(number, values, echo)
+        if (other := (yield from _run_after_serial_check(transaction, command))) is not None:
             return ProcedureOutcome(False, other=other, written=written)
         written = True
         back = yield from read(number)
         if not any(same(number, one, back[: len(one)]) for one in (before, values)):
-            back = yield from read(number)  # a reply may be altered
+            back = yield from read(number)  # a reply may be damaged
         if same(number, values, back[: len(values)]):
             return None
         if attempt == WRITE_TRIES or not same(number, before, back[: len(before)]):
@@ -218,27 +218,29 @@ def _write(
     raise VerifyFailed(number, values, back, attempt, echoed=echoed)
 
 
-def _written_once(number: int, values: Values, echo: list[Values]) -> Callable[[], Procedure[None]]:
-    """The write, as often as asked; what the device answered goes into `echo`."""
+def _make_single_write(
+    number: int, values: Values, echo: list[Values]
+) -> Callable[[], Procedure[None]]:
+    """A function that writes once; the device's reply is appended to `echo`."""
 
     def write() -> Procedure[None]:
-        with suppress(NoReply):  # carried out or not: a read says which
+        with suppress(NoReply):  # carried out or not: the read shows it
             reply = yield Write(number, values, once=True)
             echo.append(parse(number, reply.tokens))
 
     return write
 
 
-def _right_behind(
+def _run_after_serial_check(
     transaction: Transaction, make: Callable[[], Procedure[None]]
 ) -> Procedure[Unit | None]:
-    """Carry out what changes the device right behind its serial number; the unit that is another.
+    """Carry out a change immediately after reading the serial number; returns another unit, if any.
 
-    On a line that loses answers the number may be old by then: TooLate, and it is asked again.
-    Raises TooLate where no answer comes soon enough.
+    On a line that loses replies the number may be stale by then (TooLate), and is read again.
+    Raises TooLate if no reply comes soon enough.
     """
     for left in reversed(range(BEHIND_TRIES)):
-        if (other := (yield from _other_by_serial(transaction))) is not None:
+        if (other := (yield from _find_other_by_serial(transaction))) is not None:
             return other
         try:
             yield from make()
@@ -250,12 +252,12 @@ def _right_behind(
     return None
 
 
-def _put_back(
+def _restore_old_values(
     transaction: Transaction, only_ours: bool, left: Mapping[int, Values]
 ) -> Procedure[ProcedureOutcome]:
-    if (other := (yield from _other_by_serial(transaction))) is not None:
+    if (other := (yield from _find_other_by_serial(transaction))) is not None:
         return ProcedureOutcome(False, other=other)
-    if only_ours and (strange := (yield from _foreign_values(transaction, left))):
+    if only_ours and (strange := (yield from _find_foreign_values(transaction, left))):
         return ProcedureOutcome(False, strange)
     errors: dict[int, Exception] = {}
     for number, values in transaction.old.items():
@@ -269,13 +271,13 @@ def _put_back(
             return refused
     if errors:
         raise RestoreFailed(errors)
-    return (yield from _read_all_back(transaction, transaction.old))
+    return (yield from _verify_all(transaction, transaction.old))
 
 
-def _foreign_values(
+def _find_foreign_values(
     transaction: Transaction, left: Mapping[int, Values]
 ) -> Procedure[tuple[int, ...]]:
-    """Registers that hold neither the old nor the new value nor what is left, in two readings."""
+    """Registers with neither the old nor the new value nor that in `left`, in two readings."""
     found: tuple[int, ...] = ()
     for _ in range(2):
         now = yield from read_registers(transaction.old)
@@ -288,17 +290,19 @@ def _foreign_values(
 
 def _save(transaction: Transaction, session_keys: frozenset[int]) -> Procedure[ProcedureOutcome]:
     try:
-        if (other := (yield from _other(transaction))) is not None:
+        if (other := (yield from _find_other_device(transaction))) is not None:
             return ProcedureOutcome(False, other=other)
         yield from restore(transaction.snapshot, sorted(session_keys))
         outcome = yield from _compare(transaction, transaction.new, frozenset())
         if outcome.as_expected:
-            outcome = yield from _read_all_back(transaction, transaction.new)
+            outcome = yield from _verify_all(transaction, transaction.new)
     except (NotPermitted, RestoreFailed, NoReply, DeviceRefused) as error:
         return ProcedureOutcome(False, why=str(error))
     if outcome.as_expected:
         try:
-            other = yield from _right_behind(transaction, partial(save_settings, behind=True))
+            other = yield from _run_after_serial_check(
+                transaction, partial(save_settings, behind=True)
+            )
         except (NotPermitted, TooLate) as error:
             return ProcedureOutcome(False, why=str(error))
         if other is not None:

@@ -1,49 +1,50 @@
-"""The trial: new registers against the old ones, on the same live samples.
+"""The trial: new registers compared with the old ones, on the same live samples.
 
-**Figures.** The figure is the spread (std / mean) of the corrected field over the newest minute:
-both corrections see the same motion and the same disturbances, so only their quality differs. At
-rest both show the sensor's noise, scaled by a matrix each, and are not compared. Whether the new
-ones are *right* is not told by the spread, which noise has as well, but by how much of it an error
-of the calibration explains (`LeftoverError`). That says nothing of the gyroscope, nor of a matrix
-that is turned: `CarriedField` does, with the new registers and with each alternative to them
-(either one put back, or both; at rest only the gyroscope's).
+**Figures.** The figure is the spread (std / mean) of the corrected field over the newest minute.
+Both corrections have the same motion and disturbances, so only their quality differs. At rest both
+show the sensor's noise, scaled by a matrix each, and are not compared. Noise also causes spread, so
+the spread does not show whether the new registers are *right*; the part of it that an error of the
+calibration explains does (`LeftoverError`). That does not test the gyroscope, nor a rotation of the
+matrix: `CarriedField` does, with the new registers and with each alternative to them (either one
+restored, or both; at rest only the gyroscope's).
 
-The heading's jump is the difference of the two tilt-compensated headings of the same samples,
-averaged over the first seconds of samples in which the vehicle is nearly level. It was predicted
-for level, on the side it may be twice as much, and at 15 deg a hard iron along the vertical adds
-half as much again: so each sample is turned level on its own heading before the two are compared.
-Seconds are those that samples cover, taken in pieces of a quarter of one: over a gap, or over the
-many seconds that a busy host reads at once, the vehicle turns, and a mean over a turn is no field.
+The heading jump is the difference of the two tilt-compensated headings of the same samples,
+averaged over the first seconds of samples in which the vehicle is nearly level. The prediction is
+for a level vehicle; on its side the jump may be twice as much, and at 15 deg a hard iron along the
+vertical adds half as much again. So each sample is rotated to level on its own heading before the
+comparison. Only time covered by samples counts, in pieces of a quarter of a second: over a gap, or
+over many seconds that a busy host reads at once, the vehicle turns, and a mean over a turn is no
+field.
 
 **Leftover error.** How much of the corrected field's variation a wrong calibration still explains.
 
 y = |C (m - B)| / its mean    u = direction of C (m - B), sensor frame
 
-With right registers y varies by noise and by the places that the vehicle passes, neither of which
-knows the attitude. A hard or soft iron that is still in there makes y a function of u:
+With right registers y varies by noise and by place, neither of which depends on the attitude. A
+remaining hard or soft iron error makes y a function of u:
 
 y = const + d . u + u' S u       d: 3 numbers, S: 5
 
-The samples are cut into stretches in which the vehicle turned; within each, y and its columns are
-taken about their means, so that a field that differs from place to place explains nothing.
+The samples are divided into segments in which the vehicle turned; within each, y and the columns
+are centred, so that a field that differs by place explains nothing.
 
-b, the eight numbers of d and S, is fitted twice, to every other stretch. With A the Gram matrix of
-the columns and n the samples, Q = b1' (A / n) b2 is the mean square that is explained: the noise of
-b1 knows nothing of that of b2, so with right registers Q is zero on average at any level of noise.
-What each stretch leaves over of the other half's fit, g_k - A_k b, says how uncertain b is,
-whatever colour the noise has within a stretch:
+b, the eight numbers of d and S, is fitted twice, to alternate segments. With A the Gram matrix of
+the columns and n the samples, Q = b1' (A / n) b2 is the explained mean square: the noise of b1 is
+independent of that of b2, so with right registers Q is zero on average at any noise level. The
+residual r_k = g_k - A_k b of each segment from the other half's fit gives the uncertainty of b, for
+any colour of the noise within a segment:
 
 Cov b = A^-1 (sum r_k r_k') A^-1    var Q = 4 b' (A/n) Cov (A/n) b + 2 tr((A/n) Cov (A/n) Cov)
 
-**Steadiness of the field.** How still the corrected field stands when the corrected gyroscope
-carries it into one frame.
+**Carried field.** How constant the corrected field is in one frame, rotated there by the corrected
+gyroscope.
 
-u_k = R_k C (m_k - B),  R_k = R_{k-1} Exp((w_k - w_b) dt_k),  R = I at the start of a stretch
+u_k = R_k C (m_k - B),  R_k = R_{k-1} Exp((w_k - w_b) dt_k),  R = I at the start of a segment
 
-On the Earth u does not move: its spread over a stretch, |u - mean| / |mean| (rms), is the error of
-both corrections together and knows no other reference. A wrong gyro bias turns u, a wrong C or B
-makes it wander as the vehicle turns, and a C that is turned about an axis does so wherever the
-vehicle turns about another one.
+u is constant for a fixed field: its spread over a segment, |u - mean| / |mean| (rms), is the error
+of both corrections together, without any other reference. A wrong gyro bias rotates u, a wrong C or
+B changes it as the vehicle turns, and a C that is rotated about one axis changes it when the
+vehicle turns about another.
 """
 
 from __future__ import annotations
@@ -63,12 +64,12 @@ from ahrsd.samples import Array, SampleBlock
 # -- Verdicts --------------------------------------------------------------------------------------
 
 
-JUMP_NOISE_DEG = 1.0  # of a heading read off single samples; below it no jump is unexpected
+JUMP_NOISE_DEG = 1.0  # of a heading from single samples; no smaller jump is unexpected
 
 
 @dataclass(frozen=True, slots=True)
 class TrialPolicy:
-    """How written registers prove themselves. Times are of the device's clock.
+    """Conditions for proving written registers. Times are of the device's clock.
 
     duration_s, turns: whichever comes first ends the trial; longer proves more [600 s, 2 turns]
     worse_percent, worse_for_s: undo where the live figure is worse than the old registers' on the
@@ -78,8 +79,8 @@ class TrialPolicy:
     max_spread_percent: undo where std/mean of the corrected field exceeds this, whatever explains
                        it [10 %]
     max_jump_deg:      undo where the heading jumped by this much more than predicted [5 deg]
-    interlock:         undo where the vehicle withdraws its word; false lets the trial live through
-                       driving, for vehicles whose word is only about the moment of writing [true]
+    interlock:         undo if the interlock opens; false lets the trial continue while driving,
+                       for vehicles whose interlock only concerns the moment of writing [true]
     """
 
     duration_s: float = 600.0
@@ -127,7 +128,7 @@ class TrialMetrics:
 
     @property
     def finite(self) -> bool:
-        """Whether anything can be said."""
+        """Whether the figures can be judged."""
         return bool(
             np.isfinite(
                 [self.duration_s, self.turns, self.new_figure, self.old_figure, self.field_spread]
@@ -136,7 +137,7 @@ class TrialMetrics:
 
 
 class TrialVerdict(Enum):
-    """What the metrics say."""
+    """Result of judging the metrics."""
 
     GOES_ON = "goes on"
     PASSED = "passed"
@@ -152,15 +153,15 @@ class Trial:
         self._worse_since_s: float | None = None
 
     @property
-    def in_question(self) -> bool:
-        """Whether the newest figures speak against the new registers."""
+    def currently_worse(self) -> bool:
+        """Whether the newest figures are worse with the new registers."""
         return self._worse_since_s is not None
 
     def judge(self, metrics: TrialMetrics) -> tuple[TrialVerdict, str]:
-        """The finding and its reason. Metrics that are not finite say nothing."""
+        """The verdict and its reason. Metrics that are not finite are not judged."""
         if not metrics.finite:
             return TrialVerdict.GOES_ON, "nothing to judge yet"
-        if reason := self._failure(metrics):
+        if reason := self._find_failure(metrics):
             return TrialVerdict.FAILED, reason
         policy = self._policy
         if self._worse_since_s is not None:
@@ -174,7 +175,7 @@ class Trial:
             )
         return TrialVerdict.GOES_ON, ""
 
-    def _failure(self, metrics: TrialMetrics) -> str | None:
+    def _find_failure(self, metrics: TrialMetrics) -> str | None:
         policy = self._policy
         spread_percent = 100.0 * metrics.field_spread
         if spread_percent > policy.max_spread_percent:
@@ -188,9 +189,9 @@ class Trial:
                 f"(with the old registers {metrics.old_wrong:.2%}), clearly more than "
                 f"{policy.max_wrong_percent} %"
             )
-        if (jump := metrics.heading_jump_deg) is not None and self._unexpected(jump):
+        if (jump := metrics.heading_jump_deg) is not None and self._is_unexpected_jump(jump):
             return f"the heading jumped by {jump:.1f} deg, predicted {self._predicted_deg:.1f} deg"
-        worse = _worse(metrics, 1.0 + policy.worse_percent / 100.0)
+        worse = _describe_worsening(metrics, 1.0 + policy.worse_percent / 100.0)
         if worse is None:
             self._worse_since_s = None
             return None
@@ -200,15 +201,15 @@ class Trial:
             return f"{worse}, for {policy.worse_for_s:.0f} s"
         return None
 
-    def _unexpected(self, jump_deg: float) -> bool:
-        """More than twice the prediction, or over it by the limit; a nan is unexpected too."""
+    def _is_unexpected_jump(self, jump_deg: float) -> bool:
+        """Whether it is over twice the prediction, or over it by the limit; nan counts as so."""
         size = abs(jump_deg)
         likely = size <= 2.0 * self._predicted_deg + JUMP_NOISE_DEG
         return not (likely and size <= self._predicted_deg + self._policy.max_jump_deg)
 
 
-def _worse(metrics: TrialMetrics, factor: float) -> str | None:
-    """What is worse with the new registers than with the old ones, in words."""
+def _describe_worsening(metrics: TrialMetrics, factor: float) -> str | None:
+    """What is worse with the new registers than with the old ones, in words; None: nothing."""
     if metrics.turned and metrics.new_figure > metrics.old_figure * factor:
         return (
             f"the field varies by {metrics.new_figure:.2%}, with the old registers by "
@@ -227,19 +228,19 @@ def _worse(metrics: TrialMetrics, factor: float) -> str | None:
 
 SHORTEST_S, LONGEST_S = 5.0, 20.0  # of a stretch
 LEFTOVER_STRETCHES = 60  # the newest ones, that are remembered
-LEFTOVER_FEWEST = 6  # from which something is said
+LEFTOVER_FEWEST = 6  # minimum for a result
 TURNED = 0.02  # variance of u over a stretch that says something; 0.02 is some 8 deg each way
-_WELL_TURNED = 0.15  # and that need not become longer
+_WELL_TURNED = 0.15  # enough to end the segment early
 _FEWEST_ROWS = 20
-_BELIEF = 0.05  # size of d and S before anything is known, in parts of the field
-_LEAST_SIGMA = 1e-7  # of Q: rounding, where there is no noise at all
+_BELIEF = 0.05  # prior sigma of d and S, as a share of the field
+_LEAST_SIGMA = 1e-7  # of Q: rounding errors, if there is no noise
 _UPPER = np.triu_indices(3)
 
 
 @dataclass(frozen=True, slots=True)
 class Leftover:
-    """What is explained, rms in parts of the field, and by how many of its own sigmas its square is
-    beyond that of a limit: negative where right registers are likelier. nan: too few stretches.
+    """The explained share of the field, rms, and by how many of its sigmas its square exceeds the
+    square of a limit; negative: below it. nan: too few segments.
     """
 
     share: float = float("nan")
@@ -255,45 +256,45 @@ class _Stretch:
 
 
 class LeftoverError:
-    """Corrected fields in, `Leftover` out. Bounded memory."""
+    """Takes corrected fields, returns `Leftover`. Bounded memory."""
 
     def __init__(self) -> None:
         self._fields: list[Array] = []
-        self._begun_s = 0.0
-        self._done: deque[_Stretch] = deque(maxlen=LEFTOVER_STRETCHES)
+        self._start_s = 0.0
+        self._stretches: deque[_Stretch] = deque(maxlen=LEFTOVER_STRETCHES)
 
     def add(self, time_s: float, corrected: Array) -> None:
-        """One corrected field (3,), some ten a second."""
+        """Add one corrected field (3,), about ten per second."""
         if not self._fields:
-            self._begun_s = time_s
+            self._start_s = time_s
         self._fields.append(corrected)
-        length_s = time_s - self._begun_s
+        length_s = time_s - self._start_s
         if not 0.0 <= length_s <= 2.0 * LONGEST_S:  # a gap, or the clock fell
             self._fields = [corrected]
-            self._begun_s = time_s
+            self._start_s = time_s
         elif length_s >= SHORTEST_S:
-            self._close(last=length_s >= LONGEST_S)
+            self._close_stretch(last=length_s >= LONGEST_S)
 
     def leftover(self, limit: float) -> Leftover:
-        """What is explained, and how clearly it is more than `limit` (parts of the field)."""
-        count = len(self._done)
+        """The explained share, and how significantly it exceeds `limit` (share of the field)."""
+        count = len(self._stretches)
         if count < LEFTOVER_FEWEST:
             return Leftover()
-        halves = [list(self._done)[half::2] for half in (0, 1)]
-        (first, _), (second, _) = (_fit(half) for half in halves)
-        both, A = _fit([one for half in halves for one in half])
-        left = [one.g - one.A @ second for one in halves[0]]
-        left += [one.g - one.A @ first for one in halves[1]]
-        solved = np.linalg.solve(A, np.array(left).T)
-        per_row = A / sum(one.rows for one in self._done)
-        spread = per_row @ (solved @ solved.T)
+        halves = [list(self._stretches)[half::2] for half in (0, 1)]
+        (first, _), (second, _) = (_fit_leftover(half) for half in halves)
+        both, A = _fit_leftover([one for half in halves for one in half])
+        residuals = [one.g - one.A @ second for one in halves[0]]
+        residuals += [one.g - one.A @ first for one in halves[1]]
+        deviation = np.linalg.solve(A, np.array(residuals).T)
+        per_row = A / sum(one.rows for one in self._stretches)
+        spread = per_row @ (deviation @ deviation.T)
         square = float(first @ per_row @ second)
         variance = 4.0 * both @ spread @ per_row @ both + 2.0 * np.trace(spread @ spread)
         sigma = max(float(np.sqrt(max(variance, 0.0))), _LEAST_SIGMA)
         return Leftover(float(np.sqrt(max(square, 0.0))), (square - limit**2) / sigma)
 
-    def _close(self, *, last: bool) -> None:
-        """End the stretch where the vehicle turned in it; where it did not, it says nothing."""
+    def _close_stretch(self, *, last: bool) -> None:
+        """End the segment after enough turning or at its longest; drop it without turning."""
         field = np.array(self._fields)
         size = np.linalg.norm(field, axis=1)
         u = field / np.maximum(size, 1e-9)[:, None]
@@ -307,15 +308,15 @@ class LeftoverError:
             X = X - X.mean(axis=0)
             y = size / size.mean()
             y = y - y.mean()
-            self._done.append(_Stretch(len(y), X.T @ X, X.T @ y, float(y @ y)))
+            self._stretches.append(_Stretch(len(y), X.T @ X, X.T @ y, float(y @ y)))
 
 
-def _fit(stretches: list[_Stretch]) -> tuple[Array, Array]:
-    """b (8,) by least squares, held towards zero by what is believed before; its matrix (8, 8)."""
+def _fit_leftover(stretches: list[_Stretch]) -> tuple[Array, Array]:
+    """b (8,) by least squares with a zero-mean prior; its normal matrix (8, 8)."""
     A, g = sum(one.A for one in stretches), sum(one.g for one in stretches)
     noise = sum(one.yy for one in stretches) / sum(one.rows for one in stretches)
-    held = np.asarray(A) + np.eye(8) * (noise / _BELIEF**2 + 1e-9)
-    return np.asarray(np.linalg.solve(held, np.asarray(g))), held
+    regularized = np.asarray(A) + np.eye(8) * (noise / _BELIEF**2 + 1e-9)
+    return np.asarray(np.linalg.solve(regularized, np.asarray(g))), regularized
 
 
 # -- Steadiness of the carried field ---------------------------------------------------------------
@@ -327,15 +328,15 @@ _CARRIED_FEWEST = 10  # samples of a stretch that count
 
 
 class CarriedField:
-    """Pairs of corrections side by side on the same samples; `spreads` in the order of `pairs`."""
+    """Compares pairs of corrections on the same samples; `spreads` in the order of `pairs`."""
 
     def __init__(self, pairs: Sequence[tuple[Affine, Array]]) -> None:
         self._pairs = [(mag, bias.copy()) for mag, bias in pairs]
-        self._done: deque[Array] = deque(maxlen=CARRIED_STRETCHES)
-        self._begin()
+        self._spreads: deque[Array] = deque(maxlen=CARRIED_STRETCHES)
+        self._begin_stretch()
 
     def take(self, block: SampleBlock) -> None:
-        """Further samples; a step of unknown length begins a new stretch."""
+        """Take samples; a time step of unknown length starts a new segment."""
         usable = np.isfinite(block.gyro_b_rad_s).all(axis=1) & np.isfinite(block.dt_s)
         dt_s = np.where(usable, block.dt_s, 0.0)
         rate = np.where(usable[:, None], block.gyro_b_rad_s, 0.0)
@@ -343,8 +344,8 @@ class CarriedField:
         fields = [mag.apply(block.raw_b_gauss) for mag, _ in self._pairs]
         for k in range(len(block)):
             if not usable[k] or self._length_s > STRETCH_S:
-                self._end()
-                self._begin()
+                self._close_stretch()
+                self._begin_stretch()
                 continue
             self._length_s += float(dt_s[k])
             for n in range(len(self._pairs)):
@@ -353,23 +354,23 @@ class CarriedField:
 
     @property
     def spreads(self) -> Array:
-        """(pairs,) rms over the newest stretches; nan before the first one has ended."""
-        if not self._done:
+        """(pairs,) rms over the newest segments; nan before the first one has ended."""
+        if not self._spreads:
             return np.full(len(self._pairs), np.nan)
-        return np.asarray(np.sqrt(np.mean(self._done, axis=0)))
+        return np.asarray(np.sqrt(np.mean(self._spreads, axis=0)))
 
-    def _begin(self) -> None:
+    def _begin_stretch(self) -> None:
         self._length_s = 0.0
         self._R = [np.eye(3) for _ in self._pairs]
         self._carried: list[list[Array]] = [[] for _ in self._pairs]
 
-    def _end(self) -> None:
+    def _close_stretch(self) -> None:
         if len(self._carried[0]) < _CARRIED_FEWEST:
             return
         u = np.array(self._carried)
         mean = u.mean(axis=1)
         squares = ((u - mean[:, None]) ** 2).sum(axis=2).mean(axis=1)
-        self._done.append(squares / (mean**2).sum(axis=1))
+        self._spreads.append(squares / (mean**2).sum(axis=1))
 
 
 # -- Live figures ----------------------------------------------------------------------------------
@@ -384,7 +385,7 @@ _SPACING_S = 0.1  # samples closer than this add nothing to a spread
 
 
 class LiveTrial:
-    """Collects what `TrialMetrics` needs from the moment the new registers are in force."""
+    """Computes `TrialMetrics` from the moment the new registers are in force."""
 
     def __init__(
         self,
@@ -410,11 +411,11 @@ class LiveTrial:
         self._turned_rad = 0.0
 
     def take(self, block: SampleBlock) -> TrialMetrics:
-        """Further samples; the figures so far."""
+        """Take samples; returns the figures so far."""
         if self._start_s is None:
             self._start_s = self._last_s = float(block.time_s[0])
         self._carried.take(block)
-        down = _down(block.accel_b_m_s2)
+        down = _mean_down(block.accel_b_m_s2)
         rate = (block.gyro_b_rad_s - self._bias) @ down if np.isfinite(down).all() else np.zeros(1)
         self._turned_rad += abs(float(np.nansum(rate * np.nan_to_num(block.dt_s))))
         for t, m in zip(block.time_s.tolist(), block.raw_b_gauss, strict=True):
@@ -426,21 +427,21 @@ class LiveTrial:
         while self._rows and now_s - self._rows[0][0] > _WINDOW_S:
             self._rows.popleft()
         self._last_s = now_s
-        for piece in _pieces(block.time_s):
+        for piece in _split_pieces(block.time_s):
             if self._jump_covered_s < _JUMP_S:
-                self._see_jump(
+                self._add_heading_jump(
                     block.raw_b_gauss[piece], block.accel_b_m_s2[piece], block.dt_s[piece]
                 )
         return self._metrics()
 
-    def _see_jump(self, raw: Array, accel: Array, dt_s: Array) -> None:
-        """How far the heading of these samples is from what it was with the old registers."""
-        down = _down(accel)
+    def _add_heading_jump(self, raw: Array, accel: Array, dt_s: Array) -> None:
+        """Add the heading difference between new and old registers for these samples."""
+        down = _mean_down(accel)
         if not down[2] >= _LEVEL:  # nor where it is nan
             return
         field = self._new.apply(raw.mean(axis=0)[None])
         heading = tilt_compensated_heading(field, -down[None])
-        level = self._new.undo(_levelled(field[0], heading[0], down)[None])
+        level = self._new.undo(_level_field(field[0], heading[0], down)[None])
         before = tilt_compensated_heading(self._old.apply(level), np.array([[0.0, 0.0, -1.0]]))
         self._jumps.append(float((heading - before)[0]))
         self._jump_covered_s += float(np.nansum(np.minimum(dt_s, _PIECE_S)))
@@ -456,7 +457,7 @@ class LiveTrial:
         if self._jumps:
             angles = np.array(self._jumps)
             jump = float(np.degrees(np.arctan2(np.sin(angles).mean(), np.cos(angles).mean())))
-        left = self._leftover.leftover(self._wrong_limit)
+        leftover = self._leftover.leftover(self._wrong_limit)
         swing = np.nan_to_num(self._carried.spreads)
         start = self._last_s if self._start_s is None else self._start_s
         return TrialMetrics(
@@ -469,22 +470,22 @@ class LiveTrial:
             heading_jump_deg=jump,
             new_swing=float(swing[0]),
             old_swing=float(swing[1:].min() if turned else swing[_OLD_GYRO]),
-            wrong=left.share,
+            wrong=leftover.share,
             old_wrong=self._old_leftover.leftover(self._wrong_limit).share,
-            wrong_sigmas=left.sigmas,
+            wrong_sigmas=leftover.sigmas,
         )
 
 
-def _levelled(field_b: Array, heading_rad: float, down_b: Array) -> Array:
-    """The same field as it would be in the sensor's axes were it level, on the same heading."""
+def _level_field(field_b: Array, heading_rad: float, down_b: Array) -> Array:
+    """The field in the sensor's axes if the sensor were level, on the same heading."""
     vertical = float(down_b @ field_b)
     horizontal = float(np.linalg.norm(field_b - vertical * down_b))
     north = np.array([np.cos(heading_rad), -np.sin(heading_rad), 0.0])
     return np.asarray(horizontal * north + np.array([0.0, 0.0, vertical]))
 
 
-def _pieces(time_s: Array) -> list[slice]:
-    """Samples that follow each other within `_PIECE_S` of the first of their piece."""
+def _split_pieces(time_s: Array) -> list[slice]:
+    """Slices of samples within `_PIECE_S` of the first sample of the slice."""
     starts = [0]
     for k, t in enumerate(time_s.tolist()):
         if not 0.0 <= t - time_s[starts[-1]] < _PIECE_S:
@@ -492,6 +493,6 @@ def _pieces(time_s: Array) -> list[slice]:
     return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(time_s)], strict=True)]
 
 
-def _down(accel: Array) -> Array:
+def _mean_down(accel: Array) -> Array:
     mean = accel.mean(axis=0)
     return np.asarray(-mean / max(float(np.linalg.norm(mean)), 1e-9))

@@ -139,11 +139,11 @@ def test_a_verdict_by_other_limits_allows_nothing():
     core.handle(LimitsChanged(2 * 10**9, limits(max_heading_sigma_deg=0.25)))
     assert back.state.value == "OBSERVING"
     assert back.proposal is None
-    assert "no gate has judged yet" in back.holds()
+    assert "no gate has judged yet" in back.obstacles()
     assert core._era() != era  # nor does one that is still being worked on
     assert core.settings.calibrator.limits.max_heading_sigma_deg == 0.25
     assert core.calibrator.settings.limits.max_heading_sigma_deg == 0.25
-    assert core.calibrator.anew().settings.limits.max_heading_sigma_deg == 0.25
+    assert core.calibrator.make_fresh().settings.limits.max_heading_sigma_deg == 0.25
 
 
 def test_a_running_daemon_takes_it_on_sighup(emulated, tmp_path):

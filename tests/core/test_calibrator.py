@@ -73,7 +73,7 @@ def test_what_is_held_out_is_never_seen_by_the_estimator(blocks):
     held, rng = 0, np.random.default_rng(1)
     for block in later(blocks, 3):
         plain.take(block)
-        kept_out = all(role == "heldout" for role, _ in other.collector.parts(block))
+        kept_out = all(role == "heldout" for role, _ in other.collector.split(block))
         held += len(block) * kept_out
         raw = block.raw_b_gauss + 0.2 * rng.standard_normal(block.raw_b_gauss.shape)
         other.take(replace(block, raw_b_gauss=raw) if kept_out else block)
@@ -132,20 +132,22 @@ def test_a_known_field_gives_the_scale(blocks):
 
 def test_without_an_estimate_nothing_is_judged():
     calibrator = Calibrator(settings(), Affine.identity(), np.zeros(3))
-    assert calibrator.judged(0.0, HEALTH, BASIS) == ()
+    assert calibrator.judge_estimate(0.0, HEALTH, BASIS) == ()
     assert calibrator.finish() is None
 
 
 def test_it_is_judged_by_every_gate(blocks):
     calibrator = run(blocks)
-    gates = calibrator.judged(60.0, HEALTH, BASIS)
+    gates = calibrator.judge_estimate(60.0, HEALTH, BASIS)
     assert len(gates) > 30
     assert len({gate.gate for gate in gates}) == len(gates)
     verdicts = {gate.gate: gate.ok for gate in gates}
     assert verdicts["observability.converged"]
     assert verdicts["stream_health.errors"]
     worse = replace(HEALTH, crc_error_rate=0.5)
-    assert not {g.gate: g.ok for g in calibrator.judged(61.0, worse, BASIS)}["stream_health.errors"]
+    assert not {g.gate: g.ok for g in calibrator.judge_estimate(61.0, worse, BASIS)}[
+        "stream_health.errors"
+    ]
 
 
 def test_anew_has_seen_nothing_and_keeps_what_is_in_force(blocks):
@@ -154,7 +156,7 @@ def test_anew_has_seen_nothing_and_keeps_what_is_in_force(blocks):
     for block in blocks[:100]:
         calibrator.take(block)
     assert calibrator.estimate is not None
-    fresh = calibrator.anew()
+    fresh = calibrator.make_fresh()
     assert fresh.estimate is None
     assert not fresh.started
     assert fresh.present is present
@@ -174,7 +176,7 @@ def test_what_is_left_over_is_told_once_and_judged():
         calibrator = run(cut)
         calibrator.finish()
         told[size_gauss] = [note.text for note in calibrator.take_notes(0.0)]
-        gates = {gate.gate: gate for gate in calibrator.judged(170.0, HEALTH, BASIS)}
+        gates = {gate.gate: gate for gate in calibrator.judge_estimate(170.0, HEALTH, BASIS)}
         places[size_gauss] = gates["field.place"]
     assert told[0.0] == []
     (text,) = told[5e-4]

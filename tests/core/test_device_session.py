@@ -48,7 +48,7 @@ class Talk:
         self.device.advance(self.now_s)
         self.said, self.sent, self.events = [], b"", []
         self.journal, self.disk_full = [], False
-        self.device_session.opened(115200, self.now_s)
+        self.device_session.on_opened(115200, self.now_s)
 
     def step(self):
         output = self.device_session.session.take_output()
@@ -57,7 +57,7 @@ class Talk:
         self.now_s += STEP_S
         data = self.device.advance(self.now_s)
         if data:
-            self.events += self.device_session.received(data, self.now_s)
+            self.events += self.device_session.receive(data, self.now_s)
         due = self.device_session.deadline_s
         if due is not None and self.now_s >= due:
             self.events += self.device_session.tick(self.now_s)
@@ -69,7 +69,7 @@ class Talk:
         self.said += said
         for one in said:
             if isinstance(one, ConfigurationRead):
-                self.device_session.known(one.values, self.journal)
+                self.device_session.on_registers_and_journal(one.values, self.journal)
         actions = self.device_session.outputs.take_actions()
         while actions:
             action = actions.pop(0)
@@ -79,7 +79,7 @@ class Talk:
             if not self.disk_full:
                 self.journal.append(StoredRecord(action.kind.value, dict(action.facts)))
             error = "no space left" if self.disk_full else ""
-            self.device_session.journalled(action.kind, error, self.now_s)
+            self.device_session.on_journalled(action.kind, error, self.now_s)
             actions += self.device_session.outputs.take_actions()
 
     def until(self, condition, seconds=20.0):
@@ -137,7 +137,7 @@ def test_closed_in_any_phase_the_device_is_as_it_was(phase):
         talk.in_phase(Phase.READY)
     elif phase is Phase.CLOSED:
         talk.in_phase(Phase.READY)
-        talk.device_session.lost(talk.now_s)
+        talk.device_session.on_link_lost(talk.now_s)
     elif phase is Phase.SERVING:
         talk.in_phase(Phase.READY).device_session.serve(Read(23), talk.now_s)
         assert talk.device_session.phase is phase
@@ -181,12 +181,12 @@ def test_of_a_known_device_nothing_is_used_before_it_answers_again():
 
 def test_another_device_is_not_given_the_first_ones_settings():
     talk = Talk(change_stream=True).in_phase(Phase.READY)
-    talk.device_session.lost(talk.now_s)
+    talk.device_session.on_link_lost(talk.now_s)
     other = build(Setup(output="binary", rate_hz=20))
     other.replace_unit(7)
     talk.device, talk.before = other, dict(other.memory.ram)
     other.advance(talk.now_s)
-    talk.device_session.opened(115200, talk.now_s)
+    talk.device_session.on_opened(115200, talk.now_s)
     talk.in_phase(Phase.READY)
     assert talk.device_session.identity.serial == 7
     before = {key: other.memory.ram[key] for key in other.memory.ram if key[0] in SESSION_SETTINGS}
@@ -199,9 +199,9 @@ def test_another_device_is_not_given_the_first_ones_settings():
 def test_a_device_that_cannot_be_asked_is_not_written_to_at_the_end():
     """Plugged in again it may be another one: what is not known is not put back."""
     talk = Talk(change_stream=True).in_phase(Phase.READY)
-    talk.device_session.lost(talk.now_s)
-    talk.device_session.opened(115200, talk.now_s)
-    talk.device_session.lost(talk.now_s)
+    talk.device_session.on_link_lost(talk.now_s)
+    talk.device_session.on_opened(115200, talk.now_s)
+    talk.device_session.on_link_lost(talk.now_s)
     sent = len(talk.sent)
     assert isinstance(talk.close().error, LinkGone)
     assert b"VNWRG" not in talk.sent[sent:]
@@ -275,7 +275,7 @@ def test_the_gate_is_asked_for_every_command_of_the_write_back():
 def test_a_lost_link_ends_a_procedure_with_the_reason():
     talk = Talk(Mode.STAGE).in_phase(Phase.READY)
     talk.device_session.run("look", read(23), Purpose.STAGE, talk.now_s)
-    talk.device_session.lost(talk.now_s)
+    talk.device_session.on_link_lost(talk.now_s)
     (done,) = [one for one in talk.device_session.take_events() if isinstance(one, Completed)]
     assert (done.name, type(done.error)) == ("look", LinkGone)
     assert talk.device_session.may_close

@@ -15,7 +15,12 @@ import pytest
 from ahrsd.calibration import Affine, Estimate, Observability
 from ahrsd.samples import Array
 from ahrsd.stream.decompensation import Compensation
-from ahrsd.writeback.composition import UnwritableError, apart_deg, compose, heading_change_deg
+from ahrsd.writeback.composition import (
+    UnwritableError,
+    compose,
+    heading_change_deg,
+    proposal_distance_deg,
+)
 from drivers.vn100.registers import (
     Values,
     format_command,
@@ -215,8 +220,8 @@ def test_apart_is_what_a_person_would_see() -> None:
     one = compose(estimate, held)
     east = np.array([0.0, 0.01, 0.0])
     other = compose(replace(estimate, hard_iron_gauss=estimate.hard_iron_gauss + east), held)
-    assert apart_deg(one, one, estimate) == pytest.approx(0.0, abs=1e-6)
-    assert 1.0 < apart_deg(one, other, estimate) < 6.0
+    assert proposal_distance_deg(one, one, estimate) == pytest.approx(0.0, abs=1e-6)
+    assert 1.0 < proposal_distance_deg(one, other, estimate) < 6.0
 
 
 BAD: dict[str, dict[str, Any]] = {

@@ -93,11 +93,11 @@ def test_an_output_that_moved_to_a_free_register_is_the_sessions():
 def test_the_users_outputs_are_told_register_by_register():
     kept = KeptOutputs()
     found = {**USERS, 6: (0,), 75: OURS, 7: (20,), 23: (1.0,) * 12}
-    kept.read(5, found, records(KEPT))
+    kept.update(5, found, records(KEPT))
     assert kept.users == {**USERS, 7: (20,)}  # 7 is none of the session's: somebody wrote it
     assert kept.left == (75, 6)
     assert "$VNWRG,06,14*" in kept.describe_left(put_back=False)
-    kept.read(5, found, [])
+    kept.update(5, found, [])
     assert kept.users == {n: found[n] for n in USERS}
     assert kept.left == ()
 
@@ -110,10 +110,10 @@ def test_only_an_open_record_of_this_device_counts():
 
 def test_a_journal_that_cannot_be_trusted_leaves_what_this_run_kept():
     kept = KeptOutputs()
-    kept.read(5, {**USERS, 6: (0,)}, records(KEPT))
-    kept.read(5, {**USERS, 6: (0,)}, None)
+    kept.update(5, {**USERS, 6: (0,)}, records(KEPT))
+    kept.update(5, {**USERS, 6: (0,)}, None)
     assert kept.users == USERS
-    kept.read(6, {**USERS, 6: (0,)}, None)
+    kept.update(6, {**USERS, 6: (0,)}, None)
     assert kept.users == {**USERS, 6: (0,)}
 
 

@@ -111,7 +111,7 @@ def test_soft_iron_on_a_vehicle_that_turns_about_one_axis_is_no_wrong_sign(kind,
 
 def test_what_fits_is_what_is():
     checks, _ = said(*stream())
-    g, sigma, _ = checks._fit()
+    g, sigma, _ = checks._fit_gyro_gain()
     assert np.allclose(g, 1.0, atol=0.2)
     assert np.all(sigma < 0.2)
 

@@ -51,16 +51,16 @@ def test_an_answer_to_a_question_from_before_the_doubt_counts_for_nothing():
     line = holding(1)
     line.confirm(1.5)
     line.hold(block(2), 2.0, "")
-    line.doubt(2.5, perhaps_restarted=False)
+    line.mark_doubt(2.5, perhaps_restarted=False)
     assert line.confirm(2.2) == []
     assert numbers(line.confirm(2.6)) == [2]
 
 
 def test_between_two_doubts_without_an_answer_nothing_counts():
     line = holding(1)
-    line.doubt(1.5, perhaps_restarted=False)
+    line.mark_doubt(1.5, perhaps_restarted=False)
     line.hold(block(2), 2.0, "")
-    line.doubt(2.5, perhaps_restarted=False)
+    line.mark_doubt(2.5, perhaps_restarted=False)
     line.hold(block(3), 3.0, "")
     released = line.confirm(4.0)
     assert numbers(released) == [1, 3]
@@ -74,7 +74,7 @@ def test_between_two_doubts_without_an_answer_nothing_counts():
 
 def test_where_the_doubt_may_be_a_restart_nothing_from_before_it_counts():
     line = holding(1, 2)
-    line.doubt(2.5, perhaps_restarted=True)
+    line.mark_doubt(2.5, perhaps_restarted=True)
     line.hold(block(3), 3.0, "")
     assert numbers(line.confirm(4.0)) == [3]
     assert line.dropped == 8
@@ -100,7 +100,7 @@ def test_what_counts_was_vouched_for_from_both_sides(script):
         if what == "hold":
             line.hold(block(at_s), float(at_s), at_s)
         elif what in ("gap", "restart"):
-            line.doubt(float(at_s), perhaps_restarted=what == "restart")
+            line.mark_doubt(float(at_s), perhaps_restarted=what == "restart")
         elif what == "ask":
             asked = at_s
         elif asked is not None:

@@ -198,7 +198,7 @@ def test_a_bug_in_a_transaction_leaves_the_output_on(live):
     with live({"output": "imu"}, mode="stage") as daemon:
 
         def breakdown():
-            daemon.core.device_session.received = None
+            daemon.core.device_session.receive = None
 
         Operator(daemon, "STAGING", breakdown)
         daemon.until(lambda: "STAGING" in daemon.states)

@@ -160,9 +160,9 @@ def present(**changes):
 
 def warmed(run=None, clock=NOW, limit_s=LIMIT_S):
     warm = WarmStart(limit_s)
-    warm.clock(clock)
-    warm.sampled(inputs.EarlierSamples(0, block()))
-    warm.ended(run or told())
+    warm.set_clock(clock)
+    warm.add_samples(inputs.EarlierSamples(0, block()))
+    warm.on_samples_complete(run or told())
     return warm
 
 
@@ -186,7 +186,7 @@ def warmed(run=None, clock=NOW, limit_s=LIMIT_S):
 )
 def test_what_is_not_used_and_why(run, now, clock, words):
     warm = warmed(told(**run), replace(NOW, **clock))
-    blocks, _ = warm.due(present(**now), 900.0)
+    blocks, _ = warm.take_due(present(**now), 900.0)
     assert blocks == []
     assert words in warm.text
     assert warm.text.startswith("not used: ")
@@ -203,24 +203,24 @@ def test_a_wall_clock_that_lies_makes_nothing_young(wall_s):
 
 def test_other_quantities_wait_for_the_right_stream():
     warm = warmed()
-    assert warm.due(present(compensated=(True, True)), 900.0) == ([], "")
+    assert warm.take_due(present(compensated=(True, True)), 900.0) == ([], "")
     assert "same quantities" in warm.text
-    blocks, text = warm.due(present(), 900.0)
+    blocks, text = warm.take_due(present(), 900.0)
     assert len(blocks) == 1
     assert "300 samples up to 10.0 min old, from a.mcap" in text
 
 
 def test_a_device_that_restarted_gets_them_before_its_first_sample():
-    blocks, _ = warmed().due(present(at_s=3.0), 3.0)
+    blocks, _ = warmed().take_due(present(at_s=3.0), 3.0)
     assert blocks[-1].time_s[-1] == pytest.approx(3.0 - 600.0 - 1.0)
 
 
 @pytest.mark.parametrize(("limit_s", "passive"), [(0.0, False), (1800.0, True)])
 def test_it_can_be_switched_off_and_is_in_passive(limit_s, passive):
     warm = WarmStart(limit_s, passive=passive)
-    warm.sampled(inputs.EarlierSamples(0, block()))
-    assert warm.ended(told()) == ""
-    assert warm.due(present(), 900.0) == ([], "")
+    warm.add_samples(inputs.EarlierSamples(0, block()))
+    assert warm.on_samples_complete(told()) == ""
+    assert warm.take_due(present(), 900.0) == ([], "")
     assert warm.text.startswith("off: ")
     assert warm.confirms(estimate())
 
@@ -230,7 +230,7 @@ def test_it_can_be_switched_off_and_is_in_passive(limit_s, passive):
 
 def used():
     warm = warmed()
-    warm.due(present(), 900.0)
+    warm.take_due(present(), 900.0)
     return warm
 
 
@@ -238,7 +238,9 @@ def seen(warm, seconds, rate=0.2, field=(0.27, 0.27, 0.31)):
     for k in range(round(4 * seconds)):
         t = 900.0 + 0.25 * k + np.arange(1, 11) / 40.0
         raw, spin = np.tile(field, (10, 1)), np.tile([0.01, -0.02, rate + 0.005], (10, 1))
-        warm.live(SampleBlock(t, np.full(10, 1 / 40.0), t, raw, spin, np.full((10, 3), np.nan), {}))
+        warm.add_live_samples(
+            SampleBlock(t, np.full(10, 1 / 40.0), t, raw, spin, np.full((10, 3), np.nan), {})
+        )
 
 
 def right():
@@ -271,7 +273,7 @@ def test_rest_or_another_field_does_not(rate, field, words):
 def test_a_doubt_begins_the_minute_anew():
     warm = used()
     seen(warm, 50.0, field=right())
-    warm.doubt()
+    warm.restart_confirmation()
     seen(warm, 50.0, field=right())
     assert not warm.confirms(estimate())
     seen(warm, 20.0, field=right())
@@ -280,7 +282,7 @@ def test_a_doubt_begins_the_minute_anew():
 
 def test_a_calibrator_that_began_anew_knows_nothing_of_them():
     warm = used()
-    warm.over("another device was here")
+    warm.end("another device was here")
     assert warm.confirms(estimate())
     assert warm.text == "over: another device was here"
 

@@ -225,7 +225,7 @@ def test_a_verdict_on_what_was_before_the_link_was_lost_writes_nothing():
 
 def test_a_verdict_on_registers_that_are_in_force_no_more_writes_nothing():
     run = candidate(BesideRun(Mode.STAGE))
-    run.core.in_force(run.core.registers)
+    run.core.set_registers_in_force(run.core.registers)
     run.work()
     run.run(5.0)
     assert run.writes == 0
@@ -302,14 +302,14 @@ def test_soon_again_means_a_longer_pause():
     state = EstimatorState()
     pauses = []
     for _ in range(6):
-        state.broke_off(REASON)
+        state.record_failure(REASON)
         pauses.append(state.left_s)
         while state.failed:
-            state.takes(second())
+            state.accepts(second())
     assert pauses == [5.0, 10.0, 20.0, 40.0, 60.0, 60.0]
     for _ in range(301):
-        assert state.takes(second())
-    state.broke_off(REASON)
+        assert state.accepts(second())
+    state.record_failure(REASON)
     assert state.left_s == 5.0
 
 
@@ -335,7 +335,7 @@ def test_nothing_is_written_from_an_estimator_that_failed(state):
         run.run(1.0)
         fail_waiting(run)
     assert run.core.writeback.proposal is None
-    assert "no gate has judged yet" in run.core.writeback.holds()
+    assert "no gate has judged yet" in run.core.writeback.obstacles()
 
 
 def fail_waiting(run: BesideRun) -> None:

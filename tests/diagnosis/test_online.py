@@ -412,7 +412,7 @@ BASIS = BasisFacts(True, False, False, False, True)
 
 
 def gate_of(calibrator: Calibrator) -> bool:
-    gates = {gate.gate: gate.ok for gate in calibrator.judged(0.0, HEALTH, BASIS)}
+    gates = {gate.gate: gate.ok for gate in calibrator.judge_estimate(0.0, HEALTH, BASIS)}
     return gates["stationarity.step"]
 
 

@@ -118,7 +118,7 @@ def old() -> Affine:
 
 def collect(scene: Scene) -> EvidenceCollector:
     collector = EvidenceCollector()
-    for _, part in collector.parts(scene.block()):
+    for _, part in collector.split(scene.block()):
         collector.add(part)
     collector.finish()
     return collector

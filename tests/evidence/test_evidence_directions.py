@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from ahrsd.evidence.coverage import CELLS, cells_of, centres, shown
+from ahrsd.evidence.coverage import CELLS, cell_centres, cells_of, visited_cells
 
 
 def test_the_middle_of_each_cell_lies_in_it():
-    assert cells_of(centres()).tolist() == list(range(CELLS))
-    assert np.linalg.norm(centres(), axis=1) == pytest.approx(np.ones(CELLS))
+    assert cells_of(cell_centres()).tolist() == list(range(CELLS))
+    assert np.linalg.norm(cell_centres(), axis=1) == pytest.approx(np.ones(CELLS))
 
 
 def test_cells_are_about_equally_large():
@@ -23,17 +23,19 @@ def test_length_does_not_count_and_nothing_points_nowhere():
         0,
         CELLS - 3,
     ]
-    assert np.flatnonzero(shown(np.array([[1e-3, 1e-3, 1.0], [0.0, 0.0, -1.0]]))).tolist() == [
+    assert np.flatnonzero(
+        visited_cells(np.array([[1e-3, 1e-3, 1.0], [0.0, 0.0, -1.0]]))
+    ).tolist() == [
         0,
         CELLS - 3,
     ]
-    assert not shown(np.zeros((2, 3))).any()
+    assert not visited_cells(np.zeros((2, 3))).any()
 
 
 def test_level_circles_show_one_ring_at_the_dip(world) -> None:
     """A dip of 60 degrees: all cells lie at about 30 degrees from down, all around."""
     motion = world.evidence(world.Scene(roll_deg=0.0, pitch_deg=0.0)).motion
-    middle = centres()[motion.directions]
+    middle = cell_centres()[motion.directions]
     from_down_deg = np.degrees(np.arccos(middle[:, 2]))
     assert (np.abs(from_down_deg - 30.0) <= 5.5).all()
     assert 15 <= len(middle) <= 36

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ahrsd.calibration import Affine
-from ahrsd.evidence.second_opinions import rest, stretches
+from ahrsd.evidence.second_opinions import contiguous_segments, mean_rate_at_rest
 from ahrsd.evidence.segments import SegmentHistory
 from ahrsd.samples import SampleBlock
 from ahrsd.world_field import WorldField
@@ -65,7 +65,7 @@ def test_temperature_range(world) -> None:
     block = world.Scene().block()
     block.covariates["temperature_c"][:] = np.linspace(20, 31, len(block))
     collector = world.EvidenceCollector()
-    for _, part in collector.parts(block):
+    for _, part in collector.split(block):
         collector.add(part)
     seen = collector.evaluate(
         world.estimate(), world.old(), np.zeros(3), None, world.HEALTHY, world.SOUND
@@ -123,9 +123,9 @@ def rests(seconds_of_rest: float, every_s: float, phase_s: float, minutes: float
     dt_s[0] = np.nan
     block = SampleBlock(time_s, dt_s, time_s, field, rate, force, gap_before=True)
     history = SegmentHistory()
-    for _, part in history.parts(block):
+    for _, part in history.split(block):
         history.add(part)
-    history.interrupt()
+    history.close_segment()
     return history.segments
 
 
@@ -135,25 +135,25 @@ BIAS = np.array([0.004, -0.005, 0.002])
 @pytest.mark.parametrize("phase_s", np.arange(0.0, 60.0, 1.3))
 def test_rest_counts_however_it_falls(phase_s: float) -> None:
     """Also where the cut between two segments lies in the middle of it."""
-    found = rest(rests(6.0, 60.0, phase_s))
+    found = mean_rate_at_rest(rests(6.0, 60.0, phase_s))
     assert found.duration_s >= 3.0 * 8  # 6 s a minute: five whole bins less the two outer ones
     assert found.duration_s <= 6.0 * 10
     assert np.linalg.norm(found.rate_b_rad_s - BIAS) < 4e-4
 
 
 def test_one_long_rest_is_not_longer_than_it_was() -> None:
-    found = rest(rests(300.0, 600.0, 100.0))
+    found = mean_rate_at_rest(rests(300.0, 600.0, 100.0))
     assert found.duration_s == pytest.approx(300.0, abs=4.0)
 
 
 def test_rest_from_before_the_devices_clock_began_anew_is_of_before() -> None:
     segments = rests(6.0, 60.0, 10.0, minutes=4.0)
-    before = rest(segments).duration_s
-    assert rest([*segments, *segments]).duration_s == before
+    before = mean_rate_at_rest(segments).duration_s
+    assert mean_rate_at_rest([*segments, *segments]).duration_s == before
 
 
 def test_a_hole_in_the_stream_is_no_rest() -> None:
     segments = rests(300.0, 600.0, 100.0)
-    pieces = stretches(segments)
+    pieces = contiguous_segments(segments)
     assert [len(piece) for piece in pieces] == [len(segments)]
-    assert len(stretches(segments[:5] + segments[6:])) == 2
+    assert len(contiguous_segments(segments[:5] + segments[6:])) == 2

@@ -6,7 +6,7 @@ import pytest
 from ahrsd.calibration import Affine
 from ahrsd.evidence.collector import Envelope, heading_error_curve, worst_difference_deg
 from ahrsd.evidence.coverage import turn_advice
-from ahrsd.evidence.heading import SECTORS, sectors
+from ahrsd.evidence.heading import SECTORS, visited_sectors
 
 LEVEL = np.array([0.25, 0.0, 0.433])
 
@@ -78,7 +78,7 @@ def test_closure_sees_a_gyro_scale_error(world) -> None:
     block = world.Scene(roll_deg=0.5, pitch_deg=0.5).block()
     block.gyro_b_rad_s[:] = world.BIAS + 1.01 * (block.gyro_b_rad_s - world.BIAS)
     collector = world.EvidenceCollector()
-    for _, part in collector.parts(block):
+    for _, part in collector.split(block):
         collector.add(part)
     seen = collector.evaluate(
         world.estimate(), world.old(), np.zeros(3), None, world.HEALTHY, world.SOUND
@@ -127,5 +127,5 @@ def test_turn_advice_names_the_shorter_way() -> None:
 
 
 def test_sectors_wrap_and_skip_what_is_unknown() -> None:
-    seen = sectors(np.radians([5.0, -5.0, 725.0, np.nan]))
+    seen = visited_sectors(np.radians([5.0, -5.0, 725.0, np.nan]))
     assert np.flatnonzero(seen).tolist() == [0, 35]

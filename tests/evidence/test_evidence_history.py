@@ -20,14 +20,14 @@ def block(start_s=0.0, seconds=1.0, rate_hz=100.0, *, turn=0.0, gap=False, epoch
 
 def fill(history: SegmentHistory, start_s: float, end_s: float, **given) -> None:
     for t in np.arange(start_s, end_s):
-        for _, part in history.parts(block(float(t), **given)):
+        for _, part in history.split(block(float(t), **given)):
             history.add(part)
 
 
 def test_every_fourth_slot_of_thirty_seconds_is_held_out() -> None:
     history = SegmentHistory()
     fill(history, 100.0, 350.0)
-    history.interrupt()
+    history.close_segment()
     assert [s.heldout for s in history.segments] == [False] * 3 + [True] + [False] * 3 + [True] + [
         False
     ]
@@ -40,11 +40,11 @@ def test_every_fourth_slot_of_thirty_seconds_is_held_out() -> None:
 def test_role_is_the_same_however_the_stream_is_cut() -> None:
     whole = block(0.0, 250.0)
     one, many = SegmentHistory(), SegmentHistory()
-    for _, part in one.parts(whole):
+    for _, part in one.split(whole):
         one.add(part)
     fill(many, 0.0, 250.0)
-    one.interrupt()
-    many.interrupt()
+    one.close_segment()
+    many.close_segment()
     assert len(one.segments) == len(many.segments) == 9
     for a, b in zip(one.segments, many.segments, strict=True):
         assert a.heldout == b.heldout
@@ -54,7 +54,7 @@ def test_role_is_the_same_however_the_stream_is_cut() -> None:
 
 def test_parts_are_disjoint_complete_and_gapped_where_the_role_changes() -> None:
     history = SegmentHistory()
-    parts = history.parts(block(0.0, 125.0))
+    parts = history.split(block(0.0, 125.0))
     assert [role for role, _ in parts] == ["train"] * 3 + ["heldout", "train"]
     assert [part.gap_before for _, part in parts] == [False, False, False, True, True]
     np.testing.assert_array_equal(
@@ -67,7 +67,7 @@ def test_averages_share_one_instant() -> None:
     """At 100 Hz four samples are one; a field linear in time and the angle tell the same time."""
     history = SegmentHistory()
     fill(history, 0.0, 20.0, turn=0.5)
-    history.interrupt()
+    history.close_segment()
     segment = history.segments[0]
     assert segment.averaged == 4
     np.testing.assert_allclose(np.diff(segment.time_s), 0.04)
@@ -83,7 +83,7 @@ def test_a_gap_and_a_new_register_epoch_end_a_segment(change) -> None:
     fill(history, 0.0, 10.0)
     history.add(replace(block(10.5), **change))
     fill(history, 12.0, 20.0, epoch=change.get("epoch", 0))
-    history.interrupt()
+    history.close_segment()
     assert [float(s.time_s[0]) for s in history.segments] == pytest.approx([0.015, 10.515])
 
 
@@ -94,7 +94,7 @@ def test_a_sample_that_is_not_finite_ends_the_segment() -> None:
     bad.raw_b_gauss[3, 1] = np.nan
     history.add(bad)
     fill(history, 11.0, 20.0)
-    history.interrupt()
+    history.close_segment()
     assert [len(s) for s in history.segments] == [250, 225]
     assert all(np.isfinite(s.raw_b_gauss).all() for s in history.segments)
 
@@ -103,7 +103,7 @@ def test_a_clock_that_starts_again_begins_a_segment() -> None:
     history = SegmentHistory()
     fill(history, 1000.0, 1010.0)
     fill(history, 0.0, 10.0)
-    history.interrupt()
+    history.close_segment()
     assert [float(s.time_s[0]) for s in history.segments] == pytest.approx([1000.015, 0.015])
     assert history.role(block(95.0)) == "heldout"
 
@@ -113,19 +113,19 @@ def test_memory_is_bounded_and_rest_is_forgotten_first() -> None:
     fill(history, 0.0, 40.0, turn=0.5, rate_hz=10)
     fill(history, 40.0, 60.0, rate_hz=10)
     fill(history, 60.0, 200.0, turn=0.5, rate_hz=10)
-    history.interrupt()
+    history.close_segment()
     assert len(history.segments) == 8
     assert all(s.turned_rad > 1.0 for s in history.segments)
     quiet = SegmentHistory(HistoryParameters(segment_s=10.0, segments=8))
     fill(quiet, 0.0, 40.0, turn=0.5, rate_hz=10)
     fill(quiet, 40.0, 200.0, rate_hz=10)
-    quiet.interrupt()
+    quiet.close_segment()
     assert [s.turned_rad > 1.0 for s in quiet.segments] == [True] * 4 + [False] * 4
 
 
 def test_an_empty_block_changes_nothing() -> None:
     history = SegmentHistory()
     history.add(block(0.0, 0.0))
-    assert history.parts(block(0.0, 0.0)) == []
+    assert history.split(block(0.0, 0.0)) == []
     assert history.role(block(0.0, 0.0)) == "train"
     assert history.segments == []

@@ -5,25 +5,25 @@ import pytest
 
 from ahrsd.calibration import Affine
 from ahrsd.evidence.collector import Envelope, heading_error_curve, worst_difference_deg
-from ahrsd.evidence.second_opinions import gyro_fit, size_fit
-from ahrsd.evidence.segments import SegmentHistory, nodes_at, track
+from ahrsd.evidence.second_opinions import fit_magnitude, fit_with_gyro
+from ahrsd.evidence.segments import SegmentHistory, integrate_attitude, join_tracks
 
 DIP = np.radians(60.0)
 
 
 def nodes_of(world, scene):
     history = SegmentHistory()
-    for _, part in history.parts(scene.block()):
+    for _, part in history.split(scene.block()):
         history.add(part)
-    history.interrupt()
-    return nodes_at([track(s, world.BIAS) for s in history.segments], world.BIAS)
+    history.close_segment()
+    return join_tracks([integrate_attitude(s, world.BIAS) for s in history.segments], world.BIAS)
 
 
 def worst(fit, world, tilt):
     return worst_difference_deg(fit, world.truth(), Envelope(0.5, DIP, tilt, tilt))
 
 
-@pytest.mark.parametrize("fit", [gyro_fit, size_fit])
+@pytest.mark.parametrize("fit", [fit_with_gyro, fit_magnitude])
 @pytest.mark.parametrize("noise", [0.0005, 0.005])
 def test_rich_motion_from_the_factory_setting(world, fit, noise) -> None:
     found = fit(nodes_of(world, world.Scene(noise_gauss=noise)), Affine.identity(), noise / 1.4)
@@ -32,7 +32,7 @@ def test_rich_motion_from_the_factory_setting(world, fit, noise) -> None:
     np.testing.assert_allclose(found.matrix, world.truth().matrix, atol=2e-3 + noise)
 
 
-@pytest.mark.parametrize(("fit", "limit"), [(gyro_fit, 0.1), (size_fit, 0.7)])
+@pytest.mark.parametrize(("fit", "limit"), [(fit_with_gyro, 0.1), (fit_magnitude, 0.7)])
 def test_flat_motion_gives_level_heading_and_holds_the_vertical(world, fit, limit) -> None:
     nodes = nodes_of(world, world.Scene(roll_deg=1.0, pitch_deg=1.0))
     present = Affine(np.eye(3), np.array([0.0, 0.0, world.HARD[2]]))
@@ -44,7 +44,7 @@ def test_flat_motion_gives_level_heading_and_holds_the_vertical(world, fit, limi
 
 def test_the_scale_of_the_present_calibration_is_kept(world) -> None:
     nodes = nodes_of(world, world.Scene())
-    for fit in (gyro_fit, size_fit):
+    for fit in (fit_with_gyro, fit_magnitude):
         found = fit(nodes, Affine(1.3 * np.eye(3), np.zeros(3)), 0.00035)
         assert np.linalg.det(found.matrix) == pytest.approx(1.3**3, rel=1e-9)
 
@@ -54,8 +54,8 @@ def test_noise_pulls_towards_the_present_and_not_towards_zero(world) -> None:
     noise = 0.005
     nodes = nodes_of(world, world.Scene(noise_gauss=noise, roll_deg=0.0, pitch_deg=0.0))
     present = Affine(np.diag([1.0, 1.0, 1.2]), world.HARD)
-    known = gyro_fit(nodes, present, noise / np.sqrt(2))
-    denied = gyro_fit(nodes, present, 1e-5)
+    known = fit_with_gyro(nodes, present, noise / np.sqrt(2))
+    denied = fit_with_gyro(nodes, present, 1e-5)
     shares = [f.matrix[2, 2] / f.matrix[:2, :2].trace() for f in (known, denied)]
     assert shares[0] == pytest.approx(0.6, abs=0.03)
     assert shares[1] < 0.52
@@ -90,5 +90,5 @@ def test_a_size_fit_that_is_no_ellipsoid_is_refused(world) -> None:
     nodes = nodes_of(world, world.Scene(duration_s=60.0))
     rng = np.random.default_rng(3)
     nodes.raw_b_gauss[:] = rng.standard_normal(nodes.raw_b_gauss.shape)  # a ball, not a shell
-    found = size_fit(nodes, Affine.identity(), 1e-4)
+    found = fit_magnitude(nodes, Affine.identity(), 1e-4)
     assert found is None or worst(found, world, 5.0) > 10.0

@@ -25,7 +25,7 @@ from ahrsd.core.core import Core
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import NothingToFit, Track
 from ahrsd.inputs import RegistersKnown, Samples, Stop
-from ahrsd.offline.track import checked, track_of
+from ahrsd.offline.track import check_track, track_of
 from ahrsd.report.summary import summary_json
 from ahrsd.samples import SampleBlock, known_force
 
@@ -190,7 +190,7 @@ def through_the_diagnosis(r: Readings) -> str:
     made = blocks(r)
     if not made:
         return "no samples"
-    track: Track = checked(track_of(made))[0]
+    track: Track = check_track(track_of(made))[0]
     try:
         done = diagnose(track)
     except NothingToFit as error:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from shown_status import cell_of, cells, level_ring, motion
 
-from ahrsd.evidence.coverage import CELLS, centres
+from ahrsd.evidence.coverage import CELLS, cell_centres
 from ahrsd.page.view import MIDDLES, RADIUS, Fresh, dots, marker, project
 from ahrsd.telemetry.driving import shown_of
 
@@ -65,7 +65,7 @@ def test_what_is_missing_of_the_circle_is_to_be_shown_while_it_is_wanted():
 
 def test_what_was_seen_just_now_is_fresh_until_it_is_counted():
     fresh = Fresh(keep_s=60.0)
-    direction = centres()[cell_of(120.0)].tolist()
+    direction = cell_centres()[cell_of(120.0)].tolist()
     fresh.take(direction, 10.0)
     nothing = shown_of({"motion": motion("0" * CELLS)})
     assert len(places(dots(nothing, fresh.cells(30.0), circle=True, tilts=True).fresh)) == 1

@@ -20,7 +20,7 @@ from ahrsd.config.sections import LocationSection
 from ahrsd.errors import RecordingError
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.offline.calibrate import calibrate
-from ahrsd.offline.compare_methods import our_row, run_published, saturated
+from ahrsd.offline.compare_methods import describe_saturation, our_row, run_published
 from ahrsd.report.summary import BatchResult
 
 SOFT_IRON = np.array([[1.10, 0.10, 0.04], [0.10, 0.88, 0.02], [0.04, 0.02, 1.22]])
@@ -213,7 +213,7 @@ def test_saturated_readings(tmp_path, seed, axis, part):
     rows[:, 1 + axis] = np.minimum(rows[:, 1 + axis], limit)
     result = tried(tmp_path, rows)
     assert not isinstance(result, str)
-    assert not result.converged or "stick at" in saturated(result)
+    assert not result.converged or "stick at" in describe_saturation(result)
     ours = our_row(result, held_out=False)
     assert not ours.converged
     refused_by(result, list(METHODS))

@@ -22,7 +22,7 @@ def arbiter():
 
 
 def ask(arbiter, client, *bodies, at_s=0.0, identity=IDENTITY):
-    arbiter.received(client, b"".join(map(sentence, bodies)), identity, at_s)
+    arbiter.receive(client, b"".join(map(sentence, bodies)), identity, at_s)
 
 
 def told(arbiter):
@@ -37,32 +37,32 @@ def test_identity_is_answered_from_memory_as_the_device_prints_it(arbiter):
         ("b", b"$VNRRG,03,0100130608*51\r\n"),
         ("b", b"$VNRRG,04,3.1.0.0*77\r\n"),
     ]
-    assert arbiter.first(0.0) is None
+    assert arbiter.next_command(0.0) is None
 
 
 def test_a_command_with_a_crc_and_in_pieces_is_one(arbiter):
     for piece in (b"$VNRR", b"G,01*E1", b"5F\r\n"):
-        arbiter.received("a", piece, IDENTITY, 0.0)
+        arbiter.receive("a", piece, IDENTITY, 0.0)
     assert told(arbiter) == [("a", b"$VNRRG,01,VN-100S-CR*35\r\n")]
 
 
 def test_before_the_device_is_known_it_is_asked(arbiter):
     ask(arbiter, "a", "VNRRG,01", identity=None)
     assert told(arbiter) == []
-    assert arbiter.first(0.0).asked.command == Read(1)
+    assert arbiter.next_command(0.0).asked.command == Read(1)
 
 
 def test_one_command_on_the_wire_in_the_order_of_arrival_and_each_answer_to_its_owner(arbiter):
     ask(arbiter, "a", "VNWRG,07,20", "VNRRG,23")
     ask(arbiter, "b", "VNRRG,23", "VNRRG,30")
     sent = []
-    while arbiter.first(0.1) is not None:
-        waiting = arbiter.begin()
-        assert arbiter.first(0.1) is None  # while one is on the wire
+    while arbiter.next_command(0.1) is not None:
+        waiting = arbiter.start_next()
+        assert arbiter.next_command(0.1) is None  # while one is on the wire
         command = waiting.asked.command
         sent.append((waiting.client, command))
         word = "VNWRG" if isinstance(command, Write) else "VNRRG"
-        arbiter.ended(Reply(word, command.register, (str(len(sent)),)), None)
+        arbiter.finish_current(Reply(word, command.register, (str(len(sent)),)), None)
     assert sent == [("a", Write(7, (20,))), ("a", Read(23)), ("b", Read(23)), ("b", Read(30))]
     bodies = ["VNWRG,07,1", "VNRRG,23,2", "VNRRG,23,3", "VNRRG,30,4"]
     assert told(arbiter) == [
@@ -72,31 +72,31 @@ def test_one_command_on_the_wire_in_the_order_of_arrival_and_each_answer_to_its_
 
 def test_a_refusal_is_for_who_asked_and_silence_for_nobody(arbiter):
     ask(arbiter, "b", "VNRRG,74", "VNRRG,75")
-    arbiter.begin()
-    arbiter.ended(None, DeviceRefused(8))
-    arbiter.begin()
-    arbiter.ended(None, NoReply(Read(75)))
+    arbiter.start_next()
+    arbiter.finish_current(None, DeviceRefused(8))
+    arbiter.start_next()
+    arbiter.finish_current(None, NoReply(Read(75)))
     assert told(arbiter) == [("b", b"$VNERR,08*79\r\n")]
     assert arbiter.counts["b", "unanswered"] == 1
 
 
 def test_what_is_asked_again_while_it_waits_is_absorbed(arbiter):
     ask(arbiter, "a", "VNRRG,30")
-    arbiter.begin()
+    arbiter.start_next()
     for k in range(5):
         ask(arbiter, "a", "VNRRG,30", at_s=0.05 * k)
     assert arbiter.counts["a", "absorbed"] == 5
-    arbiter.ended(Reply("VNRRG", 30, ("0",)), None)
+    arbiter.finish_current(Reply("VNRRG", 30, ("0",)), None)
     assert len(told(arbiter)) == 1
     ask(arbiter, "a", "VNRRG,30", at_s=0.3)  # answered: a new question
-    assert arbiter.first(0.3) is not None
+    assert arbiter.next_command(0.3) is not None
 
 
 def test_the_rate_of_the_line_is_pretended(arbiter):
     ask(arbiter, "b", "VNWRG,05,921600", "VNRRG,05")
     assert told(arbiter) == [("b", sentence("VNWRG,05,921600")), ("b", sentence("VNRRG,05,921600"))]
     ask(arbiter, "a", "VNRRG,05")
-    assert arbiter.first(0.0).asked.command == Read(5)  # it has set none itself
+    assert arbiter.next_command(0.0).asked.command == Read(5)  # it has set none itself
 
 
 def test_pausing_the_output_is_a_clients_own_matter(arbiter):
@@ -104,25 +104,25 @@ def test_pausing_the_output_is_a_clients_own_matter(arbiter):
     off, on = arbiter.take_answers()
     assert off == SendToClient("b", sentence("VNASY,0"), stream=False)
     assert on == SendToClient("b", sentence("VNASY,1"), stream=True)
-    assert arbiter.first(0.0) is None
+    assert arbiter.next_command(0.0) is None
 
 
 def test_a_question_that_waited_too_long_is_dropped_and_told(arbiter):
     ask(arbiter, "a", "VNRRG,30", at_s=1.0)
     assert arbiter.deadline_s == 1.0 + PATIENCE_S
-    assert arbiter.first(1.0 + PATIENCE_S) is None
+    assert arbiter.next_command(1.0 + PATIENCE_S) is None
     assert arbiter.take_notes() == ["a: read of register 30 got no turn in time"]
     assert arbiter.deadline_s is None
 
 
 def test_a_client_that_left_is_owed_nothing(arbiter):
     ask(arbiter, "a", "VNRRG,30", "VNRRG,07")
-    arbiter.begin()
-    arbiter.received("a", b"$VNRRG", IDENTITY, 0.0)
-    arbiter.left("a")
-    arbiter.ended(Reply("VNRRG", 30, ("0",)), None)
+    arbiter.start_next()
+    arbiter.receive("a", b"$VNRRG", IDENTITY, 0.0)
+    arbiter.disconnect("a")
+    arbiter.finish_current(Reply("VNRRG", 30, ("0",)), None)
     assert told(arbiter) == []
-    assert arbiter.first(0.0) is None
+    assert arbiter.next_command(0.0) is None
     ask(arbiter, "a", "VNRRG,01")  # whoever opens it next begins with a line of its own
     assert told(arbiter) == [("a", b"$VNRRG,01,VN-100S-CR*35\r\n")]
 
@@ -130,10 +130,10 @@ def test_a_client_that_left_is_owed_nothing(arbiter):
 @pytest.mark.parametrize("garbage", [b"\x00" * 9000, b"$" * 9000, b"$VN" + b"A" * 9000])
 def test_garbage_and_half_a_command_for_ever_cost_nobody_anything(arbiter, garbage):
     for k in range(0, len(garbage), 100):
-        arbiter.received("a", garbage[k : k + 100], IDENTITY, 0.0)
+        arbiter.receive("a", garbage[k : k + 100], IDENTITY, 0.0)
     ask(arbiter, "b", "VNRRG,01")
     assert ("b", b"$VNRRG,01,VN-100S-CR*35\r\n") in told(arbiter)
-    arbiter.received("a", b"\r\n", IDENTITY, 0.0)
+    arbiter.receive("a", b"\r\n", IDENTITY, 0.0)
     ask(arbiter, "a", "VNRRG,04")
     assert ("a", b"$VNRRG,04,3.1.0.0*77\r\n") in told(arbiter)
 
@@ -143,15 +143,15 @@ def test_a_flood_is_bounded_and_the_other_is_next(arbiter):
         ask(arbiter, "a", f"VNWRG,00,{k}")
     ask(arbiter, "b", "VNRRG,30")
     for _ in range(MOST_WAITING):
-        assert arbiter.begin().client == "a"
-        arbiter.ended(None, None)
-    assert arbiter.first(0.0).client == "b"
+        assert arbiter.start_next().client == "a"
+        arbiter.finish_current(None, None)
+    assert arbiter.next_command(0.0).client == "b"
     assert arbiter.counts["a", "dropped"] == 200 - MOST_WAITING
 
 
 def test_an_unknown_client_is_nobody(arbiter):
     ask(arbiter, "c", "VNRRG,01")
-    arbiter.left("c")
+    arbiter.disconnect("c")
     assert told(arbiter) == []
 
 
@@ -169,14 +169,14 @@ def test_answers_go_to_who_asked_whatever_the_order(seed):
             tag = f"{client}{step}"
             asked[client].add(tag)
             ask(arbiter, client, f"VNWRG,00,{tag}", at_s=now_s)
-        elif what == 2 and arbiter.first(now_s) is not None:
-            arbiter.begin()
+        elif what == 2 and arbiter.next_command(now_s) is not None:
+            arbiter.start_next()
         elif what == 3 and (way := arbiter.under_way) is not None:
             how = rng.integers(0, 3)
             reply = Reply("VNWRG", 0, tuple(map(str, way.asked.command.values)))
-            arbiter.ended(*[(reply, None), (None, DeviceRefused(7)), (None, None)][how])
+            arbiter.finish_current(*[(reply, None), (None, DeviceRefused(7)), (None, None)][how])
         elif rng.random() < 0.05:
-            arbiter.left(client)
+            arbiter.disconnect(client)
             asked[client].clear()
         for one in arbiter.take_answers():
             text = one.data.decode()

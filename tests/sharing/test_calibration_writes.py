@@ -174,7 +174,7 @@ def test_nothing_is_written_over_what_the_owner_did_not_save(ends):
     run.approve()
     run.run(20.0)
     assert run.state == "QUALIFIED"
-    assert any("register 84 holds what a program" in r for r in run.core.writeback.holds())
+    assert any("register 84 holds what a program" in r for r in run.core.writeback.obstacles())
     assert run.cable.unit.held() == (ONE, THEIRS)
     if ends == "saved":
         assert say(run, "VNWNV") == "VNWNV"
@@ -183,7 +183,7 @@ def test_nothing_is_written_over_what_the_owner_did_not_save(ends):
         run.run(3.0)
         run.core.calibrator = PlantedCalibrator(run.core.calibrator, estimate())
         run.approve()
-    assert run.until("TRIAL", 40.0), run.core.writeback.holds()
+    assert run.until("TRIAL", 40.0), run.core.writeback.obstacles()
     assert run.cable.unit.held() != (ONE, THEIRS)
 
 
@@ -226,7 +226,7 @@ def test_what_the_owner_did_not_save_itself_is_not_saved_for_it(saves):
         assert (run.state, flash[25], run.cable.unit.held("flash")) == ("COMMITTED", THEIRS, NEW)
     else:
         assert (run.state, flash[25], flash[23]) == ("PROVEN", ONE, ONE)
-        assert any("somebody else changed register 25" in r for r in run.core.writeback.holds())
+        assert any("somebody else changed register 25" in r for r in run.core.writeback.obstacles())
 
 
 def test_a_journal_that_cannot_be_written_lets_nothing_pass():
@@ -246,7 +246,7 @@ def test_a_journal_that_cannot_be_written_lets_nothing_pass():
 
 def test_a_client_that_leaves_while_its_write_is_journaled_leaves_nothing_behind():
     run = shared(planted=False)
-    run.core.clients.sent(
+    run.core.clients.on_bytes(
         inputs.ClientSent(run.now_ns, "owner", "$VNWRG,84,1,0,0,0,1,0,0,0,1,0,0,1*XX\r\n"),
         run.now_s,
     )
@@ -300,7 +300,7 @@ def test_a_write_that_was_not_sent_holds_nothing_up(how):
     run = shared()
     announced_and_not_sent(run, how)
     run.approve()
-    assert run.until("TRIAL", 30.0), run.core.writeback.holds()
+    assert run.until("TRIAL", 30.0), run.core.writeback.obstacles()
     assert run.cable.unit.held() == NEW
 
 

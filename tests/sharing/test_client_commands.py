@@ -10,7 +10,7 @@ from ahrsd.sharing.arbiter import (
     Kind,
     Refusal,
     SharePolicy,
-    understand,
+    parse_client_command,
 )
 from ahrsd.writeback.permissions import permitted
 from ahrsd.writeback.states import Mode, Purpose
@@ -23,7 +23,7 @@ MATRIX = "1,0,0,0,1,0,0,0,1,0,0,0"
 
 def refused(body: str, policy: SharePolicy) -> Refusal:
     """The refusal of a write: at once, or where the register, which is read, holds otherwise."""
-    answer = understand(body, policy)
+    answer = parse_client_command(body, policy)
     if isinstance(answer, ClientCommand):
         number = int(body.split(",")[1])
         assert (answer.kind, answer.command) == (Kind.COMPARE, Read(number))
@@ -50,7 +50,7 @@ def test_what_calibrates_passes_for_an_owner_whose_share_says_so_from_mode_stage
     values = next(iter(REGISTERS[number].defaults.values()))
     body = f"VNWRG,{format_reply(number, values)}"
     passing = SharePolicy("/a", owner=True, calibration_writes="pass")
-    answer = understand(body, passing)
+    answer = parse_client_command(body, passing)
     assert answer == ClientCommand(Kind.CALIBRATE, body, Write(number, values))
     allowed = [m for m in Mode if permitted(answer.command, m, False, answer.purpose)]
     assert allowed == [Mode.STAGE, Mode.COMMIT]
@@ -65,9 +65,9 @@ def test_nothing_else_becomes_possible_by_it():
         for values in REGISTERS[number].defaults.values():
             body = f"VNWRG,{format_reply(number, values)}"
             if number == 5 or number not in GUARDED:
-                assert understand(body, passing) == understand(body, OWNER)
+                assert parse_client_command(body, passing) == parse_client_command(body, OWNER)
     for word in FOR_NOBODY:
-        assert understand(word, passing) == understand(word, OWNER)
+        assert parse_client_command(word, passing) == parse_client_command(word, OWNER)
     for word, arguments in (("VNWNV", ()), ("VNRST", ()), ("VNRFS", ()), ("VNTAR", ())):
         command = Word(word, arguments)
         assert not permitted(command, Mode.COMMIT, True, Purpose.CLIENT_CALIBRATION)
@@ -76,7 +76,7 @@ def test_nothing_else_becomes_possible_by_it():
 @pytest.mark.parametrize("number", sorted(REGISTERS))
 def test_each_register_has_one_answer(number):
     """Reads are for everybody, writes for the owner, and nothing guarded goes out."""
-    read = understand(f"VNRRG,{number:02d}", LISTENER)
+    read = parse_client_command(f"VNRRG,{number:02d}", LISTENER)
     assert isinstance(read, ClientCommand)
     assert read.command == Read(number)
     expected = Kind.MEMORY if number <= 4 and number else Kind.RATE if number == 5 else Kind.READ
@@ -84,7 +84,7 @@ def test_each_register_has_one_answer(number):
     row = REGISTERS[number]
     for values in row.defaults.values():
         body = f"VNWRG,{format_reply(number, values)}"
-        owners, others = understand(body, OWNER), understand(body, LISTENER)
+        owners, others = parse_client_command(body, OWNER), parse_client_command(body, LISTENER)
         if number == 5:
             assert owners.kind is others.kind is Kind.RATE
         elif row.writable and number not in GUARDED:
@@ -104,10 +104,10 @@ def test_each_register_has_one_answer(number):
     ],
 )  # fmt: skip
 def test_words_of_the_owner(body, kind):
-    answer = understand(body, OWNER)
+    answer = parse_client_command(body, OWNER)
     assert isinstance(answer, ClientCommand)
     assert answer.kind is kind
-    others = understand(body, LISTENER)
+    others = parse_client_command(body, LISTENER)
     assert others == answer if kind is Kind.STREAM else others.code == 0x09
 
 
@@ -116,7 +116,7 @@ FOR_NOBODY = ["VNRFS", "VNTAR", "VNSGB", "VNSFB", "VNSIH", "VNSPS", "VNFWU", "VN
 
 @pytest.mark.parametrize("word", FOR_NOBODY)
 def test_words_for_nobody(word):
-    answer = understand(word, OWNER)
+    answer = parse_client_command(word, OWNER)
     assert (answer.code, word in answer.why) == (0x09, True)
     if word in ("VNRFS", "VNTAR", "VNSGB"):
         assert not permitted(Word(word), Mode.COMMIT, True, Purpose.CLIENT)
@@ -132,13 +132,13 @@ def test_words_for_nobody(word):
     ],
 )  # fmt: skip
 def test_wrong_lines_get_the_error_of_the_device(body, code):
-    assert understand(body, OWNER).code == code
+    assert parse_client_command(body, OWNER).code == code
 
 
 def test_policies():
     strict = SharePolicy("/a", owner=True, save="refuse", reset="refuse")
-    assert "save" in understand("VNWNV", strict).why
-    assert "reset" in understand("VNRST", strict).why
+    assert "save" in parse_client_command("VNWNV", strict).why
+    assert "reset" in parse_client_command("VNRST", strict).why
 
 
 @pytest.mark.parametrize(
@@ -151,6 +151,6 @@ def test_policies():
     ],
 )  # fmt: skip
 def test_what_real_drivers_set_at_their_start_goes_out(body):
-    answer = understand(body, OWNER)
+    answer = parse_client_command(body, OWNER)
     assert isinstance(answer, ClientCommand), answer
     assert answer.kind is Kind.WRITE

@@ -41,15 +41,15 @@ def test_a_rollback_over_what_the_owner_wrote_would_be_seen(monkeypatch):
         self.client_write = None
         self.roll_back("client", "a client wrote")
 
-    monkeypatch.setattr(WriteBack, "may_client_write", lambda self, number: "")
-    monkeypatch.setattr(flow.Flow, "client_wrote", end_the_trial)
+    monkeypatch.setattr(WriteBack, "client_write_refusal", lambda self, number: "")
+    monkeypatch.setattr(flow.Flow, "on_client_wrote", end_the_trial)
     monkeypatch.setattr(flow, "roll_back", lambda what, **_: undo(what, only_ours=False))
     hits = (9, 15, 16)  # of the first two dozen: such a write must fall into a trial
     assert any(played(seed, passes=True).wrong["overwritten"] > 0 for seed in hits)
 
 
 def test_a_save_in_the_middle_of_a_trial_would_be_seen(monkeypatch):
-    monkeypatch.setattr(WriteBack, "no_client_save", "")
+    monkeypatch.setattr(WriteBack, "client_save_refusal", "")
     assert any(played(seed).wrong["flash"] > 0 for seed in range(4))
 
 

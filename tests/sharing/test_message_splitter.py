@@ -24,23 +24,23 @@ def cut(stream: bytes, rng: np.random.Generator) -> list[bytes]:
 
 def out(splitter: MessageSplitter, chunk: bytes) -> list[bytes]:
     """As a share does it."""
-    ahead = splitter.ahead(chunk)
+    ahead = splitter.completed_message(chunk)
     return [*([ahead] if ahead else []), *splitter.feed(chunk)]
 
 
 def test_the_next_message_comes_out_ahead_and_once():
     splitter, one = MessageSplitter(), packet(bytes(range(8)))
-    assert splitter.ahead(TEXT) == b""  # nothing is known of the line yet
+    assert splitter.completed_message(TEXT) == b""  # nothing is known of the line yet
     assert splitter.feed(TEXT) == [TEXT]
     for message in (TEXT, one):
         splitter.feed(message)
-        assert splitter.ahead(message) == message
+        assert splitter.completed_message(message) == message
         assert splitter.feed(message) == []
-        assert splitter.ahead(message[:9]) == b""
+        assert splitter.completed_message(message[:9]) == b""
         assert splitter.feed(message[:9]) == []
-        assert splitter.ahead(message[9:]) == message
+        assert splitter.completed_message(message[9:]) == message
         assert splitter.feed(message[9:]) == []
-        assert splitter.ahead(message + message[:1]) == b""  # more than one
+        assert splitter.completed_message(message + message[:1]) == b""  # more than one
         assert splitter.feed(message + message[:1]) == [message]
         splitter.feed(message[1:])
 
@@ -75,7 +75,7 @@ def test_a_reply_between_messages_is_kept_back(body):
 def test_a_damaged_reply_is_no_reply():
     bad = b"$VNRRG,01,VN-100*00\r\n"
     splitter = MessageSplitter()
-    assert b"".join(splitter.feed(TEXT + bad + TEXT) + splitter.silence()) == TEXT + bad + TEXT
+    assert b"".join(splitter.feed(TEXT + bad + TEXT) + splitter.flush()) == TEXT + bad + TEXT
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -94,7 +94,7 @@ def test_every_byte_but_the_replies_comes_out_once_and_in_order(seed):
         stream, wanted = stream + piece, wanted + piece
     splitter = MessageSplitter()
     pieces = [piece for chunk in cut(stream, rng) for piece in out(splitter, chunk)]
-    assert b"".join(pieces + splitter.silence()) == wanted
+    assert b"".join(pieces + splitter.flush()) == wanted
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -105,5 +105,5 @@ def test_how_the_bytes_are_cut_changes_nothing(seed):
     for _ in range(3):
         splitter = MessageSplitter()
         pieces = [piece for chunk in cut(stream, rng) for piece in out(splitter, chunk)]
-        outs.append(b"".join(pieces + splitter.silence()))
+        outs.append(b"".join(pieces + splitter.flush()))
     assert outs[0] == outs[1] == outs[2] == stream

@@ -7,7 +7,7 @@ from operator import xor
 
 import pytest
 
-from ahrsd.sharing.nmea import Transducer, attitude, hdm, xdr
+from ahrsd.sharing.nmea import Transducer, attitude_transducers, hdm, xdr
 
 
 def checked(line: bytes) -> str:
@@ -36,20 +36,20 @@ def test_a_heading_is_three_digits_and_one_and_never_360(heading_deg, printed):
 
 
 def test_pitch_roll_and_temperature():
-    line = xdr(attitude(1.44, -0.26, 24.6))
+    line = xdr(attitude_transducers(1.44, -0.26, 24.6))
     assert line == b"$YXXDR,A,1.4,D,PITCH,A,-0.3,D,ROLL,C,24.6,C,TEMP*2D\r\n"
     assert checked(line) == "YXXDR,A,1.4,D,PITCH,A,-0.3,D,ROLL,C,24.6,C,TEMP"
 
 
 def test_what_is_not_known_is_empty_and_a_sensor_that_is_not_there_is_left_out():
-    assert checked(xdr(attitude(None, None, None))) == "YXXDR,A,,D,PITCH,A,,D,ROLL"
-    assert checked(xdr(attitude(-0.04, 179.96, -40.0))) == (
+    assert checked(xdr(attitude_transducers(None, None, None))) == "YXXDR,A,,D,PITCH,A,,D,ROLL"
+    assert checked(xdr(attitude_transducers(-0.04, 179.96, -40.0))) == (
         "YXXDR,A,0.0,D,PITCH,A,180.0,D,ROLL,C,-40.0,C,TEMP"
     )
 
 
 def test_the_longest_line_of_ours_fits():
-    assert len(xdr(attitude(-90.0, -180.0, -100.0))) <= 82
+    assert len(xdr(attitude_transducers(-90.0, -180.0, -100.0))) <= 82
 
 
 def test_the_published_example_of_other_transducers():

@@ -97,7 +97,7 @@ def test_a_second_save_sets_it_aside_again_until_the_days_writes_are_used_up():
     assert run.states[-1] != "TRIAL"
     assert run.cable.unit.held() == ONE
     assert [number for number, _ in run.cable.unit.writes].count(23) == 12  # six, each undone
-    assert any("6 RAM writes in a day" in reason for reason in run.core.writeback.holds())
+    assert any("6 RAM writes in a day" in reason for reason in run.core.writeback.obstacles())
 
 
 @pytest.mark.parametrize("what", ["unsafe", "unheard", "disarm", "gone", "killed link", "stop"])
@@ -263,7 +263,7 @@ def test_what_ends_a_trial_that_a_reset_set_aside(what, after_s):
         run.run(3.0)  # later than the device's own start behind VNRST
         unit.restart()
     elif what == "void":
-        run.core.take([])
+        run.core.process_events([])
         more = run.core.writeback.on_void("something stepped", run.core.at_s, run.now_s)
         run.core._action_queue.add(more)
     elif what == "swap":
@@ -425,7 +425,7 @@ def test_what_speaks_against_the_values_is_not_forgotten_by_a_save():
     run, heard = on_trial(), []
     moved = IRON + np.array([0.03, 0.0, 0.0])
     run.core.calibrator = PlantedCalibrator(
-        run.core.calibrator.anew(), estimate(hard_iron_gauss=moved)
+        run.core.calibrator.make_fresh(), estimate(hard_iron_gauss=moved)
     )
     run.listeners.append(lambda event: heard.append(event) if isinstance(event, Estimated) else 0)
     assert run.until(lambda: heard, 20.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from shown_status import cell_of, cells, gate, level_ring, motion
 
-from ahrsd.evidence.coverage import centres
+from ahrsd.evidence.coverage import cell_centres
 from ahrsd.gates import GATES
 from ahrsd.telemetry.driving import HELPED_BY_TILT, drive_next, shown_of, tilt_is_wanted
 
@@ -21,7 +21,7 @@ def status(directions, gates=SHUT, heading_deg=None, **changes):
 
 def all_but(wanted):
     """Everything was shown but the cells of these attitudes and their neighbours."""
-    middle = centres()
+    middle = cell_centres()
     hidden = np.zeros(len(middle), dtype=bool)
     for attitude in wanted:
         hidden |= middle @ middle[cell_of(*attitude)] > np.cos(np.radians(8.0))

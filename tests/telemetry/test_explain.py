@@ -159,7 +159,7 @@ def test_a_sensor_an_estimator_and_a_file_that_are_wrong_are_said():
 
 
 def test_without_an_interlock_the_key_is_named():
-    unheard = WriteBack(WriteBackPolicy()).holds()[-2]
+    unheard = WriteBack(WriteBackPolicy()).obstacles()[-2]
     held = {"state": "CANDIDATE", "holds": [unheard], "proposal": None}
     (text,) = explain_json(status(interlock="none", write_back=held))["others"]
     assert text.startswith("no interlock is configured, so nothing is ever written: set interlock.")
@@ -168,7 +168,7 @@ def test_without_an_interlock_the_key_is_named():
 
 
 def test_without_an_interlock_that_is_the_thing_to_do_and_not_to_wait_for_a_word():
-    unheard = WriteBack(WriteBackPolicy()).holds()[-2]
+    unheard = WriteBack(WriteBackPolicy()).obstacles()[-2]
     held = {
         "state": "QUALIFIED",
         "holds": [unheard, "an operator must approve 12ab34cd"],

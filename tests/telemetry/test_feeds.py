@@ -91,7 +91,7 @@ def true_heading_deg(R_nb):
     return math.degrees(math.atan2(R_nb[1, 0], R_nb[0, 0])) % 360.0
 
 
-def apart_deg(one, other):
+def proposal_distance_deg(one, other):
     return abs((one - other + 180.0) % 360.0 - 180.0)
 
 
@@ -108,7 +108,9 @@ def test_corrected_says_the_true_field_rate_and_heading_once_a_candidate_qualifi
         assert np.allclose(sample["mag_body_gauss"], R_nb.T @ FIELD_N, atol=6e-3)  # 6 sigma
         assert np.allclose(sample["gyro_body_rad_s"], rate, atol=6e-3)
         if sample["magnetic_heading_deg"] is not None:
-            assert apart_deg(sample["magnetic_heading_deg"], true_heading_deg(R_nb)) < 2.0
+            assert (
+                proposal_distance_deg(sample["magnetic_heading_deg"], true_heading_deg(R_nb)) < 2.0
+            )
         assert sample["heading_sigma_deg"] == pytest.approx(0.05, abs=0.01)
     assert sum(s["magnetic_heading_deg"] is not None for s in samples[-200:]) > 150
     (state,) = told.outlet.records("state")[-1:]
@@ -217,11 +219,11 @@ def test_nmea_is_a_true_heading_ten_times_a_second_and_an_empty_one_when_the_dev
         value = head.decode().split(",")[1]
         if value:
             known += 1
-            assert apart_deg(float(value), true_heading_deg(R)) < 2.0
+            assert proposal_distance_deg(float(value), true_heading_deg(R)) < 2.0
         pitch, roll = (float(transducers.decode().split(",")[k]) for k in (2, 6))
         assert abs(pitch - math.degrees(math.asin(-R[2, 0]))) < 1.0
         level = math.cos(math.radians(pitch))
-        assert apart_deg(roll, math.degrees(math.atan2(R[2, 1], R[2, 2]))) * level < 1.0
+        assert proposal_distance_deg(roll, math.degrees(math.atan2(R[2, 1], R[2, 2]))) * level < 1.0
     assert known > 70
     told.run.feed(inputs.LinkLost(told.run.now_ns, "unplugged"))
     told.go(1.5, replace(LINK, is_open=False))

@@ -32,7 +32,7 @@ def test_the_whole_way_on_one_unit(binary):
     run.proven()
     assert unit.held("flash") == ("1,0,0,0,1,0,0,0,1,0,0,0", "1,0,0,0,1,0,0,0,1,0,0,0")
     run.park()
-    assert run.state == "COMMITTED", (run.notes, run.core.writeback.holds())
+    assert run.state == "COMMITTED", (run.notes, run.core.writeback.obstacles())
     assert unit.held("flash") == unit.held()
     assert unit.held()[0].endswith(",0.05,-0.03,0.04")
     assert [n for n, _ in unit.writes] == [23, 84]

@@ -68,9 +68,9 @@ def test_what_differs_only_as_the_device_prints_it_is_the_same():
     record = DeviceRecord()
     written = (1.0569499731063843, *IDENTITY[1:])
     printed = (1.05695, *IDENTITY[1:])
-    assert record.registers_read({23: written}, {}, 1) == []
-    assert record.registers_read({23: printed, 84: IDENTITY}, {23: written}, 1) == []
-    assert record.registers_read({23: OTHER}, {23: printed}, 1) == [23]
+    assert record.on_registers_read({23: written}, {}, 1) == []
+    assert record.on_registers_read({23: printed, 84: IDENTITY}, {23: written}, 1) == []
+    assert record.on_registers_read({23: OTHER}, {23: printed}, 1) == [23]
     assert (
-        record.registers_read({23: IDENTITY}, {23: OTHER}, 2) == []
+        record.on_registers_read({23: IDENTITY}, {23: OTHER}, 2) == []
     )  # the link was lost meanwhile

@@ -158,7 +158,7 @@ def test_firmware_2_with_its_estimator_applied_is_left_alone():
     bench.until(lambda: False, 2.0)
     assert bench.wb.state is State.QUALIFIED
     assert bench.held == old
-    assert any("on-board estimator" in text for text in bench.wb.holds())
+    assert any("on-board estimator" in text for text in bench.wb.obstacles())
 
 
 FAULTS = [

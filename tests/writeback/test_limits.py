@@ -120,7 +120,7 @@ def test_after_a_rollback_a_day_of_rest_and_twice_the_margin(make_rig):
     assert rig.wb.margin == 2.0
     another(rig, 0.02)
     assert rig.wb.state is State.QUALIFIED
-    assert any("a rollback was" in text for text in rig.wb.holds())
+    assert any("a rollback was" in text for text in rig.wb.obstacles())
     sent = len(rig.sent)
     rig.now_s += DAY_S
     small = {"soft_iron": np.eye(3), "gyro_bias_rad_s": np.zeros(3)}
@@ -165,7 +165,7 @@ def test_a_lock_undoes_what_is_only_in_ram(make_rig, when):
     rig.do(rig.wb.on_operator("lock", "race day", rig.now_s))
     assert rig.wb.state is State.LOCKED
     assert rig.device.held() == rig.device.held("flash")
-    assert any("locked: race day" in text for text in rig.wb.holds())
+    assert any("locked: race day" in text for text in rig.wb.obstacles())
 
 
 def test_a_lock_while_saving_does_not_interrupt_it(make_rig):
@@ -327,11 +327,11 @@ def test_the_gate_itself_asks_everything_again(make_rig):
     assert safe.allow(write, Purpose.ROLL_BACK, now_s + 1.1)
     safe.journal_ok = False
     assert not safe.allow(save, Purpose.SAVE, now_s)
-    assert safe.write_holds(JournalHistory(), now_s, Now(Stamp()))[-1].startswith(
+    assert safe.write_obstacles(JournalHistory(), now_s, Now(Stamp()))[-1].startswith(
         "the journal cannot be written"
     )
     safe.gates = rig.RED
-    assert "gate observability: turn more" in safe.write_holds(
+    assert "gate observability: turn more" in safe.write_obstacles(
         JournalHistory(), now_s, Now(Stamp())
     )
 
@@ -385,9 +385,9 @@ def test_which_values_were_only_tried(more, tried):
     }  # fmt: skip
     records = [("PREPARED", facts), ("RAM_VERIFIED", {}), *more]
     history = JournalHistory.of(SimpleNamespace(kind=k, facts=f) for k, f in records)
-    assert history.tried(23, tuple(row(2))) == tried
-    assert not history.tried(23, tuple(row(1)))
-    assert not history.tried(84, tuple(row(5)))
+    assert history.is_trial_value(23, tuple(row(2))) == tried
+    assert not history.is_trial_value(23, tuple(row(1)))
+    assert not history.is_trial_value(84, tuple(row(5)))
 
 
 @pytest.mark.parametrize("old", [{"23": [1]}, {}])
@@ -434,28 +434,28 @@ def test_still(changes, reason):
     still = Stillness(StillPolicy())
     for k in range(10):
         still.update(block(k * 0.4 + 0.01 * np.arange(40), **changes), np.full(3, 0.01))
-    why = still.why_not(4.0)
+    why = still.find_motion(4.0)
     assert why is None if reason is None else reason in (why or "")
 
 
 def test_not_still_without_samples_after_a_gap_or_when_they_are_old():
     still = Stillness(StillPolicy())
-    assert still.why_not(0.0) is not None
+    assert still.find_motion(0.0) is not None
     still.update(block(0.01 * np.arange(400)), np.full(3, 0.01))
-    assert still.why_not(4.0) is None
-    assert "old" in (still.why_not(6.1) or "")
+    assert still.find_motion(4.0) is None
+    assert "old" in (still.find_motion(6.1) or "")
     still.update(block(10.0 + 0.01 * np.arange(100), gap=True), np.full(3, 0.01))
-    assert "still for 1.0 s" in (still.why_not(11.0) or "")
+    assert "still for 1.0 s" in (still.find_motion(11.0) or "")
 
 
 def test_a_movement_ends_the_rest_and_old_shaking_is_forgotten():
     still = Stillness(StillPolicy())
     still.update(block(0.01 * np.arange(400), shake=0.5), np.full(3, 0.01))
-    assert "varies" in (still.why_not(4.0) or "")
+    assert "varies" in (still.find_motion(4.0) or "")
     still.update(block(4.0 + 0.01 * np.arange(400)), np.full(3, 0.01))
-    assert still.why_not(8.0) is None
+    assert still.find_motion(8.0) is None
     still.update(block(8.0 + 0.01 * np.arange(10), rate=0.1), np.full(3, 0.01))
-    assert still.why_not(8.1) is not None
+    assert still.find_motion(8.1) is not None
 
 
 def test_without_a_verdict_for_flash_nothing_is_saved(make_rig):
@@ -468,7 +468,7 @@ def test_without_a_verdict_for_flash_nothing_is_saved(make_rig):
     rig.stand_still()
     assert rig.wb.state is State.PROVEN
     assert rig.device.flash_writes == 0
-    assert any("no gate has judged" in text for text in rig.wb.holds())
+    assert any("no gate has judged" in text for text in rig.wb.obstacles())
 
 
 def test_a_new_process_saves_nothing_before_its_own_gates_have_judged(make_rig):
@@ -485,7 +485,7 @@ def test_a_new_process_saves_nothing_before_its_own_gates_have_judged(make_rig):
     rig.verdict()
     rig.stand_still()
     assert rig.device.flash_writes == 0  # nor before it has proven them itself
-    assert any("on trial again" in text for text in rig.wb.holds())
+    assert any("on trial again" in text for text in rig.wb.obstacles())
     rig.live()
     rig.stand_still()
     assert rig.device.flash_writes == 1

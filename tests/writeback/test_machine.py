@@ -48,7 +48,7 @@ def test_nothing_is_sent_before_the_record_is_on_the_disk(make_rig):
     rig.verdict()
     rig.approve()
     assert rig.device.log == []  # as long as the journal is not writable
-    assert "the journal cannot be written" in " ".join(rig.wb.holds())
+    assert "the journal cannot be written" in " ".join(rig.wb.obstacles())
     rig.disk_full = False
     rig.do(rig.wb.on_operator("unlock", "disk freed", rig.now_s))
     rig.pass_time(0.1)
@@ -67,7 +67,7 @@ def test_observe_says_to_the_byte_what_it_would_write_and_sends_nothing(make_rig
     assert len(lines) == 2
     for line in lines:
         assert line in would
-    assert any("mode is observe" in reason for reason in rig.wb.holds())
+    assert any("mode is observe" in reason for reason in rig.wb.obstacles())
 
 
 def test_stage_proves_in_ram_and_never_saves(make_rig):
@@ -108,7 +108,7 @@ def test_a_doubtful_device_is_observed_only(make_rig, limit, reason):
         rig.approve()
     assert rig.wb.mode is Mode.OBSERVE
     assert rig.device.log == []
-    assert any(reason in text for text in rig.wb.holds())
+    assert any(reason in text for text in rig.wb.obstacles())
 
 
 def test_another_device_on_the_port_is_not_written(make_rig):
@@ -121,7 +121,7 @@ def test_another_device_on_the_port_is_not_written(make_rig):
     rig.verdict()
     rig.approve()
     assert rig.device.log == []
-    assert any("this is the device 42" in text for text in rig.wb.holds())
+    assert any("this is the device 42" in text for text in rig.wb.obstacles())
 
 
 def test_an_applied_onboard_estimator_holds_the_write(make_rig):
@@ -130,7 +130,7 @@ def test_an_applied_onboard_estimator_holds_the_write(make_rig):
     rig.whole_way()
     assert rig.wb.state is State.QUALIFIED
     assert rig.device.log == []
-    assert any("on-board estimator" in text for text in rig.wb.holds())
+    assert any("on-board estimator" in text for text in rig.wb.obstacles())
 
 
 @pytest.mark.parametrize("gates", ["RED", "none"])
@@ -219,7 +219,7 @@ def test_auto_approves_small_changes_only(make_rig):
     large.pass_time(0.1)
     large.verdict()
     assert large.wb.state is State.QUALIFIED
-    assert any("must approve" in text for text in large.wb.holds())
+    assert any("must approve" in text for text in large.wb.obstacles())
     small = make_rig(Mode.STAGE, approval="auto", armed_at_start=True)
     small.connect()
     small.pass_time(0.1)
@@ -234,7 +234,7 @@ def test_a_run_writes_by_itself_only_when_a_person_armed_it(make_rig):
     rig.pass_time(0.1)
     rig.verdict()
     assert rig.wb.state is State.QUALIFIED
-    assert NOT_ARMED in rig.wb.holds()
+    assert NOT_ARMED in rig.wb.obstacles()
     assert not any(isinstance(command, Write) for command in rig.device.log)
     rig.do(rig.wb.on_operator("arm", "", rig.now_s))
     assert rig.wb.state is State.TRIAL
@@ -242,7 +242,7 @@ def test_a_run_writes_by_itself_only_when_a_person_armed_it(make_rig):
     rig.live(turns=2.5)
     rig.stand_still()
     assert rig.wb.state is State.PROVEN
-    assert rig.wb.holds() == [NOT_ARMED]
+    assert rig.wb.obstacles() == [NOT_ARMED]
     assert rig.device.flash_writes == 0
     rig.do(rig.wb.on_operator("arm", "", rig.now_s))
     rig.stand_still()
@@ -430,7 +430,7 @@ def test_flash_waits_for_stillness(make_rig):
     rig.stand_still(rate_rad_s=0.02)
     rig.stand_still(seconds=2.5)
     assert rig.wb.state is State.PROVEN
-    assert any("still for" in text for text in rig.wb.holds())
+    assert any("still for" in text for text in rig.wb.obstacles())
     rig.stand_still()
     assert rig.wb.state is State.COMMITTED
 

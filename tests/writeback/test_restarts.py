@@ -242,7 +242,7 @@ def test_a_rollback_that_could_not_be_journaled_is_journaled_later(make_rig, whe
     rig = on_trial(make_rig)
     rig.disk_full = True
     rig.live(field_spread=0.5)
-    assert any("the journal cannot be written" in text for text in rig.wb.holds())
+    assert any("the journal cannot be written" in text for text in rig.wb.obstacles())
     rig.disk_full = False
     if when == "time":
         rig.pass_time(29.0)
@@ -263,7 +263,7 @@ def test_a_rollback_that_could_not_be_journaled_is_journaled_later(make_rig, whe
     assert rig.journal[2].facts["boot_s"] < rig.now_s - rig.boot_began_s or when == "stop"
     assert JournalHistory.of(rig.journal).rollbacks == 1
     assert rig.wb.history == JournalHistory.of(rig.journal)
-    assert not any("journal" in text for text in rig.wb.holds())
+    assert not any("journal" in text for text in rig.wb.obstacles())
 
 
 def test_a_write_that_could_not_be_announced_leaves_the_save_before_it_open(make_rig):

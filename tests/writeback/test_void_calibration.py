@@ -117,7 +117,7 @@ def test_an_estimate_that_clearly_asks_for_something_else_ends_it():
         run.core.calibrator, estimate(hard_iron_gauss=IRON + STEP)
     )
     run.run(15.0)
-    assert any("asks for another" in text for text in run.core.writeback.holds())
+    assert any("asks for another" in text for text in run.core.writeback.obstacles())
     run.park(120.0)
     undone(run)
 
@@ -140,8 +140,8 @@ def test_one_that_differs_a_little_only_holds_the_save():
 class Red(PlantedCalibrator):
     """One gate is red."""
 
-    def judged(self, at_s: float, *_: object) -> tuple[GateResult, ...]:
-        super().judged(at_s)
+    def judge_estimate(self, at_s: float, *_: object) -> tuple[GateResult, ...]:
+        super().judge_estimate(at_s)
         bad = GateResult(GATES[0].gate, 2.0, 1.0, False, at_s, "", "look at the wire")
         self.gates = (bad, *self.gates[1:])
         return self.gates
@@ -173,7 +173,7 @@ def test_a_jump_of_the_readings_at_rest_is_proven_again_before_it_is_saved():
     run.park(15.0)
     assert run.cable.unit.saves == []
     assert run.told("jumped")
-    again = any("on trial again" in text for text in run.core.writeback.holds())
+    again = any("on trial again" in text for text in run.core.writeback.obstacles())
     assert again or "ROLLED_BACK" in run.states  # or the trial has found it worse already
 
 
@@ -200,7 +200,7 @@ def test_the_estimator_itself_sees_the_step_and_the_old_values_are_not_saved():
     run.cable.moving = False
     run.run(15.0)
     run.cable.moving = True
-    assert run.until("QUALIFIED", 400.0), run.core.writeback.holds()
+    assert run.until("QUALIFIED", 400.0), run.core.writeback.obstacles()
     run.proven()
     written = run.cable.unit.held()
     assert written != OLD

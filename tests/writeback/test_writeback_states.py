@@ -14,7 +14,7 @@ from ahrsd.writeback.states import (
     WITHOUT_TRANSACTION,
     Signal,
     State,
-    after,
+    next_state,
 )
 
 AWAY = {Signal.LINK_LOST, Signal.DEVICE_RESET, Signal.CLIENT_RESET, Signal.IN_DOUBT}
@@ -47,7 +47,7 @@ def test_total_over_states_and_signals() -> None:
     assert set(TABLE) == set(State)
     for state in State:
         for signal in Signal:
-            assert after(state, signal) in State
+            assert next_state(state, signal) in State
     used = {signal for row in TABLE.values() for signal in row}
     assert used == set(Signal)
 

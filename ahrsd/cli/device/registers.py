@@ -52,7 +52,7 @@ from ahrsd.daemon.operator_inbox import NoAnswerInTime, OperatorBox, OperatorFol
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, DeviceError, JournalError
 from ahrsd.printable import counted
 from ahrsd.telemetry.unix_socket import DaemonConnection, default_socket_path
-from ahrsd.writeback.journal_history import JournalHistory, RecordKind, of_another_device
+from ahrsd.writeback.journal_history import JournalHistory, RecordKind, find_record_of_other_device
 from drivers.vn100.commands import (
     Identity,
     identify,
@@ -429,7 +429,7 @@ def _change(
     with open_device(port, baud, gate(permitted, save=save and yes)) as device:
         identity = device.run(identify())
         journal = Journal.open(journal_file or journal_path(state, identity.serial))
-        if other := of_another_device(journal.records(), identity.serial):
+        if other := find_record_of_other_device(journal.records(), identity.serial):
             raise JournalError(f"{journal.path}: {other}; nothing was written")
         changes, why = wanted(device, journal)
         if "undoes" not in why:  # what goes back to where it was is not locked out

@@ -62,7 +62,7 @@ def command(
     Exit 1 where the motion does not determine the answer; the output then says what is missing.
     """
     from ahrsd.offline.calibrate import calibrate
-    from ahrsd.offline.compare_methods import saturated
+    from ahrsd.offline.compare_methods import describe_saturation
     from ahrsd.offline.diagnose import load_model
     from ahrsd.report.summary import estimate_lines
 
@@ -79,7 +79,7 @@ def command(
         result = calibrate(
             recording, config, rate_hz=rate_hz, progress=progress, model=model, columns=columns
         )
-    if method in _METHODS[:2] and (words := saturated(result)):
+    if method in _METHODS[:2] and (words := describe_saturation(result)):
         raise RecordingError(
             recording, words, "record again, away from magnets and strong currents"
         )
@@ -145,8 +145,8 @@ def _published(
     from ahrsd.offline import compare_methods as published
 
     if method == _ALL:
-        found = published.all_methods(result)
-        rows = [published.our_row(result), *(published.row_of(result, one) for one in found)]
+        found = published.run_all_methods(result)
+        rows = [published.our_row(result), *(published.method_row(result, one) for one in found)]
         ours = published.with_spread(result.json(published.OURS), rows[0])
         others = [published.published_json(result, *pair) for pair in zip(found, rows[1:])]
         body: dict[str, object] = {
@@ -155,14 +155,14 @@ def _published(
         }
     else:
         one = published.run_published(result, method)
-        rows = [published.row_of(result, one, held_out=False)]
+        rows = [published.method_row(result, one, held_out=False)]
         body = published.published_json(result, one)
     if json_path is not None:
         write_json(json_path, body)
     if figure_path is not None:
         _draw(figure_path, result.name, rows)
     if json_path != "-":
-        for line in published.table(rows):
+        for line in published.format_table(rows):
             click.echo(line)
     return EXIT_DONE if rows[0].converged else EXIT_NO
 

@@ -40,7 +40,7 @@ def command(
     FILE may be any recording: a ROS 1 bag, a ROS 2 recording, the log of an autopilot, a foreign
     CSV (with --columns), or one of ours. Every other command opens these files directly, too.
     """
-    from ahrsd.offline.convert import converted, save
+    from ahrsd.offline.convert import convert_recording, save
     from ahrsd.recording.foreign.sensors import Choice
     from ahrsd.recording.opening import listed
 
@@ -56,7 +56,7 @@ def command(
         raise AhrsdError(f"-o {output}: is the recording itself; give another name")
     refuse_unwritable(str(output))
     with byte_progress(recording) as progress:
-        table = converted(recording, Choice(topics, compass, columns), rate_hz, progress)
+        table = convert_recording(recording, Choice(topics, compass, columns), rate_hz, progress)
     save(table, output)
     rows = len(next(iter(table.columns.values())))
     click.echo(f"{output}: {counted(rows, 'row')}, {', '.join(table.columns)}")

@@ -96,13 +96,13 @@ class _Options:
 
 def _simulate_scenario(wanted: _Options) -> None:
     """Write a scenario's experiment, its effects in it, and its truth beside it."""
-    from ahrsd.offline.simulate import with_effects, write_experiment
+    from ahrsd.offline.simulate import add_effects, write_experiment
     from ahrsd.simulation.scenarios import truth_json
 
     experiment, made_from = _experiment(wanted)
     truth: dict[str, object] = {}
     if wanted.effects:
-        experiment, truth["effects"] = with_effects(experiment, wanted.effects, wanted.seed)
+        experiment, truth["effects"] = add_effects(experiment, wanted.effects, wanted.seed)
     write_experiment(wanted.output, experiment)
     write_json(f"{wanted.output}.truth.json", {**truth_json(experiment, made_from), **truth})
     count, name = len(experiment), experiment.name
@@ -169,7 +169,7 @@ def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None
     """Write a table of what a repaired model reads along a recording, and its truth beside it."""
     from ahrsd.diagnosis.repaired_model.injection import terms_json
     from ahrsd.offline.diagnose import load_model, load_track
-    from ahrsd.offline.simulate import along, write_columns
+    from ahrsd.offline.simulate import simulate_along_motion, write_columns
     from ahrsd.recording.table import TABLE_SUFFIXES, is_table
 
     output, seed = wanted.output, wanted.seed
@@ -177,7 +177,7 @@ def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None
         raise AhrsdError(f"{output}: the name must end in one of {', '.join(TABLE_SUFFIXES)}")
     model = load_model(model_path)
     read, notes = load_track(recording, columns=wanted.columns)
-    columns, refused = along(model, recording, read, seed)
+    columns, refused = simulate_along_motion(model, recording, read, seed)
     for note in [*notes, *refused]:
         click.echo(f"{recording}: {note}", err=True)
     write_columns(output, columns)

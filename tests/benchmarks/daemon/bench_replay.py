@@ -48,8 +48,8 @@ PARTS: tuple[tuple[str, type, tuple[str, ...]], ...] = (
     ("parse", Session, ("receive",)),
     ("samples", Stream, ("take",)),
     ("estimate", Estimator, ("add", "estimate")),
-    ("evidence", EvidenceCollector, ("parts", "add", "evaluate")),
-    ("evidence", Calibrator, ("judged",)),
+    ("evidence", EvidenceCollector, ("split", "add", "evaluate")),
+    ("evidence", Calibrator, ("judge_estimate",)),
 )
 
 

@@ -47,8 +47,8 @@ from ahrsd.evaluation.heading import (
 )
 from ahrsd.heading import wrapped
 from ahrsd.offline.calibrate import calibrate
-from ahrsd.offline.compare_methods import our_row, row_of, run_published
-from ahrsd.offline.evaluate import gps_beside, read_fixes, read_track
+from ahrsd.offline.compare_methods import method_row, our_row, run_published
+from ahrsd.offline.evaluate import find_gps_file, read_fixes, read_track
 from ahrsd.report.summary import BatchResult
 from ahrsd.samples import Array, SampleBlock
 
@@ -90,7 +90,7 @@ def rows_of(
 ) -> tuple[list[ComparisonRow], BatchResult]:
     """Ours and these methods on a recording."""
     result = calibrate(path, config)
-    theirs = [row_of(result, run_published(result, name), held_out=False) for name in methods]
+    theirs = [method_row(result, run_published(result, name), held_out=False) for name in methods]
     return [our_row(result, held_out=False), *theirs], result
 
 
@@ -129,7 +129,7 @@ def drive(folder: Path, methods: tuple[str, ...] = tuple(METHODS)) -> list[Judge
     path = folder / "vn100" / "drive_2022_rahul.csv.gz"
     rows, _ = rows_of(circles, methods, BOSTON)
     track, _ = read_track(path, Config())
-    gps = gps_beside(path)
+    gps = find_gps_file(path)
     assert gps is not None
     fixes, _ = read_fixes(gps)
     references = [course_reference(fixes, LEAST_SPEED_M_S)]
@@ -339,7 +339,7 @@ def honest(folder: Path) -> tuple[list[Announced], list[Halves]]:
         path: read_track(path, Config())[0]
         for path in (circles, drive_path, *broad, stick, *punches)
     }
-    gps = gps_beside(drive_path)
+    gps = find_gps_file(drive_path)
     assert gps is not None
     answers = {path: estimated(track) for path, track in tracks.items()}
     references = {drive_path: [course_reference(read_fixes(gps)[0], LEAST_SPEED_M_S)]}

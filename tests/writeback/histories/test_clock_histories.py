@@ -196,7 +196,7 @@ def told():
         rig = Observed(policy, draw)
         new = None
         if not save(rig):
-            wrong.append(f"{seed}: nothing was saved, {rig.wb.holds()}")
+            wrong.append(f"{seed}: nothing was saved, {rig.wb.obstacles()}")
             continue
         new, observer, deeds = rig.device.held(), Observer(rig), []
         for _ in range(STEPS):

@@ -10,8 +10,8 @@ from __future__ import annotations
 import pytest
 
 from ahrsd.writeback.journal_history import JournalHistory, RecordKind
-from ahrsd.writeback.reconcile import TABLE, DeviceContents, found
-from ahrsd.writeback.states import Mode, Signal, State, after
+from ahrsd.writeback.reconcile import TABLE, DeviceContents, compare_contents
+from ahrsd.writeback.states import Mode, Signal, State, next_state
 from drivers.vn100.commands import Word, Write
 
 HOLDS_OLD = {
@@ -235,7 +235,7 @@ def test_the_table_is_total_and_its_signals_are_taken():
     for row in TABLE.values():
         assert set(row) == set(DeviceContents)
         for resolution in row.values():
-            assert after(State.RECONCILING, resolution.signal) is not State.RECONCILING
+            assert next_state(State.RECONCILING, resolution.signal) is not State.RECONCILING
             assert resolution.text
             closes = resolution.signal in (Signal.NOTHING_OPEN, Signal.READ_CONFIRMED, Signal.TORN)
             assert closes <= (resolution.record is not None)
@@ -287,7 +287,7 @@ OTHER = (2.0,) * 12
     ],
 )
 def test_found(device, restarted, expected):
-    assert found({23: OLD, 84: OLD}, {23: NEW, 84: NEW}, device, restarted) is expected
+    assert compare_contents({23: OLD, 84: OLD}, {23: NEW, 84: NEW}, device, restarted) is expected
 
 
 def test_foreign_values_lock_until_a_person_looked(make_rig):

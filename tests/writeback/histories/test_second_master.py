@@ -194,4 +194,6 @@ def test_what_they_changed_in_ram_is_not_saved_along():
     run.park(60.0)
     assert run.told("register 25 changed")
     assert unit.saves == []
-    assert any("somebody else changed register 25" in text for text in run.core.writeback.holds())
+    assert any(
+        "somebody else changed register 25" in text for text in run.core.writeback.obstacles()
+    )
