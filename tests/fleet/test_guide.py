@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import re
 import signal
-import socket
 import subprocess
 from pathlib import Path
 
 import pytest
 from fleet_kills import PYTHON, rows_of, write_archive
+from free_port import free_port
 
 pytest.importorskip("distributed", reason="distributed (the extra cluster) is not installed")
 
@@ -35,9 +35,7 @@ def commands(tmp_path):
 
 
 def test_the_cluster_of_three_processes(tmp_path, commands):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
+    port = str(free_port())
     write_archive(tmp_path / "ARCHIVE", 4)
     script = example().replace("8786", port)
     assert script.count("&\n") == 3

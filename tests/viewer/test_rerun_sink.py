@@ -22,6 +22,7 @@ import psutil
 import pyarrow
 import pytest
 import rerun_cli
+from free_port import free_port
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
@@ -574,9 +575,7 @@ def test_a_port_in_use_is_counted_and_the_file_still_written(tmp_path):
 
 
 def test_the_live_viewer_is_served_on_this_machine_only():
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     with opened(None, serve=True, port=port) as sink:
         push_all(sink, simulated_events(5.0))
 

@@ -41,6 +41,7 @@ import numpy as np
 sys.path.extend(map(str, (Path(__file__).parents[2] / "support").glob("**/")))
 
 from cabled_units import crc16
+from free_port import free_port
 
 HEAD = bytes([0xFA, 0x01]) + struct.pack("<H", 0x0001 | 0x0008 | 0x0020 | 0x0400)
 PATIENCE_S = 30.0
@@ -228,7 +229,7 @@ def shared(device: str, folder: Path) -> Iterator[Way]:
 @contextlib.contextmanager
 def tcp(device: str, folder: Path) -> Iterator[Way]:
     """A raw share over tcp."""
-    place = free_place()
+    place = free_port()
     with running(ahrsd(device, folder, f'tcp = "127.0.0.1:{place}"')) as pid:
         yield Way(connected(place).detach(), pid)
 
@@ -236,7 +237,7 @@ def tcp(device: str, folder: Path) -> Iterator[Way]:
 @contextlib.contextmanager
 def crowd(device: str, folder: Path) -> Iterator[Way]:
     """The same with 14 readers in another process, and one that never reads."""
-    place, way = free_place(), Way(-1)
+    place, way = free_port(), Way(-1)
     with contextlib.ExitStack() as leaving:
         way.pid = leaving.enter_context(
             running(ahrsd(device, folder, f'tcp = "127.0.0.1:{place}"'))
@@ -279,7 +280,7 @@ def drain(place: int) -> None:
 def socat(device: str, folder: Path) -> Iterator[Way]:
     """socat between the two."""
     if device.startswith("socket://"):
-        place, host = free_place(), device.removeprefix("socket://")
+        place, host = free_port(), device.removeprefix("socket://")
         to = f"tcp-listen:{place},bind=127.0.0.1,nodelay"
         with running(["socat", to, f"tcp:{host}"]) as pid:
             yield Way(connected(place).detach(), pid)
@@ -287,13 +288,6 @@ def socat(device: str, folder: Path) -> Iterator[Way]:
     port = folder / "socat"
     with running(["socat", f"{device},raw,echo=0", f"pty,raw,echo=0,link={port}"]) as pid:
         yield Way(opened(port), pid)
-
-
-def free_place() -> int:
-    """A tcp port that nobody uses now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def connected(place: int) -> socket.socket:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from cabled_units import sentence
+from free_port import free_port
 from patience import PATIENCE_S
 
 from ahrsd.config.sections import ShareSection
@@ -26,9 +27,7 @@ TEXT = sentence("VNYMR,+006.271,+000.031,-002.000,+0.2,-0.1,+0.4,+0.1,-0.2,-9.8,
 
 def free(kind: socket.SocketKind = socket.SOCK_STREAM) -> str:
     """An address that nobody uses now."""
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"127.0.0.1:{probe.getsockname()[1]}"
+    return f"127.0.0.1:{free_port(kind)}"
 
 
 def place(text: str) -> tuple[str, int]:

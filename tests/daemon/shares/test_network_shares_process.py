@@ -19,18 +19,13 @@ from operator import xor
 from pathlib import Path
 
 import pytest
+from free_port import free_port
 from patience import PATIENCE_S
 
 from ahrsd.inputs import Received
 from ahrsd.recording.capture import CaptureReader
 from drivers.vn100.emulator.pty import PtyEmulator
 from drivers.vn100.emulator.scenarios import Setup, build
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class Reader:
@@ -123,6 +118,7 @@ class Vehicle:
             try:
                 return Reader(socket.create_connection(("127.0.0.1", port)))
             except ConnectionRefusedError:
+                assert self.process.poll() is None, self.log
                 assert time.monotonic() < end_s, self.log
                 time.sleep(0.05)
 

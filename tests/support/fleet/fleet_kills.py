@@ -9,7 +9,6 @@ import json
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -20,6 +19,7 @@ from pathlib import Path
 
 import psutil
 import pyarrow.parquet
+from free_port import free_port
 
 from ahrsd.fleet.store import Store
 from ahrsd.offline.simulate import write_experiment
@@ -58,9 +58,7 @@ class Cluster:
     port: int = 0
 
     def __post_init__(self) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
+        self.port = free_port()
         self.start()
 
     @property
