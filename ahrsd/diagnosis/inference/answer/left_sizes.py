@@ -45,11 +45,11 @@ from ahrsd.diagnosis.inference.decision.members import (
 )
 from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
-from ahrsd.diagnosis.inference.search_rounds import Searched
+from ahrsd.diagnosis.inference.search_rounds import ModelSearchResult
 from ahrsd.diagnosis.where_and_when import locate
 from ahrsd.samples import Array
 
-_WORDS = {
+_PART_WORDS = {
     "world_course": "an outside field that varies with time and place",
     "gyro_course": "a gyro bias that varies with time",
     "by_direction": "a field that depends on attitude",
@@ -65,17 +65,17 @@ _WORDS = {
     QUICK: "a quickly varying field on the sensor",
 }
 #: what varies with time, by its frame
-_COURSES = {
+_PROCESS_WORDS = {
     "sensor": "a field on the sensor that varies with time",
     "world": "an outside field that varies with time",
     "gyro": "a gyro error that varies with time",
 }
 #: of 95 % of a normal size
-_WITHIN = 1.96
+_DEVIATIONS_95 = 1.96
 
 
-def told_sizes(
-    all_sets: Hypotheses, answer: Answer, left: Unexplained, nats: float, *, simulated: bool
+def with_remainder_sizes(
+    all_sets: Hypotheses, answer: Answer, unexplained: Unexplained, nats: float, *, simulated: bool
 ) -> Unexplained:
     """What is left, with its sizes where the recording leaves what real ones do.
 
@@ -83,20 +83,24 @@ def told_sizes(
     """
     best = answer.best
     if not all_sets.is_real(best.names):
-        return left
-    if left.detected:
-        known = dict.fromkeys(_words(all_sets, best, key) for key in answer.unknown)
-        what = ", ".join(known) or "a source of one direction, too quick to be followed in time"
-        why = f"beyond what such recordings ordinarily leave: {what}"
-        sizes = left_sizes(all_sets, best, why, answer.unknown)
-        return replace(left, ordinary=sizes)
+        return unexplained
+    if unexplained.detected:
+        parts = dict.fromkeys(_describe_part(all_sets, best, key) for key in answer.unknown)
+        described = (
+            ", ".join(parts) or "a source of one direction, too quick to be followed in time"
+        )
+        why = f"beyond what such recordings ordinarily leave: {described}"
+        sizes = remainder_sizes(all_sets, best, why, answer.unknown)
+        return replace(unexplained, ordinary=sizes)
     if simulated and nats > priors.UNKNOWN_ODDS:
-        sizes = left_sizes(all_sets, best, SIMULATED, ())
-        return replace(left, detected=True, ordinary=sizes, evidence_nats=nats)
-    return replace(left, ordinary=left_sizes(all_sets, best, None, ()), evidence_nats=nats)
+        sizes = remainder_sizes(all_sets, best, SIMULATED, ())
+        return replace(unexplained, detected=True, ordinary=sizes, evidence_nats=nats)
+    return replace(
+        unexplained, ordinary=remainder_sizes(all_sets, best, None, ()), evidence_nats=nats
+    )
 
 
-def left_sizes(
+def remainder_sizes(
     all_sets: Hypotheses, best: Hypothesis, why: str | None, keys: Sequence[str]
 ) -> Ordinary:
     """Everything that is left beside the names.
@@ -104,27 +108,29 @@ def left_sizes(
     why: it is not ordinary, None where it is;  keys: of a course that is left besides
     A name that is not told, being no larger than what such recordings have of its kind, is left.
     """
-    untold = [
+    ordinary_effects = [
         key
         for key in library_members(all_sets, best)
         if key not in keys and is_ordinary(all_sets, best, key)
     ]
     context = all_sets.made.context
-    take, nats = calibration_basis(context), _nats(all_sets, best)
-    whole = {unit: np.zeros((len(context.track), 3)) for unit in ("gauss", "rad/s")}
+    basis, nats = calibration_basis(context), _member_nats(all_sets, best)
+    totals = {unit: np.zeros((len(context.track), 3)) for unit in ("gauss", "rad/s")}
     parts = []
-    besides = [key for key in keys if key not in all_sets.remainder]
-    for key in (*all_sets.remainder, *besides, *untold):
+    unknown = [key for key in keys if key not in all_sets.remainder]
+    for key in (*all_sets.remainder, *unknown, *ordinary_effects):
         added, unit = contribution_of(all_sets, best, key)
-        added = project_out_calibration(added, take) if unit == "gauss" else added
-        whole[unit] += added
+        added = project_out_calibration(added, basis) if unit == "gauss" else added
+        totals[unit] += added
         size, frame = rms_about_mean(added), all_sets.component(key).frame
         heading_deg = heading_deviation_deg(added, context) if unit == "gauss" else None
-        up_to = size * _to_limit(all_sets, best, key)
+        up_to = size * _limit_ratio(all_sets, best, key)
         there = nats[key] > priors.ODDS_REAL
-        row = Component(
+        part = Component(
             key,
-            _untold(all_sets, key) if key in untold else _words(all_sets, best, key),
+            _describe_ordinary_effect(all_sets, key)
+            if key in ordinary_effects
+            else _describe_part(all_sets, best, key),
             frame,
             size,
             up_to,
@@ -133,24 +139,24 @@ def left_sizes(
             nats[key],
             there,
         )
-        parts.append(row)
+        parts.append(part)
     fields = [one for one in parts if one.unit == "gauss"]
     headings = [(one.heading_deg or 0.0) * one.up_to / max(one.size, 1e-300) for one in fields]
     return Ordinary(
         within=why is None,
         why=why,
-        field_gauss=rms_about_mean(whole["gauss"]),
-        field_up_to_gauss=_together([one.up_to for one in fields]),
-        heading_deg=heading_deviation_deg(whole["gauss"], context),
-        heading_up_to_deg=_together(headings),
-        gyro_rad_s=rms_about_mean(whole["rad/s"]),
-        gyro_up_to_rad_s=_together([one.up_to for one in parts if one.unit != "gauss"]),
+        field_gauss=rms_about_mean(totals["gauss"]),
+        field_up_to_gauss=_combined_limit([one.up_to for one in fields]),
+        heading_deg=heading_deviation_deg(totals["gauss"], context),
+        heading_up_to_deg=_combined_limit(headings),
+        gyro_rad_s=rms_about_mean(totals["rad/s"]),
+        gyro_up_to_rad_s=_combined_limit([one.up_to for one in parts if one.unit != "gauss"]),
         recordings=priors.RECORDINGS,
         components=tuple(parts),
     )
 
 
-def _words(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
+def _describe_part(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
     """What a part is, in words."""
     one, effect = all_sets.component(key), key.split(maxsplit=1)[0]
     factors = {factor for name in library_members(all_sets, best) for factor in factor_keys(name)}
@@ -158,11 +164,11 @@ def _words(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
         return f"a cause that {effect} resembles"
     if one.row is not None:
         return f"a step of a source that switches ({effect})"
-    words = _WORDS.get(key) or _WORDS.get(key.removeprefix("free "))
-    return words or _COURSES[one.frame]
+    words = _PART_WORDS.get(key) or _PART_WORDS.get(key.removeprefix("free "))
+    return words or _PROCESS_WORDS[one.frame]
 
 
-def _untold(all_sets: Hypotheses, key: str) -> str:
+def _describe_ordinary_effect(all_sets: Hypotheses, key: str) -> str:
     """What a name is that is not told, being ordinary, with its moments."""
     one = all_sets.component(key)
     when = " and ".join(f"{time_s:.0f} s" for time_s in one.moments_s)
@@ -170,12 +176,12 @@ def _untold(all_sets: Hypotheses, key: str) -> str:
     return f"{f'at {when} ' if when else ''}{words} ({one.effect})"
 
 
-def _together(limits: Sequence[float]) -> float:
+def _combined_limit(limits: Sequence[float]) -> float:
     """What parts that know nothing of each other are ordinarily at most together."""
     return float(np.linalg.norm(limits))
 
 
-def _to_limit(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
+def _limit_ratio(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
     """How many times as large a part is ordinarily at most; 0 of what is not ordinary."""
     law, row = all_sets.component(key).law, all_sets.component(key).row
     if row is not None and isinstance(law, ScaledLaw):
@@ -184,13 +190,13 @@ def _to_limit(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
         return 1.0 / max(float(np.max(np.abs(value) / limit)), 1e-12)
     if isinstance(law, FixedLaw):
         value, _ = coefficients(all_sets, best, key)
-        return _WITHIN / max(float(np.sqrt(np.mean(value**2 / law.variance))), 1e-12)
+        return _DEVIATIONS_95 / max(float(np.sqrt(np.mean(value**2 / law.variance))), 1e-12)
     if key not in priors.ORDINARY:
         return 0.0
     return priors.ORDINARY[key].up_to() / max(size_of(all_sets, best, key), 1e-12)
 
 
-def _nats(all_sets: Hypotheses, best: Hypothesis) -> dict[str, float]:
+def _member_nats(all_sets: Hypotheses, best: Hypothesis) -> dict[str, float]:
     """By how much likelier the recording is with each member, sizes and noise as they are.
 
     Of a Gaussian: the prior's density where the coefficients are nothing, to the posterior's.
@@ -204,30 +210,30 @@ def _nats(all_sets: Hypotheses, best: Hypothesis) -> dict[str, float]:
         mine = slice(begin, begin + one.width)
         begin = mine.stop
         mean, phi = best.at.mean[mine], one.law.log_variance(psi[key])
-        out[key] = _to_nothing(mean, covariance[mine, mine], phi)
+        out[key] = _savage_dickey_nats(mean, covariance[mine, mine], phi)
     return out
 
 
-def _to_nothing(mean: Array, covariance: Array, log_variance: Array) -> float:
+def _savage_dickey_nats(mean: Array, covariance: Array, log_variance: Array) -> float:
     scale = np.exp(-0.5 * log_variance)
-    shrunk = covariance * scale * scale[:, None]
-    _, log_det = np.linalg.slogdet(shrunk)
+    relative = covariance * scale * scale[:, None]
+    _, log_det = np.linalg.slogdet(relative)
     z = mean * scale
-    return 0.5 * float(z @ np.linalg.solve(shrunk, z) + log_det)
+    return 0.5 * float(z @ np.linalg.solve(relative, z) + log_det)
 
 
-def with_channels(
-    left: Unexplained, found: Searched, courses: Sequence[locate.Located]
+def with_correlated_channels(
+    unexplained: Unexplained, found: ModelSearchResult, processes: Sequence[locate.Located]
 ) -> Unexplained:
     """What is left, with the logged columns that move with it."""
-    if left.where is None or not left.course:
-        return left
-    frame, track = left.where.frame, found.all_sets.made.context.track
-    like = [one for course in courses if course.frame == frame
-            for one in locate.matching_channels(track, course)]  # fmt: skip
+    if unexplained.where is None or not unexplained.course:
+        return unexplained
+    frame, track = unexplained.where.frame, found.all_sets.made.context.track
+    matches = [one for process in processes if process.frame == frame
+            for one in locate.matching_channels(track, process)]  # fmt: skip
     follows = tuple(
         Suspect(one.channel, one.correlation, one.p_value)
-        for one in like
+        for one in matches
         if one.p_value < priors.CHANCE and abs(one.correlation) > priors.ALIKE
     )
-    return replace(left, follows=follows)
+    return replace(unexplained, follows=follows)
