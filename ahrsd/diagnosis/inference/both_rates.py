@@ -1,4 +1,4 @@
-"""The search at the working rate, and beside it what only the recorded rate shows."""
+"""The search at the working rate, and the search for quick effects at the recorded rate."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def search_both_rates(
     start: NullFit,
     library: Mapping[str, Effect],
 ) -> tuple[ModelSearchResult, RecordedRateResult]:
-    """The search, and what only the recorded rate shows; with that taken out the search anew.
+    """Both searches; if quick effects are found, they are removed, and the first search is repeated.
 
-    A source that is quicker than the working rate is folded by it and looks like what real
-    recordings leave.  Where it is surer than that, and without it nothing of the kind is left, it
-    is the source.
+    A source that is quicker than the working rate is aliased there and resembles what real
+    recordings leave.  It is accepted as the source if it has higher odds than the evidence of the
+    ordinary remainder, and if the recording without it needs no such remainder.
     """
     found = search_until_stable(richest, library)
     real = found.all_sets.is_real(found.answer.best.names)
@@ -47,7 +47,7 @@ def search_both_rates(
 def _search_without_quick(
     problem: Problem, fast: RecordedRateResult, start: NullFit, library: Mapping[str, Effect]
 ) -> tuple[ModelSearchResult, RecordedRateResult]:
-    """The search anew, without what the recorded rate shows."""
+    """The search repeated without the quick effects that were found at the recorded rate."""
     if fast.reduced_problem is None:
         raise ValueError("nothing was found at the recorded rate")
     refit = fit_null(fast.reduced_problem.track, problem.spec, start.model, walk=False)

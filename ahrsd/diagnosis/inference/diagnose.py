@@ -1,9 +1,9 @@
 """One diagnosis by one generative model.
 
-prepared -> null fit -> richest model, linearised -> search over sets -> linearised there -> ...
-         -> names, and what is left beyond the ordinary -> quick effects at the recorded rate
-         -> what holds it against other readings, other times, other priors
-         -> beside a loud gyro: whether that is beyond chance
+data quality -> null fit -> richest model, linearised -> search over sets -> linearised there -> ...
+     -> findings, and the residual beyond the ordinary -> quick effects at the recorded rate
+     -> checks of the answer: held-out readings, copies shifted in time, other priors
+     -> with a gyro of a high noise level: comparison with simulations of the null model
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from ahrsd.diagnosis.track import Spec, Track
 
 
 def build_and_fit_null(track: Track, spec: Spec) -> tuple[Problem, NullFit]:
-    """A track that hygiene has put right at its working rate, and the fit of a null to it."""
+    """The problem of a corrected track at its working rate, and the null model fitted to it."""
     problem, cold = build_problem(split_at_large_turns(track), spec)
     return problem, fit_null(problem.track, problem.spec, cold, walk=False)
 
@@ -49,7 +49,7 @@ def build_and_fit_null(track: Track, spec: Spec) -> tuple[Problem, NullFit]:
 def diagnose_logged(
     track: Track, spec: Spec | None = None, *, recording: str = "", simulated: bool = False
 ) -> Diagnosis:
-    """The same of columns with holes, as users have it."""
+    """The same for columns that have missing values."""
     run = partial(diagnose, recording=recording, simulated=simulated)
     return diagnose_with_gaps(track, spec, run)
 
@@ -62,9 +62,9 @@ def diagnose(
     recording: str = "",
     simulated: bool = False,
 ) -> Diagnosis:
-    """Where the recording and the model differ, and which physics was left out.
+    """Where the recording and the model differ, and which physical effects the model lacks.
 
-    simulated: known to be no real recording, of which nothing is ordinary
+    simulated: the recording is known to be simulated; then no residual counts as ordinary
     Deterministic.  ValueError, one line, where nothing can be fitted.
     """
     known_spec = spec or Spec()
@@ -77,9 +77,9 @@ def diagnose(
 def _diagnose_once(
     track: Track, spec: Spec, library: Mapping[str, Effect], *, simulated: bool, clocks: bool
 ) -> FittedDiagnosis:
-    """The answer, whatever is to be expected of it by chance.
+    """The diagnosis, without the comparison with simulations of the null model.
 
-    clocks: whether a column may run by another clock than the sensor
+    clocks: whether to test for a column that was logged by another clock than the sensor's
     """
     prepared = prepare(track)
     if (stopped := prepared.stopped_diagnosis("", library)) is not None:

@@ -1,9 +1,10 @@
-"""Turns that a recording lost: where its gyro's samples do not tell them, and which it left out.
+"""Turns that are missing in a recording: by undersampling, or because samples were lost.
 
-A step's turn is told by one vector as long as the rate hardly changes within it.  In a crash, a
-fall or a blow a slow logger sees turns of a radian a step: what happened between is not known.  A
-field that jumps looks like lost turns now and then, and hides those that are; so they are looked
-for once more beside what was found, and where the two answers differ, the likelier one is believed.
+One gyro sample describes the turn of a step only if the rate hardly changes within the step.  In a
+crash, a fall or a blow a slow logger has turns of a radian in a step, and the motion between is
+unknown.  A field that jumps sometimes resembles lost turns, and hides real ones.  So lost turns are
+sought once more with the accepted effects in the model.  If the two results differ, the more
+probable one is kept.
 """
 
 from __future__ import annotations
@@ -25,9 +26,11 @@ from ahrsd.diagnosis.track import Track
 def find_lost_turns_given(
     recorded: Track, found: ModelSearchResult, fast: RecordedRateResult, lost: Sequence[Fact]
 ) -> list[Fact]:
-    """Lost turns of a recording as it came, beside what was found.
+    """Lost turns of a recording, given the accepted effects.
 
-    lost: those that had been put right before that was found
+    recorded: the recording before any correction
+    lost: the lost turns that were corrected before the search; a member that jumps where one of
+          them ended may be its remainder, and is left out of the model here
     """
     if not lost:
         return _find_in_point(fast.point)
@@ -46,12 +49,12 @@ def find_lost_turns_given(
 
 
 def corrected_log_evidence(found: ModelSearchResult, lost: Sequence[Fact]) -> float:
-    """How likely the readings are where these turns were put right, as nats that compare."""
+    """Log evidence of the readings with these turns corrected; corrections compare by it."""
     return found.answer.best.score + found.all_sets.made.log_whitening - correction_cost(lost)
 
 
 def split_at_large_turns(track: Track) -> Track:
-    """The track with a run's end ahead of each step that turns too far to be told."""
+    """The track with a new run at each step that turns by more than a gyro sample can describe."""
     step_s = np.nan_to_num(track.dt_s, nan=0.0)
     turn = np.linalg.norm(track.gyro_b_rad_s, axis=1) * step_s
     too_large = np.flatnonzero(turn > priors.SAMPLED_TURN_RAD)

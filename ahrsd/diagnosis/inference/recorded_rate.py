@@ -1,8 +1,8 @@
-"""What only the recording's own rate shows: fields that alternate, rotors, pulses, single readings.
+"""Effects that only the recorded rate shows: alternating fields, rotors, pulses, single readings.
 
-Averaging to the working rate loses a field that changes many times a second, or folds it to another
-frequency.  So the recording as it came is filtered with the calibration and all that the search
-found, and the library's quick effects are searched there, by the same evidence.
+Averaging to the working rate removes a field that changes many times a second, or aliases it to
+another frequency.  So the recording at its own rate is filtered with the calibration and all that
+the search found, and the library's quick effects are searched there, by the same evidence.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 from ahrsd.diagnosis.where_and_when.narrow_band import loudest_band, unexplained_band
 from ahrsd.samples import Array
 
-#: how often rows are weighed anew beside what was found
+#: how often the noise level is estimated anew with the accepted effects in the model
 NOISE_REFITS = 2
 
 
@@ -50,9 +50,10 @@ NOISE_REFITS = 2
 class RecordedRateResult:
     """An answer at the recorded rate.
 
-    left: the recording with all that was found taken out;  all_sets, space: what was searched
-    hum: a band that no name explains and that stands out of the noise
-    slower: the problem of a search that begins anew without what was found, None where nothing was
+    point: the recording with all that was found at the working rate removed
+    all_sets, space: what was searched
+    band: a band of a high noise level that no effect explains
+    reduced_problem: the problem of a new search without what was found, None if nothing was found
     """
 
     answer: decision.Answer
@@ -71,18 +72,18 @@ def search_recorded_rate(
     real: bool,
     source_nats: float = 0.0,
 ) -> RecordedRateResult:
-    """The quick effects beside a set that was found at the working rate.
+    """Search the quick effects, given a set that was found at the working rate.
 
-    real: whether that set leaves what real recordings do: then a column has to tell, for a room has
-          alternating fields of its own
-    source_nats: evidence of a source in that set that switches
+    real: whether that set has the ordinary remainder; then only effects by a logged column are
+          tested, because a room has alternating fields of its own
+    source_nats: evidence of a switching source in that set
     """
     point = point_at_recorded_rate(step_to_maximum(made, best.keys, best.at))
     fast, all_sets, space, found = _search_with_band(point, library, real=real)
     # readings that were outliers may be none with what was found in the model
     for _ in range(NOISE_REFITS if found.names else 0):
         point = refit_noise_level(fast, found.keys, found.at)
-        del fast, all_sets, space  # what was asked at the point before is as much again
+        del fast, all_sets, space  # the sets of the previous point take as much memory
         fast, all_sets, space, found = _search_with_band(point, library, real=real)
     all_sets.unknown_nats = source_nats
     answer = decision.decide(all_sets, space, found, library)
@@ -97,10 +98,10 @@ def search_recorded_rate(
 def _search_with_band(
     point: Point, library: Mapping[str, Effect], *, real: bool
 ) -> tuple[Linearised, Hypotheses, Space, Hypothesis]:
-    """The likeliest set of quick effects at a point.
+    """The most probable set of quick effects at a point.
 
-    Where a band stands out it may be noise as well: what was found without that has to be likelier
-    than a band of any power.
+    If a band stands out, it may be noise as well.  Then the effects found without it have to be
+    more probable than a band of any power.
     """
     plain = linearise(point, point.context)
     first = _search_in_noise(plain, library, (), real=real)
@@ -108,12 +109,13 @@ def _search_with_band(
         return first
     null = first[1].judge(frozenset())
     rate_hz = point.problem.rate_hz
-    highest_hz = 0.5 * rate_hz * float(np.mean(point.filtered.used))  # readings that repeat
+    # repeated readings are not used, so the magnetometer's own rate is lower
+    highest_hz = 0.5 * rate_hz * float(np.mean(point.filtered.used))
     band = loudest_band(plain.residual(null.keys, null.at), rate_hz, highest_hz)
     if band is None:
         return first
     first_members = first[3].names
-    del plain, first, null  # at a recording's own rate each is a hundred megabytes
+    del plain, first, null  # at the recorded rate each takes a hundred megabytes
     with_band = linearise(point, point.context, band[:2])
     return _search_in_noise(with_band, library, [first_members], real=real)
 
@@ -121,7 +123,7 @@ def _search_with_band(
 def _search_in_noise(
     fast: Linearised, library: Mapping[str, Effect], starts: Sequence[Names], *, real: bool
 ) -> tuple[Linearised, Hypotheses, Space, Hypothesis]:
-    """The likeliest set in one form of the noise.  starts: sets beside the empty one."""
+    """The most probable set with one form of the noise.  starts: sets besides the empty one."""
     candidates: dict[str, list[str]] = {}
     forms: dict[str, Component] = {}
     for effect_key, effect in library.items():
@@ -147,7 +149,7 @@ def _search_in_noise(
 
 
 def _find_unexplained_band(fast: Linearised, best: Hypothesis) -> Unexplained:
-    """The band of the noise that stands alone, where what was found leaves it loud."""
+    """The band with a noise level of its own, if it stands out given the accepted effects."""
     alone = fast.alone
     if alone is None:
         return Unexplained(False)
@@ -168,7 +170,7 @@ def _find_unexplained_band(fast: Linearised, best: Hypothesis) -> Unexplained:
 
 
 def point_at_recorded_rate(slow: Point) -> Point:
-    """A point at the recording's own rate: all that is taken out is drawn between working rows."""
+    """A point at the recorded rate; what was removed is interpolated between the working rows."""
     problem = slow.problem
     track = without_lag(problem.recorded, problem.lag_s, instants=problem.instants)
     at_s, time_s = slow.filtered.track.time_s, track.time_s
@@ -186,7 +188,7 @@ def point_at_recorded_rate(slow: Point) -> Point:
 
 
 def _remove_found(fast: Problem, slow: Problem, made: Linearised, best: Hypothesis) -> Problem:
-    """The problem of the working rate, without what was found at the recorded one."""
+    """The problem at the working rate, without what was found at the recorded rate."""
     values = {
         key: value
         for key, value in coefficients_by_key(made, best.keys, best.at).items()

@@ -1,4 +1,4 @@
-"""Searches at one linearisation after the other, until what is found stays."""
+"""Repeated linearisation and search, until the accepted effects no longer change."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.diagnosis.inference.search.search_space import search_at_point
 from ahrsd.samples import Array
 
-#: linearisations with a search each, at most
+#: largest number of linearisations, each with a search
 ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelSearchResult:
-    """An answer, and the sets at the last linearisation that it was chosen of.
+    """An answer, and the sets at the last linearisation point, from which it was chosen.
 
-    source: what is louder along one direction than a sensor's noise is, None where nothing is
+    source: noise along one direction beyond a sensor's own, None if there is none
     """
 
     answer: decision.Answer
@@ -43,7 +43,7 @@ class ModelSearchResult:
 def search_until_stable(
     found: richest_model.FittedPoint, library: Mapping[str, Effect]
 ) -> ModelSearchResult:
-    """Searched at the richest model, and again at what was found, until that stays."""
+    """Search at the richest model, then at the accepted effects, until these no longer change."""
     all_sets, space, best = search_at_point(found, library, (), was_real=True)
     answer = decision.decide(all_sets, space, best, library)
     source = _find_directed_source(all_sets, answer.best)
@@ -59,7 +59,7 @@ def search_until_stable(
             break
         intervals = movement_intervals(all_sets, answer.best)
         point = replace(omit_readings(point, intervals) if intervals else point, directed=directed)
-        del all_sets, space  # what was asked at the point before is as much again
+        del all_sets, space  # the sets of the previous point take as much memory
         found = richest_model.converge(point, library, effects)
         all_sets, space, best = search_at_point(found, library, effects, real)
         answer = decision.decide(all_sets, space, best, library)
@@ -70,7 +70,7 @@ def search_until_stable(
 
 
 def _find_directed_source(all_sets: Hypotheses, best: Hypothesis) -> DirectedNoise | None:
-    """What is louder along one direction than a sensor's noise is, None where that is not sure."""
+    """Noise along one direction beyond a sensor's own, None if its evidence is too low."""
     found = directed_noise_of_residual(all_sets.made, best.keys, best.at)
     required = priors.DIRECTED_REAL if all_sets.is_real(best.names) else priors.UNKNOWN_ODDS
     return found if found.nats > required else None
@@ -79,10 +79,14 @@ def _find_directed_source(all_sets: Hypotheses, best: Hypothesis) -> DirectedNoi
 def _whitening_source(
     answer: decision.Answer, source: DirectedNoise | None, known: DirectedNoise | None
 ) -> DirectedNoise | None:
-    """The source beside whose noise names are judged: one that is surer than all that is told.
+    """The source by whose covariance the rows are whitened, if it exceeds all that is reported.
 
-    A strong name whose log or form is not exact leaves a rest, and is no worse for it, and so does
-    a course of what is unknown; what a source has more of than all of these have is not theirs.
+    A strong effect leaves a residual along its direction if its log or its form is inexact, and is
+    still correct.  A free process does so as well.  Directed noise with more evidence than any of
+    these is not their residual.
+
+    known: the source by which the rows are whitened already; then the source need not be more
+    certain
     """
     reported_nats = [one.evidence_nats for one in answer.findings]
     largest_nats = max([*reported_nats, answer.unexplained.evidence_nats])
@@ -92,10 +96,11 @@ def _whitening_source(
 def _search_without_movement(
     found: ModelSearchResult, library: Mapping[str, Effect]
 ) -> ModelSearchResult:
-    """The search anew without the readings of a spell of seconds, where a step began in it.
+    """Repeat the search without the readings of a short unknown source, if a step began within it.
 
-    What a hand brings passes the sensor before it stays, and the passing is louder than the step:
-    a source that is there for a spell, and beside it no step would be told.
+    An object that is brought by hand passes the sensor before it stays, and its field in passing is
+    larger than the step.  That looks like a source which is present for some seconds, and with this
+    source in the model no step is accepted.
     """
     all_sets, unknown, margin_s = found.all_sets, found.answer.unknown, priors.TRANSITION_S / 2
     active_intervals = [all_sets.component(key).setting.get("spans_s", ()) for key in unknown]
@@ -118,11 +123,12 @@ def _search_without_movement(
 
 
 def movement_intervals(all_sets: Hypotheses, best: Hypothesis) -> list[tuple[float, float]]:
-    """When something was moved, (from, to) s: where the way of a step's source is far off a step.
+    """Intervals (from, to), s, in which something was moved, so that a step does not describe it.
 
-    A step has its two levels right, but a form of some pieces is not the way from one to the other:
-    what it leaves is louder than all else, and other names are told for it.  Of names that begin
-    within a hand's time of each other, and end so or stay, all but the levels is the way.
+    A step has both of its levels right.  Its form component has only some pieces and cannot follow
+    the movement from one level to the other, so it leaves a large residual, and other effects are
+    fitted to it.  If several effects begin within `APPROACH_S` of each other and end so or remain,
+    all but their levels belongs to one movement.
     """
     point, half_s = all_sets.made.point, priors.APPROACH_S / 2 / STEP_PIECES
     track, sigma = point.filtered.track, point.filtered.model.sigma_mag_gauss
@@ -154,7 +160,7 @@ def movement_intervals(all_sets: Hypotheses, best: Hypothesis) -> list[tuple[flo
 
 
 def _is_part_of_movement(one: Component, moment_s: float) -> bool:
-    """Whether a member begins beside a step and does not outlast what a hand does there."""
+    """Whether a member begins near a step and lasts no longer than a movement by hand."""
     begin, end = _active_interval(one)
     near = abs(begin - moment_s) <= priors.APPROACH_S
     return near and end - begin <= 2 * priors.APPROACH_S and one.columns.on_mag
@@ -163,7 +169,7 @@ def _is_part_of_movement(one: Component, moment_s: float) -> bool:
 def _same_movement_times(
     step: Component, moment_s: float, with_onset: Sequence[Component]
 ) -> list[float]:
-    """When steps of the same vector as one at a moment are there: all moments are those of it."""
+    """Times of other steps that belong to the same movement: same frame, all times within `APPROACH_S`."""
     out = list[float]()
     for one in with_onset:
         if one is step or one.frame != step.frame or len(one.moments_s) != len(step.moments_s):
@@ -175,19 +181,19 @@ def _same_movement_times(
 
 
 def _active_interval(one: Component) -> tuple[float, float]:
-    """From when to when a member changes, s."""
+    """The interval (from, to), s, in which a member changes."""
     begin, *end = one.moments_s
     return begin, end[0] if end else begin + float(one.setting.get("length_s", 0.0))
 
 
 def _runs_with_peak(wide: NDArray[np.bool], high: NDArray[np.bool]) -> list[tuple[int, int]]:
-    """Runs of rows of the first kind that have one of the second, first and behind the last."""
+    """Runs of rows in `wide` that contain a row in `high`, as (first, last + 1)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], wide.astype(int), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if np.any(high[a:b])]
 
 
 def _added_field(all_sets: Hypotheses, best: Hypothesis, key: str) -> Array:
-    """(N, 3) gauss that a member puts on the magnetometer."""
+    """(N, 3) gauss that a member adds to the magnetometer."""
     columns = all_sets.component(key).columns.mag
     if columns is None:
         return np.zeros((len(all_sets.made.context.track), 3))
