@@ -20,7 +20,7 @@ def search_both_rates(
     start: NullFit,
     library: Mapping[str, Effect],
 ) -> tuple[ModelSearchResult, RecordedRateResult]:
-    """Both searches; if quick effects are found, they are removed, and the first search is repeated.
+    """Both searches; if quick effects are found, they are removed and the first one is repeated.
 
     A source that is quicker than the working rate is aliased there and resembles what real
     recordings leave.  It is accepted as the source if it has higher odds than the evidence of the

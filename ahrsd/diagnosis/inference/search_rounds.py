@@ -169,7 +169,7 @@ def _is_part_of_movement(one: Component, moment_s: float) -> bool:
 def _same_movement_times(
     step: Component, moment_s: float, with_onset: Sequence[Component]
 ) -> list[float]:
-    """Times of other steps that belong to the same movement: same frame, all times within `APPROACH_S`."""
+    """Times of other steps of the same movement: same frame, all times within `APPROACH_S`."""
     out = list[float]()
     for one in with_onset:
         if one is step or one.frame != step.frame or len(one.moments_s) != len(step.moments_s):

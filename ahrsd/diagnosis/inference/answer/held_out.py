@@ -1,15 +1,16 @@
 """What a part of the model gains on readings that it was not fitted to, and what its copies gain.
 
-The recording is cut in stretches of some seconds, dealt to five parts in turn.  Each part's
-readings are foretold from the other four: coefficients are what those say, sizes and the noise's
-spectrum are those of the whole.  A set's density of a part is p(all) / p(the other four), with all
-that is not known of its coefficients in it; the gain is how much likelier a part's readings are
-with what was named than without it, each set in the noise that it leaves.  Below nothing, what was
-named says of other readings what is not so.
+The recording is cut into intervals of some seconds, which are assigned to five folds in turn
+(cross-validation).  The readings of each fold are predicted from the other four: the coefficients
+are those of the other folds, the sizes and the noise spectrum are those of the whole recording.
+The predictive density of a fold is p(all) / p(the other folds), with the coefficients integrated
+out.  The gain is the log likelihood ratio of a fold's readings with the accepted members and
+without them, each set in its own noise.  If it is negative, the members predict other readings
+wrongly.
 
-Copies: the same columns at other times of the recording, as a cause of the same law would have them
-that has nothing to do with the readings.  Of a course that is free in time: the same in the other
-frames.
+Copies are the same columns shifted in time, as a cause of the same statistics would have them that
+is unrelated to the readings.  For a free process in time, the copies are free processes in the
+other frames.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ from ahrsd.diagnosis.inference.likelihood.candidates import averaged_log_bayes_f
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis, Names
 from ahrsd.samples import Array
 
-#: readings that a stretch has at least
+#: least number of readings of an interval
 _FEWEST_READINGS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FoldProducts:
-    """Products of rows, part by part: G (F, q, q), s (F, q), square (F,), rows (F,)."""
+    """Products of rows by fold: G (F, q, q), s (F, q), square (F,), rows (F,)."""
 
     G: Array
     s: Array
@@ -42,7 +43,7 @@ class _FoldProducts:
     rows: Array
 
     def all_but(self, number: int) -> tuple[Array, Array, float, float]:
-        """The same of all parts but one, together; of all where none has the number."""
+        """The sums over all folds but one; over all folds if there is none of this number."""
         others = np.arange(len(self.rows)) != number
         return (
             self.G[others].sum(axis=0),
@@ -54,11 +55,11 @@ class _FoldProducts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """How well a set foretells each part from the others.
+    """How well a set predicts each fold from the others.
 
-    nats: log density of all parts
-    square: mean square by which the next reading is off, in the filter's unit: the mean of the
-            noise's log powers is the error of a forecast by all that was before
+    nats: log density of all folds
+    square: mean square error of the prediction of the next reading, in the filter's unit; the mean
+            of the noise's log powers is the log error variance of a prediction from all before
     """
 
     nats: float
@@ -67,13 +68,13 @@ class Prediction:
 
 @dataclass(eq=False)
 class HeldOut:
-    """Sets of one recording, each foretold once; gains are by recorded reading."""
+    """Sets of one recording, each predicted once; gains are per recorded reading."""
 
     all_sets: Hypotheses
     best: Hypothesis
 
     def __post_init__(self) -> None:
-        """Nothing is foretold yet."""
+        """Start with no predictions."""
         self._rows: dict[Names, WhiteRows] = {}
         self._parts: dict[Names, _FoldProducts] = {}
         self._predictions: dict[Names, Prediction] = {}
@@ -81,31 +82,31 @@ class HeldOut:
         self.samples = int(np.count_nonzero(np.isfinite(recorded.mag_b_gauss).all(axis=1)))
 
     def rows(self, names: Names) -> WhiteRows:
-        """A set's rows in its own noise; those of the best set and of the last one asked stay."""
+        """The rows of a set in its own noise; kept for the best set and for the last other one."""
         if names not in self._rows:
             self._rows = {key: one for key, one in self._rows.items() if key == self.best.names}
             self._rows[names] = white_rows(self.all_sets, self.all_sets.judge(names, self.best))
         return self._rows[names]
 
     def predict(self, names: Names) -> Prediction:
-        """How well a set foretells."""
+        """How well a set predicts each fold from the others."""
         if names not in self._predictions:
             self._predictions[names] = _predict_folds(self.parts(names), self.rows(names))
         return self._predictions[names]
 
     def parts(self, names: Names) -> _FoldProducts:
-        """Products of a set's rows, part by part."""
+        """Products of a set's rows by fold."""
         if names not in self._parts:
             rows = self.rows(names)
             self._parts[names] = _fold_products(rows.X, rows.y, assign_folds(rows))
         return self._parts[names]
 
     def gain(self, without: Names) -> float:
-        """Nats per recorded reading by which the best set foretells better than another."""
+        """Nats per recorded reading by which the best set predicts better than `without`."""
         return float(self.predict(self.best.names).nats - self.predict(without).nats) / self.samples
 
     def held_out_gain(self, keys: Sequence[str]) -> Heldout:
-        """The held-out gain of members of the best set together, and the largest of its copies."""
+        """The held-out gain of members of the best set together, and the largest of copies."""
         without = self.without(keys)
         free_process = any(self.all_sets.component(key).row is None for key in keys)
         if free_process:
@@ -123,7 +124,7 @@ class HeldOut:
         return names
 
     def _prediction_rms_gauss(self, names: Names) -> float:
-        """Root mean square of what is not foretold, gauss."""
+        """Root mean square error of the prediction, gauss."""
         found, filtered = self.predict(names), self.all_sets.made.point.filtered
         used, level = filtered.used, self.all_sets.made.point.loud.amplitude[:, None]
         own = float(np.mean(filtered.innovation[used] ** 2))
@@ -131,7 +132,7 @@ class HeldOut:
         return float(np.sqrt(found.square * per_unit))
 
     def _best_shifted_copy_nats(self, key: str, without: Names) -> float:
-        """Nats of the best of a member's copies at other times, beside the set without it."""
+        """Largest gain, nats, of a member's copies shifted in time, added to the set without it."""
         rows, one = self.rows(without), self.all_sets.component(key)
         shifted = [one.shifted_columns(share) for share in priors.SHIFTS]
         copies = rows.filter_columns(shifted)
@@ -140,7 +141,7 @@ class HeldOut:
         cuts = [slice(k * one.width, (k + 1) * one.width) for k in range(len(shifted))]
 
         def copy_nats(number: int) -> Array:
-            """Nats of each copy on all parts but one."""
+            """Log Bayes factor of each copy on all folds but one."""
             G, s, _, _ = parts.all_but(number)
             deviation = np.exp(0.5 * rows.phi)
             root = upper_root(G[:known, :known], deviation)
@@ -158,7 +159,7 @@ class HeldOut:
         return float(np.max(folds * copy_nats(folds) - nats_of_others))
 
     def _best_other_frame_nats(self, without: Names) -> float:
-        """Nats of the best free course in a frame in which the best set has none."""
+        """Largest gain, in nats, of a free process in a frame in which the best set has none."""
         others = [one for one in priors.COURSE_UNIT if f"free {one}" not in self.best.names]
         fitted = [f"free {one}" for one in others if f"free {one}" in self.all_sets.made.seen]
         base = self.predict(without).nats
@@ -166,7 +167,7 @@ class HeldOut:
 
 
 def assign_folds(rows: WhiteRows) -> NDArray[np.intp]:
-    """(N,) the part that a row is in: stretches in turn."""
+    """(N,) fold of each row: successive intervals belong to the folds in turn."""
     track = rows.made.point.problem.track
     length_s = max(priors.STRETCH_S, _FEWEST_READINGS * track.step_s)
     at_s = track.time_s[rows.rows] - track.time_s[0]
@@ -183,7 +184,7 @@ def _fold_products(X: Array, y: Array, fold_of_row: NDArray[np.intp]) -> _FoldPr
 
 
 def _append_columns(known: _FoldProducts, rows: WhiteRows, copies: Array) -> _FoldProducts:
-    """The products with more columns (N, 3, p) behind the set's own."""
+    """The products with further columns (N, 3, p) behind those of the set."""
     fold_of_row, products = assign_folds(rows), []
     for number in range(priors.PARTS):
         inside = fold_of_row == number
@@ -197,12 +198,12 @@ def _append_columns(known: _FoldProducts, rows: WhiteRows, copies: Array) -> _Fo
 
 
 def _predict_folds(parts: _FoldProducts, rows: WhiteRows) -> Prediction:
-    """Each part from the others."""
+    """Predict each fold from the others."""
     deviation = np.exp(0.5 * rows.phi)
     unit = np.log(2 * np.pi) + rows.log_power
 
     def density(number: int) -> tuple[float, Array]:
-        """Log density of all parts but one, and the likeliest coefficients there."""
+        """Log density of all folds but one, and the maximum-posterior coefficients there."""
         G, s, square, count = parts.all_but(number)
         root = upper_root(G, deviation)
         m = linalg.cho_solve((root, False), deviation * s)

@@ -1,9 +1,9 @@
-"""The size of what a recording leaves, part by part, beside what such recordings ordinarily leave.
+"""Sizes of the ordinary remainder, part by part, next to what real recordings ordinarily leave.
 
-A part of the ordinary remainder adds to the readings what its likeliest coefficients make of its
-columns; the deviation of that over the recording, less what another calibration would take of it,
-is its size.  What 95 % of untouched recordings stay below is told in the same motion: as many times
-its size as the limit of its coefficients is theirs.
+The contribution of a part is its columns times their maximum-posterior coefficients.  Its size is
+the standard deviation of this contribution over the recording, less what another calibration would
+explain of it.  The limit that 95 % of untouched recordings stay below is given for the same motion:
+the size times the ratio of the limit of the coefficients to the coefficients.
 """
 
 from __future__ import annotations
@@ -64,22 +64,23 @@ _PART_WORDS = {
     BY_HEADING: "a field that depends on heading",
     QUICK: "a quickly varying field on the sensor",
 }
-#: what varies with time, by its frame
+#: free processes in time, by frame
 _PROCESS_WORDS = {
     "sensor": "a field on the sensor that varies with time",
     "world": "an outside field that varies with time",
     "gyro": "a gyro error that varies with time",
 }
-#: of 95 % of a normal size
+#: deviations that bound 95 % of a normal distribution
 _DEVIATIONS_95 = 1.96
 
 
 def with_remainder_sizes(
     all_sets: Hypotheses, answer: Answer, unexplained: Unexplained, nats: float, *, simulated: bool
 ) -> Unexplained:
-    """What is left, with its sizes where the recording leaves what real ones do.
+    """The unexplained part, with the sizes of the remainder if the set contains one.
 
-    nats: by which it is likelier that it does;  simulated: then none of it is ordinary
+    nats: evidence of the remainder
+    simulated: the recording is known to be simulated; then no remainder is ordinary
     """
     best = answer.best
     if not all_sets.is_real(best.names):
@@ -103,10 +104,11 @@ def with_remainder_sizes(
 def remainder_sizes(
     all_sets: Hypotheses, best: Hypothesis, why: str | None, keys: Sequence[str]
 ) -> Ordinary:
-    """Everything that is left beside the names.
+    """Sizes of everything besides the findings.
 
-    why: it is not ordinary, None where it is;  keys: of a course that is left besides
-    A name that is not told, being no larger than what such recordings have of its kind, is left.
+    why: reason why the remainder is not ordinary, None if it is
+    keys: unknown members of the set, which are listed as well
+    Effects that are no larger than is ordinary for their kind are no findings and are listed here.
     """
     ordinary_effects = [
         key
@@ -157,7 +159,7 @@ def remainder_sizes(
 
 
 def _describe_part(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
-    """What a part is, in words."""
+    """A part in words."""
     one, effect = all_sets.component(key), key.split(maxsplit=1)[0]
     factors = {factor for name in library_members(all_sets, best) for factor in factor_keys(name)}
     if key in factors or not best.names.isdisjoint(factor_keys(key)):
@@ -169,7 +171,7 @@ def _describe_part(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
 
 
 def _describe_ordinary_effect(all_sets: Hypotheses, key: str) -> str:
-    """What a name is that is not told, being ordinary, with its moments."""
+    """An effect of ordinary size, which is no finding, in words with its times."""
     one = all_sets.component(key)
     when = " and ".join(f"{time_s:.0f} s" for time_s in one.moments_s)
     words = "" if one.row is None else one.row.words
@@ -177,16 +179,16 @@ def _describe_ordinary_effect(all_sets: Hypotheses, key: str) -> str:
 
 
 def _combined_limit(limits: Sequence[float]) -> float:
-    """What parts that know nothing of each other are ordinarily at most together."""
+    """The ordinary limit of independent parts together."""
     return float(np.linalg.norm(limits))
 
 
 def _limit_ratio(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
-    """How many times as large a part is ordinarily at most; 0 of what is not ordinary."""
+    """Ordinary limit of a part over its size; 0 if the part is not an ordinary one."""
     law, row = all_sets.component(key).law, all_sets.component(key).row
     if row is not None and isinstance(law, ScaledLaw):
         value, deviation = coefficients(all_sets, best, key)
-        limit = row.ordinary * law.scale + 2.0 * deviation  # beyond, it is told (`size_of`)
+        limit = row.ordinary * law.scale + 2.0 * deviation  # beyond, it is a finding (`size_of`)
         return 1.0 / max(float(np.max(np.abs(value) / limit)), 1e-12)
     if isinstance(law, FixedLaw):
         value, _ = coefficients(all_sets, best, key)
@@ -197,9 +199,9 @@ def _limit_ratio(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
 
 
 def _member_nats(all_sets: Hypotheses, best: Hypothesis) -> dict[str, float]:
-    """By how much likelier the recording is with each member, sizes and noise as they are.
+    """Log Bayes factor of each member, with sizes and noise as they are.
 
-    Of a Gaussian: the prior's density where the coefficients are nothing, to the posterior's.
+    For a Gaussian this is the Savage-Dickey ratio at zero coefficients: prior density to posterior.
     """
     scan = candidate_scan(all_sets.made, best.keys, best.at)
     inverse = np.linalg.inv(scan.root)
@@ -215,6 +217,7 @@ def _member_nats(all_sets: Hypotheses, best: Hypothesis) -> dict[str, float]:
 
 
 def _savage_dickey_nats(mean: Array, covariance: Array, log_variance: Array) -> float:
+    """Log of the prior density at zero coefficients over the posterior density there."""
     scale = np.exp(-0.5 * log_variance)
     relative = covariance * scale * scale[:, None]
     _, log_det = np.linalg.slogdet(relative)
@@ -225,7 +228,7 @@ def _savage_dickey_nats(mean: Array, covariance: Array, log_variance: Array) -> 
 def with_correlated_channels(
     unexplained: Unexplained, found: ModelSearchResult, processes: Sequence[locate.Located]
 ) -> Unexplained:
-    """What is left, with the logged columns that move with it."""
+    """The unexplained part, with the logged columns that correlate with it."""
     if unexplained.where is None or not unexplained.course:
         return unexplained
     frame, track = unexplained.where.frame, found.all_sets.made.context.track

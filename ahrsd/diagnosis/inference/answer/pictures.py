@@ -1,4 +1,4 @@
-"""What a report draws of an answer: innovations, what each name adds, what was not named."""
+"""The data that a report plots: innovations, contributions of the terms, unexplained processes."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def plot_data(
     processes: tuple[Located, ...],
     single_effects: Sequence[EffectEvidence],
 ) -> Drawn:
-    """The pictures' numbers.
+    """The data of the plots.
 
-    start: the calibration alone;  found: of which all is taken out after
-    residual: (N, 3) what that leaves, white where the model is right
+    start: the calibration alone;  found: the answer, all of which is removed for `after`
+    residual: (N, 3) what remains then, white if the model is right
     """
     best = found.answer.best
     after = step_to_maximum(found.all_sets.made, best.keys, best.at).filtered
@@ -52,7 +52,7 @@ def plot_data(
 
 
 def contributions(all_sets: Hypotheses, answer: Answer) -> list[Contribution]:
-    """What each term of an answer adds to the readings, in the terms' order."""
+    """What each term of an answer adds to the readings, in the order of the terms."""
     time_s = all_sets.made.context.track.time_s
     return [
         Contribution(term.identifier, time_s, *contribution_of(all_sets, answer.best, key))
@@ -61,7 +61,7 @@ def contributions(all_sets: Hypotheses, answer: Answer) -> list[Contribution]:
 
 
 def locate_processes(all_sets: Hypotheses, best: Hypothesis) -> tuple[Located, ...]:
-    """The free course of each frame beside an answer, stretch by stretch."""
+    """The free process of each frame given the answer, in segments of the recording."""
     fitted = all_sets.made.seen
     return tuple(_locate_process(all_sets, best, f) for f in FRAMES if f"free {f}" in fitted)
 

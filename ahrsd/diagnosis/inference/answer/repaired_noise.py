@@ -1,7 +1,8 @@
-"""The noise of the repaired model: what a recording scatters by beside its names alone.
+"""The noise of the repaired model: the scatter that remains given the findings alone.
 
-The repaired model is calibration, names and noise.  What real recordings ordinarily leave is in no
-name, so it is noise to it, and the law is found with nothing but names taken out.
+The repaired model consists of calibration, effects and noise.  What real recordings ordinarily
+leave belongs to no effect and is noise in this model.  So the noise law is fitted with only the
+effects removed.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def repaired_noise(
     facts: Sequence[Fact],
     level_intervals: Sequence[tuple[float, float]],
 ) -> Noise:
-    """The noise law of the recording's own rate.  loud: spans of another level, s."""
+    """The noise law at the recorded rate.  level_intervals: intervals of another noise level, s."""
     point, answer = fast.point, found.answer
     if found.all_sets.is_real(answer.best.names):
         point = point_at_recorded_rate(_remove_effects_only(found))
@@ -52,13 +53,13 @@ def repaired_noise(
     fit = NullFit(
         filtered.model, filtered, True, np.zeros((11, 11)), point.terms_mag, point.terms_gyro
     )
-    # a delay is out of the track, and what only the recorded rate shows out of the recording
+    # a delay has been removed from the track, and quick effects from the recording
     kept = [term for term in answer.terms if not library[term.identifier].delay]
     return constant_level_noise(fit, level_intervals, (*kept, *rounding(facts)), library)
 
 
 def _remove_effects_only(found: ModelSearchResult) -> Point:
-    """The point of an answer with nothing but its names taken out of the readings."""
+    """The point of an answer with only its effects removed from the readings."""
     all_sets, best = found.all_sets, found.answer.best
     values = coefficients_by_key(all_sets.made, best.keys, best.at)
     effects = {key: all_sets.component(key) for key in found.answer.keys if key != LAG}
@@ -76,11 +77,11 @@ def noise_level_facts(
     *,
     spec_given: bool,
 ) -> list[Fact]:
-    """What is to be said of the noise's level.
+    """Facts about the noise level.
 
-    Beside a real remainder it comes and goes, and so it does with a source of one direction; coarse
-    numbers scatter by themselves, and where turns were lost or something passed what that leaves is
-    no noise.
+    None are reported with the ordinary remainder or with a source along one direction, because both
+    come and go; nor with coarse numbers, which scatter by themselves.  A burst is not noise where
+    turns were lost or an object was passed.
     """
     real = found.all_sets.is_real(found.answer.best.names)
     if real or found.source is not None or rounding(facts):

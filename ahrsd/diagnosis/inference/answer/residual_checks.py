@@ -1,13 +1,14 @@
-"""What of the residual is still unlike the model: whiteness, by time, attitude, rate and column.
+"""Tests of what the residual still shows: whiteness, and by time, attitude, rate and column.
 
-In the noise that the answer leaves, its residual is V^-1 y, y of variance V = 1 + X Phi X^T.
-Copies are drawn of that law with the residual's own tails and fitted as the recording was; each
-statistic, chosen before anything is looked at, has the band of its copies (`predictive_checks`).  A
-bin of a regime (heading, tilt, rate, a column) is asked for a field of its own, Z: its score
-Z^T V^-1 y has the variance Z^T V^-1 Z, so half of the square has three halves of a nat where
-nothing is left.
+In the noise of the answer its residual is V^-1 y, where y has the variance V = 1 + X Phi X^T.
+Copies are drawn from that law with the tails of the residual, and are fitted as the recording was.
+Each statistic, chosen in advance, is compared with the band of its copies (`predictive_checks`).
+For each bin of a regime (heading, tilt, rate, a column), a field of its own with columns Z is
+tested: its score Z^T V^-1 y has the variance Z^T V^-1 Z, so half of the normalised square has a
+mean of three halves of a nat if nothing is left.
 
-Before is the calibration alone in the same noise: what was left out would else pass for noise.
+"Before" is the calibration alone in the same noise.  In its own noise, what it lacks would count as
+noise.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from ahrsd.samples import Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """The rows of an answer, and what is left of them (3 N,) by the calibration and by all."""
+    """The rows of an answer, and their residuals (3 N,) for the calibration alone and for all."""
 
     rows: WhiteRows
     calibration: Fit
@@ -51,12 +52,12 @@ class Residuals:
 
     @property
     def whitened(self) -> Array:
-        """(rows of the track, 3) what is left by all of it, nothing where there is no reading."""
+        """(rows of the track, 3) residual for the whole answer, 0 where there is no reading."""
         return self.rows.on_track(self.after.reshape(-1, 3))
 
 
 def fit_residuals(rows: WhiteRows) -> Residuals:
-    """What is left of an answer's rows."""
+    """The residuals of an answer's rows."""
     y = rows.y.reshape(-1, 1)
     calibration, whole = rows.fit(rows.made.seen[CALIBRATION].component.width), rows.fit()
     return Residuals(
@@ -65,7 +66,7 @@ def fit_residuals(rows: WhiteRows) -> Residuals:
 
 
 def checks(found: Residuals, maps: Sequence[RegimeMap]) -> dict[str, Check]:
-    """Each statistic of the residual beside its copies, and each regime's bin that stands out most.
+    """Each statistic of the residual with the band of its copies, and each regime's largest bin.
 
     Deterministic.
     """
@@ -79,10 +80,10 @@ def checks(found: Residuals, maps: Sequence[RegimeMap]) -> dict[str, Check]:
 
 
 def merge_recorded_rate_checks(slow: Mapping[str, Check], found: Residuals) -> dict[str, Check]:
-    """Checks of the working rate, and of the recorded one where that has them.
+    """Checks at the working rate, replaced by those at the recorded rate where there are such.
 
-    found: rows of the recorded rate, with all that the search found taken out: where the
-    calibration alone was beside its band already, it is.
+    found: rows at the recorded rate, with all that the search found removed.  "Before" is inside of
+           its band only if it is so at both rates.
     """
     fast = _check_statistics(found)
     return {
@@ -94,7 +95,7 @@ def merge_recorded_rate_checks(slow: Mapping[str, Check], found: Residuals) -> d
 
 
 def _check_statistics(found: Residuals) -> dict[str, Check]:
-    """Each statistic of the residual beside its copies."""
+    """Each statistic of the residual with the band of its copies."""
     before, value, expected = _statistics_and_bands(found)
     return {
         name: Check(value[name], band, _inside(before[name], band), _inside(value[name], band))
@@ -105,7 +106,7 @@ def _check_statistics(found: Residuals) -> dict[str, Check]:
 def _statistics_and_bands(
     found: Residuals,
 ) -> tuple[dict[str, float], dict[str, float], dict[str, tuple[float, float]]]:
-    """Statistics before and after, and the bands of copies."""
+    """Statistics before and after, and the bands of the copies."""
     rows = found.rows
     scene, shape = build_scene(rows.made.context), (-1, 3)
 
@@ -124,7 +125,7 @@ def _statistics_and_bands(
 
 
 def _draw_noise(rng: np.random.Generator, found: Residuals, shape: tuple[int, int]) -> Array:
-    """White noise of unit variance, its tails those of what is left."""
+    """White noise of unit variance with the tails of the residual."""
     filtered = found.rows.made.point.filtered
     freedom = tail_freedom(replace(filtered, whitened=found.whitened))
     e = rng.standard_normal(shape)
@@ -138,7 +139,7 @@ def _inside(value: float, band: tuple[float, float]) -> bool:
 
 
 def regime_maps(found: Residuals) -> tuple[RegimeMap, ...]:
-    """How much is left under which conditions, the strongest first."""
+    """Evidence of a field of its own in each bin of each regime, the strongest regime first."""
     tested = regimes(found.rows.made.context)
     if not tested:
         return ()
@@ -156,7 +157,7 @@ def regime_maps(found: Residuals) -> tuple[RegimeMap, ...]:
 
 
 def _bin_nats(Z: Array, fit: Fit, residual: Array) -> list[float]:
-    """What each three columns in turn gain."""
+    """Half of the score statistic, nats, of each three columns in turn."""
     score, information = Z.T @ residual, fit.information(Z)
     out = []
     for at in range(0, len(score), 3):
@@ -166,7 +167,7 @@ def _bin_nats(Z: Array, fit: Fit, residual: Array) -> list[float]:
 
 
 def whiteness(start: NullFit, found: Residuals) -> dict[str, Whiteness]:
-    """Tests that need no idea of what may be wrong, of the null and of what the answer leaves."""
+    """Tests without an alternative hypothesis, of the null model and of the answer's residual."""
     context = found.rows.made.context
     filtered = replace(found.rows.made.point.filtered, whitened=found.whitened)
     p_after = {test.name: test.p_value for test in omnibus_tests(filtered, context)}
@@ -176,20 +177,20 @@ def whiteness(start: NullFit, found: Residuals) -> dict[str, Whiteness]:
     }
 
 
-#: relative: columns that are alike but for rounding would else leave no root
+#: relative increase of the diagonal: columns equal to rounding would otherwise have no root
 _ROUNDING = 1e-10
-#: columns that pass the filter together
+#: number of columns that are filtered together
 _BATCH = 96
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WhiteRows:
-    """Rows of the readings that are there, and of a set's columns, in the set's noise.
+    """Rows of the used readings and of a set's columns, whitened by the set's noise.
 
     y (N, 3);  X (N, 3, q);  phi (q,): log variances of the coefficients
-    log_power: of the noise that was taken out, mean over the rows
-    rows:      of the track, numbers (N,) of those that are here
-    made, log_noise: of which and by which they were made
+    log_power: log power of the noise by which they were whitened, mean over the rows
+    rows: (N,) numbers of these rows in the track
+    made, log_noise: the linearisation and the noise from which they were made
     """
 
     y: Array
@@ -201,11 +202,11 @@ class WhiteRows:
     log_noise: Array
 
     def to_time_rows(self, rows: Array) -> Array:
-        """Other rows by frequency (3 M, p) as (N, 3, p) here."""
+        """Other rows by frequency (3 M, p) as (N, 3, p) at these rows."""
         return _rows_in_time(self.made, rows, self.log_noise)[self.rows]
 
     def filter_columns(self, columns: Sequence[Columns]) -> Array:
-        """(N, 3, p) columns of any kind as the filter and this noise leave them."""
+        """(N, 3, p) columns of any kind, passed through the filter and whitened by this noise."""
         made, found = self.made, []
         for batch in batch_columns(columns, _BATCH):
             cube = sensitivities(made.regressing, join_columns([columns[k] for k in batch]))
@@ -221,13 +222,13 @@ class WhiteRows:
         return np.concatenate([cut[k] for k in range(len(columns))], axis=2)
 
     def on_track(self, values: Array) -> Array:
-        """(rows of the track, ...) with nothing where there is no reading."""
+        """(rows of the track, ...) values, 0 where there is no reading."""
         out = np.zeros((len(self.made.point.loud.amplitude), *values.shape[1:]))
         out[self.rows] = values
         return out
 
     def fit(self, width: int | None = None) -> Fit:
-        """The likeliest coefficients of the first `width` columns, or of all."""
+        """The fit of the first `width` columns, or of all."""
         X = self.X.reshape(-1, self.X.shape[2])[:, :width]
         deviation = np.exp(0.5 * self.phi[:width])
         return Fit(X, deviation, upper_root(X.T @ X, deviation))
@@ -242,13 +243,13 @@ class Fit:
     root: Array
 
     def residual(self, values: Array) -> Array:
-        """(3 N, k) of values (3 N, k), the columns at their likeliest taken out."""
+        """(3 N, k) residual of values (3 N, k) at the maximum-posterior coefficients."""
         D = self.deviation[:, None]
         w = D * linalg.cho_solve((self.root, False), D * (self.X.T @ values))
         return np.asarray(values - self.X @ w)
 
     def information(self, Z: Array) -> Array:
-        """(p, p) Z^T V^-1 Z of other columns (3 N, p), V with all that the fit's columns may be."""
+        """(p, p) Z^T V^-1 Z of other columns (3 N, p), the fit's coefficients integrated out."""
         projected = linalg.solve_triangular(
             self.root, self.deviation[:, None] * (self.X.T @ Z), trans="T", check_finite=False
         )
@@ -264,7 +265,7 @@ def upper_root(G: Array, deviation: Array) -> Array:
 
 
 def white_rows(all_sets: Hypotheses, hypothesis: Hypothesis) -> WhiteRows:
-    """A set's rows in its own noise."""
+    """The rows of a set in its own noise."""
     made = all_sets.made
     rows = np.concatenate([*(made.rows(key) for key in hypothesis.keys), made.y[:, None]], axis=1)
     cube = _rows_in_time(made, rows, hypothesis.at.log_noise)
@@ -279,7 +280,7 @@ def white_rows(all_sets: Hypotheses, hypothesis: Hypothesis) -> WhiteRows:
 
 
 def _rows_in_time(made: Linearised, rows: Array, log_noise: Array) -> Array:
-    """(N, 3, p) of rows by frequency (3 M, p), the noise's powers taken out."""
+    """(N, 3, p) of rows by frequency (3 M, p), divided by the noise's deviations."""
     scale = np.exp(-0.5 * np.repeat(log_noise, 3 * np.diff(made.edges)))
     cube = (rows * scale[:, None]).reshape(-1, 3, rows.shape[1])
     return np.asarray(idct(cube, axis=0, norm="ortho")[: len(made.point.loud.amplitude)])

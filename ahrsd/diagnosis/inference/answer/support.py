@@ -1,4 +1,4 @@
-"""What an answer is held against: other readings, the same columns at other times, other priors."""
+"""Checks of an answer: held-out readings, copies of the columns shifted in time, other priors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from ahrsd.diagnosis.inference.likelihood.evidence import evaluate
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.diagnosis.inference.search_rounds import ModelSearchResult
 
-#: where what is unknown may be more sources than are asked together
+#: note for an unknown part that may be more sources than are tested together
 TOO_MANY = (
     f"models of more than {priors.WIDEST} coefficients were not asked: what is unknown may be "
     "several sources, of which a shorter part of the recording tells more"
@@ -39,7 +39,7 @@ TOO_MANY = (
 
 
 def validate_findings(answer: Answer, held: HeldOut, first: int) -> tuple[Finding, ...]:
-    """An answer's findings with their held-out gains and what they owe to priors.
+    """An answer's findings with their held-out gains and their sensitivity to the priors.
 
     first: number of the first one's term among all terms
     """
@@ -60,7 +60,7 @@ def validate_findings(answer: Answer, held: HeldOut, first: int) -> tuple[Findin
 
 
 def validate_unexplained(answer: Answer, held: HeldOut) -> Unexplained:
-    """What no name explains, with the same."""
+    """What no effect explains, with the same."""
     unexplained, keys = answer.unexplained, answer.unknown
     if not keys:
         return unexplained
@@ -80,7 +80,7 @@ def unexplained_part(
     held: tuple[HeldOut, HeldOut],
     contributions: Sequence[Contribution],
 ) -> Unexplained:
-    """What no name explains: in time, along one direction, or at the recorded rate."""
+    """What no effect explains: in time, along one direction, or at the recorded rate."""
     unexplained = validate_unexplained(found.answer, held[0])
     if not unexplained.detected:
         added = [one.added for one in contributions if one.unit == "gauss"]
@@ -92,7 +92,7 @@ def validation(
     slow: tuple[Answer, HeldOut], fast: tuple[Answer, HeldOut], findings: Sequence[Finding],
     unexplained: Unexplained,
 ) -> Validation:  # fmt: skip
-    """What all names together gain on readings that they were not fitted to."""
+    """The gain of all effects together on readings that they were not fitted to."""
     gain = sum(held.gain(held.without(answer.keys)) for answer, held in (slow, fast) if answer.keys)
     copies = [one.heldout.placebo_gain for one in findings if one.heldout is not None]
     free = 0.0 if unexplained.heldout is None else unexplained.heldout.nll_gain_per_sample
@@ -100,7 +100,7 @@ def validation(
 
 
 def doubts(findings: Sequence[Finding]) -> tuple[str, ...]:
-    """A sentence on each name that foretells other readings no better than copies of it."""
+    """A note on each finding that predicts no better than its copies, or depends on a prior."""
     out = []
     for one in findings:
         held = one.heldout
@@ -185,7 +185,7 @@ def _odds_changes(
 def score_changes(
     all_sets: Hypotheses, hypothesis: Hypothesis, factor: float
 ) -> Mapping[str, float]:
-    """By what a set's score changes where each prior is so many times what it is, nats."""
+    """Changes of a set's score, nats, if each prior in turn is multiplied by a factor."""
     log, at = float(np.log(factor)), hypothesis.at
     members = [
         all_sets.component(key) for key in sorted(hypothesis.names) if key not in all_sets.remainder
@@ -209,7 +209,7 @@ def score_changes(
 def _size_prior_change(
     all_sets: Hypotheses, hypothesis: Hypothesis, factor: float, step: float
 ) -> float:
-    """The change where all ordinary sizes are so many times what they are."""
+    """The change if all ordinary sizes are multiplied by the factor."""
     ordinary = {*all_sets.remainder, LAG, LAG_FORM}
     if not ordinary & set(hypothesis.keys):
         return 0.0
@@ -227,7 +227,7 @@ def _size_prior_change(
 
 
 def _scale_law(law: Law, factor: float) -> Law:
-    """A law whose sizes are so many times as large."""
+    """A law with its sizes multiplied by a factor."""
     if isinstance(law, FixedLaw):
         return FixedLaw(law.variance * factor**2)
     if isinstance(law, ScaledLaw | GaussianProcessLaw) and law.spread > 0.0:
@@ -243,7 +243,7 @@ def notes(
     *,
     differs: bool,
 ) -> tuple[str, ...]:
-    """How the recording was read and what was left out of it, then what was said of the answer."""
+    """How the recording was read and what was left out of it, then the notes on the answer."""
     problem = found.all_sets.made.point.problem
     faults = () if differs else detectable_faults(problem.recorded)
     reading_notes = (

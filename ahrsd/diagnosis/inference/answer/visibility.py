@@ -1,7 +1,7 @@
-"""What a recording says of each effect of the library alone, beside what is known.
+"""What a recording says about each single effect of the library, given a set.
 
-Each in its likeliest setting: how much likelier the recording is with it, its sizes averaged, and
-the smallest coefficients that would have shown in this noise.
+Each effect is taken in its most probable setting: its log Bayes factor, averaged over sizes, and
+the smallest coefficients that would have been detected in this noise.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ahrsd.samples import Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EffectEvidence:
-    """One effect: nats of it, information (p, p) of its coefficients beside all that is known."""
+    """One effect: its log Bayes factor, and information (p, p) on its coefficients."""
 
     row: Effect
     nats: float
@@ -30,7 +30,7 @@ class EffectEvidence:
 
 
 def effect_evidence(all_sets: Hypotheses, space: Space, names: Names) -> list[EffectEvidence]:
-    """Every effect that could be asked, each in its likeliest setting, beside a set."""
+    """Every effect that can be tested, each in its most probable setting, given a set."""
     base = all_sets.judge(names)
     scan = candidate_scan(all_sets.made, base.keys, base.at)
     candidates = {
@@ -59,7 +59,7 @@ def effect_evidence(all_sets: Hypotheses, space: Space, names: Names) -> list[Ef
 
 
 def limits(found: Sequence[EffectEvidence]) -> tuple[Limit, ...]:
-    """The smallest value of every parameter that would have shown; None where it cannot."""
+    """The smallest detectable value of every parameter; None if the motion does not show it."""
     out = []
     for one in found:
         scale = np.array([parameter.scale for parameter in one.row.parameters])
@@ -71,7 +71,7 @@ def limits(found: Sequence[EffectEvidence]) -> tuple[Limit, ...]:
 
 
 def _smallest_detectable(one: EffectEvidence, scale: Array) -> tuple[Array, NDArray[np.bool]]:
-    """(p,) what would have shown, and which are mostly in directions that the motion hides."""
+    """(p,) smallest detectable values, and which lie mostly in directions that the motion hides."""
     G = one.information * scale * scale[:, None]
     values, vectors = np.linalg.eigh((G + G.T) / 2)
     shown = values > one.row.least_information

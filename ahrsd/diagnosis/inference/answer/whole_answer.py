@@ -1,7 +1,7 @@
-"""An answer with all that is said beside its names, in the contract's form.
+"""A complete diagnosis: the findings and everything that is reported besides.
 
-held-out gains and moved copies, priors halved and doubled, checks of the residual, sizes of what is
-left, the smallest effects that would have shown, the repaired model with its noise, pictures
+held-out gains and those of shifted copies, priors halved and doubled, residual checks, sizes of the
+remainder, smallest detectable effects, the repaired model with its noise, data of the plots
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from ahrsd.diagnosis.inference.recorded_rate import RecordedRateResult
 from ahrsd.diagnosis.inference.search_rounds import ModelSearchResult
 from ahrsd.diagnosis.model import Term
 
-#: what has a setting
+#: what has a setting by logged columns
 Reported = TypeVar("Reported", Finding, Term)
 
 
@@ -51,11 +51,11 @@ def build_diagnosis(
     spec_given: bool,
     simulated: bool,
 ) -> Diagnosis:
-    """Everything that was found.
+    """The complete diagnosis.
 
-    start: the calibration alone;  spec_given: whether somebody said how loud the sensor is
-    still: what a gyro that stands tells of its bias
-    simulated: known to be no real recording
+    start: the calibration alone;  simulated: the recording is known to be simulated
+    spec_given: whether the noise level of the sensor was specified
+    rest_findings: causes of a bias drift that the readings of a gyro at rest show
     """
     answer, all_sets = found.answer, found.all_sets
     held, fast_held = HeldOut(all_sets, answer.best), HeldOut(fast.all_sets, fast.answer.best)
@@ -103,7 +103,7 @@ def build_diagnosis(
 
 
 def _as_recorded(reported: Sequence[Reported], found: ModelSearchResult) -> tuple[Reported, ...]:
-    """What was told by columns as they are read, with settings by the columns as they came."""
+    """Findings or terms with settings by the columns as logged, not as they were corrected."""
     problem = found.all_sets.made.point.problem
     return tuple(replace(one, setting=recorded_setting(one.setting, problem)) for one in reported)
 
@@ -114,7 +114,7 @@ def _check_both_rates(
     fast_answer: Answer,
     held: HeldOut,
 ) -> dict[str, Check]:
-    """Of the residual, where only the recorded rate shows it at that: what was found and left."""
+    """Residual checks; if quick effects were found, those of the recorded rate are made there."""
     slow_checks = residual_checks.checks(residuals, maps)
     if not fast_answer.keys:
         return slow_checks
