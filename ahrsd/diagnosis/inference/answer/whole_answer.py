@@ -54,8 +54,7 @@ def build_diagnosis(
     """The complete diagnosis.
 
     start: the calibration alone;  simulated: the recording is known to be simulated
-    spec_given: whether the noise level of the sensor was specified
-    rest_findings: causes of a bias drift that the readings of a gyro at rest show
+    rest_findings: bias drift of a gyro at rest;  spec_given: whether the noise level was specified
     """
     answer, all_sets = found.answer, found.all_sets
     held, fast_held = HeldOut(all_sets, answer.best), HeldOut(fast.all_sets, fast.answer.best)
