@@ -1,9 +1,10 @@
-"""Turns that a recording lost: where its gyro's samples do not tell them, and which it left out.
+"""Turns that are missing in a recording: by undersampling, or because samples were lost.
 
-A step's turn is told by one vector as long as the rate hardly changes within it.  In a crash, a
-fall or a blow a slow logger sees turns of a radian a step: what happened between is not known.  A
-field that jumps looks like lost turns now and then, and hides those that are; so they are looked
-for once more beside what was found, and where the two answers differ, the likelier one is believed.
+One gyro sample describes the turn of a step only if the rate hardly changes within the step.  In a
+crash, a fall or a blow a slow logger has turns of a radian in a step, and the motion between is
+unknown.  A field that jumps sometimes resembles lost turns, and hides real ones.  So lost turns are
+sought once more with the accepted effects in the model.  If the two results differ, the more
+probable one is kept.
 """
 
 from __future__ import annotations
@@ -17,50 +18,56 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.data_quality.dropped_samples import correction_cost, find_lost_turns
 from ahrsd.diagnosis.data_quality.facts import Fact
 from ahrsd.diagnosis.inference.likelihood.linearisation import Point, step_to_maximum
-from ahrsd.diagnosis.inference.recorded_rate import Quick, at_recorded_rate
-from ahrsd.diagnosis.inference.search_rounds import Searched
+from ahrsd.diagnosis.inference.recorded_rate import RecordedRateResult, point_at_recorded_rate
+from ahrsd.diagnosis.inference.search_rounds import ModelSearchResult
 from ahrsd.diagnosis.track import Track
 
 
-def lost_beside(came: Track, found: Searched, fast: Quick, lost: Sequence[Fact]) -> list[Fact]:
-    """Lost turns of a recording as it came, beside what was found.
+def find_lost_turns_given(
+    recorded: Track, found: ModelSearchResult, fast: RecordedRateResult, lost: Sequence[Fact]
+) -> list[Fact]:
+    """Lost turns of a recording, given the accepted effects.
 
-    lost: those that had been put right before that was found
+    recorded: the recording before any correction
+    lost: the lost turns that were corrected before the search; a member that jumps where one of
+          them ended may be its remainder, and is left out of the model here
     """
     if not lost:
-        return _turns(fast.left)
+        return _find_in_point(fast.point)
     all_sets, best = found.all_sets, found.answer.best
     begin_s = [end for fact in lost if fact.turned is not None for _, end in fact.where.intervals_s]
-    answers = {
+    jumps_at_gaps = {
         key for key in best.names
         if (one := all_sets.component(key)).jumps
         and any(abs(one.moments_s[0] - at) < priors.TRANSITION_S for at in begin_s)
     }  # fmt: skip
-    rest = all_sets.judge(best.names - answers, best)
-    point = step_to_maximum(all_sets.made, rest.keys, rest.at)
-    return _turns(at_recorded_rate(replace(point, problem=replace(point.problem, recorded=came))))
+    reduced = all_sets.judge(best.names - jumps_at_gaps, best)
+    point = step_to_maximum(all_sets.made, reduced.keys, reduced.at)
+    return _find_in_point(
+        point_at_recorded_rate(replace(point, problem=replace(point.problem, recorded=recorded)))
+    )
 
 
-def nats(found: Searched, lost: Sequence[Fact]) -> float:
-    """How likely the readings are where these turns were put right, as nats that compare."""
+def corrected_log_evidence(found: ModelSearchResult, lost: Sequence[Fact]) -> float:
+    """Log evidence of the readings with these turns corrected; corrections compare by it."""
     return found.answer.best.score + found.all_sets.made.log_whitening - correction_cost(lost)
 
 
-def broken_where_unsampled(track: Track) -> Track:
-    """The track with a run's end ahead of each step that turns too far to be told."""
+def split_at_large_turns(track: Track) -> Track:
+    """The track with a new run at each step that turns by more than a gyro sample can describe."""
     step_s = np.nan_to_num(track.dt_s, nan=0.0)
     turn = np.linalg.norm(track.gyro_b_rad_s, axis=1) * step_s
-    unknown = np.flatnonzero(turn > priors.SAMPLED_TURN_RAD)
-    if not len(unknown):
+    too_large = np.flatnonzero(turn > priors.SAMPLED_TURN_RAD)
+    if not len(too_large):
         return track
-    starts = np.union1d([run.start for run in track.runs] or [0], unknown)
+    starts = np.union1d([run.start for run in track.runs] or [0], too_large)
     dt_s = track.dt_s.copy()
-    dt_s[unknown] = np.nan
+    dt_s[too_large] = np.nan
     ends = [*starts[1:], len(track)]
     runs = tuple(slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True))
     return replace(track, dt_s=dt_s, runs=runs)
 
 
-def _turns(fast: Point) -> list[Fact]:
-    done = fast.filtered
-    return find_lost_turns(done, done.track.gyro_b_rad_s - done.model.gyro_bias_rad_s)
+def _find_in_point(point: Point) -> list[Fact]:
+    filtered = point.filtered
+    return find_lost_turns(filtered, filtered.track.gyro_b_rad_s - filtered.model.gyro_bias_rad_s)

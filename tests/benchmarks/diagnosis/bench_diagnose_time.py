@@ -51,8 +51,8 @@ PHASES = {
         engine,
     ),
     "fit_richest_model": richest_model,
-    **dict.fromkeys(("answered", "quick"), both_rates),
-    **dict.fromkeys(("lost_beside", "whole_answer", "diagnose_beyond_chance"), engine),
+    **dict.fromkeys(("search_until_stable", "search_recorded_rate"), both_rates),
+    **dict.fromkeys(("find_lost_turns_given", "build_diagnosis", "diagnose_beyond_chance"), engine),
 }
 
 

@@ -32,7 +32,7 @@ from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.components.effect_components import LAG
 from ahrsd.diagnosis.inference.decision.members import size_of
-from ahrsd.diagnosis.inference.diagnose import begun, diagnose
+from ahrsd.diagnosis.inference.diagnose import build_and_fit_null, diagnose
 from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.likelihood.evidence import evaluate
@@ -65,7 +65,7 @@ def untouched(words: list[str]) -> Iterator[tuple[str, Path]]:
 def measured(path: Path) -> dict[str, Any]:
     """What a recording leaves: `profiles` of the remainder, `effects` that nobody put there."""
     track = prepare(load_track(path)[0]).corrected_track()
-    problem, fit = begun(track, Spec())
+    problem, fit = build_and_fit_null(track, Spec())
     found = richest_model.fit_richest_model(problem, fit.filtered, EFFECTS)
     return {"profiles": profiles(found), "effects": sizes(found)}
 

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.inference.diagnose import begun
+from ahrsd.diagnosis.inference.diagnose import build_and_fit_null
 from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.track import Spec
 
@@ -24,7 +24,7 @@ def held(values, rows):
 
 def notes_at_the_richest_model(track):
     """What is said of the columns before anything is searched."""
-    problem, fit = begun(track, Spec())
+    problem, fit = build_and_fit_null(track, Spec())
     return richest_model.fit_richest_model(
         problem, fit.filtered, EFFECTS
     ).base.made.point.problem.notes

@@ -9,7 +9,7 @@ import pytest
 from tracks import coloured, experiment, track_of
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.inference.diagnose import begun, diagnose
+from ahrsd.diagnosis.inference.diagnose import build_and_fit_null, diagnose
 from ahrsd.diagnosis.inference.likelihood.directed_noise import DirectedNoise, fit_directed_noise
 from ahrsd.diagnosis.inference.likelihood.linearisation import initial_point, linearise
 from ahrsd.diagnosis.track import Spec
@@ -72,7 +72,7 @@ def test_what_a_loud_gyro_leaves_across_the_field_is_no_source():
 
 def test_whitened_rows_are_alike_on_all_axes_and_their_density_is_counted():
     track = track_of(experiment("wam", seed=14, samples=2000, sigma_mag=5e-4))
-    problem, start = begun(track, Spec())
+    problem, start = build_and_fit_null(track, Spec())
     point = initial_point(problem, start.filtered, ())
     source = DirectedNoise(
         np.array([1.1, 1.0, 1 / 1.1]),

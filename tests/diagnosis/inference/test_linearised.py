@@ -25,7 +25,7 @@ from ahrsd.diagnosis.inference.components.ordinary_remainder import (
     ordinary_remainder,
     still_intervals,
 )
-from ahrsd.diagnosis.inference.diagnose import broken_where_unsampled
+from ahrsd.diagnosis.inference.diagnose import split_at_large_turns
 from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.likelihood.evidence import evaluate
@@ -170,10 +170,10 @@ def test_a_run_ends_where_a_step_turns_too_far_to_be_told():
     track = track_of(experiment("wam", seed=8, samples=400))
     gyro = track.gyro_b_rad_s.copy()
     gyro[250] = [0.0, 20.0, 5.0]
-    broken = broken_where_unsampled(replace(track, gyro_b_rad_s=gyro))
+    broken = split_at_large_turns(replace(track, gyro_b_rad_s=gyro))
     assert [(run.start, run.stop) for run in broken.runs] == [(0, 250), (250, 400)]
     assert np.isnan(broken.dt_s[250])
-    assert broken_where_unsampled(track) is track
+    assert split_at_large_turns(track) is track
 
 
 def test_a_span_in_which_something_was_moved_is_unread_and_the_gyro_carries_the_field_across():

@@ -26,24 +26,24 @@ from ahrsd.diagnosis.answer.diagnosis import (
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import build_problem
 from ahrsd.diagnosis.effects.library import EFFECTS
-from ahrsd.diagnosis.inference.answer.held_out import HeldOut, dealt
-from ahrsd.diagnosis.inference.answer.left_sizes import left_sizes
+from ahrsd.diagnosis.inference.answer.held_out import HeldOut, assign_folds
+from ahrsd.diagnosis.inference.answer.left_sizes import remainder_sizes
 from ahrsd.diagnosis.inference.answer.residual_checks import (
     checks,
+    fit_residuals,
     regime_maps,
-    residuals_of,
     whiteness,
 )
 from ahrsd.diagnosis.inference.answer.support import (
     COURSE,
-    NAME,
+    EFFECT,
     NOISE,
     ORDINARY,
     doubts,
-    nearest,
-    on_priors,
+    nearest_effect,
+    prior_sensitivity,
 )
-from ahrsd.diagnosis.inference.answer.visibility import limits, seen_alone
+from ahrsd.diagnosis.inference.answer.visibility import effect_evidence, limits
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Space
@@ -97,7 +97,7 @@ def gains(found: tuple[Hypotheses, Space], name: str) -> tuple[float, float]:
     all_sets, space = found
     key = key_of(space, name)
     held = HeldOut(all_sets, all_sets.judge({key}))
-    told = held.told((key,))
+    told = held.held_out_gain((key,))
     return told.nll_gain_per_sample * held.samples, told.placebo_gain * held.samples
 
 
@@ -107,11 +107,11 @@ def test_what_is_not_reported_is_compared_with_an_unknown_cause_in_its_place(tra
     bare, key = all_sets.judge(()), key_of(space, "motor_current_field")
     answer = Answer(bare, (), (), {}, (), (), Unexplained(False), 0.0)
     named = all_sets.judge({key})
-    (alone,) = nearest(answer, all_sets)
+    (alone,) = nearest_effect(answer, all_sets)
     assert f"motor_current_field: {named.score - bare.score:+.1f} nats over no effect" in alone
     free = all_sets.judge({space.courses[0]})
     assert free.score > bare.score
-    (beside,) = nearest(answer, all_sets)
+    (beside,) = nearest_effect(answer, all_sets)
     assert f"motor_current_field: {named.score - free.score:+.1f} nats over an unknown" in beside
 
 
@@ -148,7 +148,7 @@ def test_a_cause_foretells_readings_and_its_copies_do_not(driven):
     assert copy < 0.1 * gain
     all_sets, space = driven
     key = key_of(space, "motor_current_field")
-    told = HeldOut(all_sets, all_sets.judge({key})).told((key,))
+    told = HeldOut(all_sets, all_sets.judge({key})).held_out_gain((key,))
     # the next reading is off by the sensor's own noise, a row being a mean of so many readings
     noise = 1e-3 / np.sqrt(all_sets.made.point.problem.averaged)
     assert told.rms_after_gauss == pytest.approx(noise, rel=0.15)
@@ -160,8 +160,8 @@ def test_an_effect_that_says_the_wrong_thing_loses(driven):
     all_sets, space = driven
     cause, step = (key_of(space, name) for name in ("motor_current_field", "hard_iron_step"))
     held = HeldOut(all_sets, all_sets.judge({cause, step}))
-    assert held.gain(held.less((step,))) * held.samples < 0.5
-    assert held.gain(held.less((cause,))) * held.samples > 200.0
+    assert held.gain(held.without((step,))) * held.samples < 0.5
+    assert held.gain(held.without((cause,))) * held.samples > 200.0
 
 
 def test_a_part_is_foretold_with_the_density_that_the_dense_gaussian_has():
@@ -169,7 +169,7 @@ def test_a_part_is_foretold_with_the_density_that_the_dense_gaussian_has():
     all_sets, space = sets_of(with_current(short, field=True))
     held = HeldOut(all_sets, all_sets.judge({key_of(space, "motor_current_field")}))
     rows = held.rows(held.best.names)
-    part = np.repeat(dealt(rows), 3)
+    part = np.repeat(assign_folds(rows), 3)
     X, y = rows.X.reshape(len(part), -1), rows.y.ravel()
     V = (X * np.exp(rows.phi)) @ X.T + np.eye(len(y))
 
@@ -180,12 +180,12 @@ def test_a_part_is_foretold_with_the_density_that_the_dense_gaussian_has():
 
     whole = density(np.ones(len(y), dtype=bool))
     expected = sum(whole - density(part != k) for k in range(priors.PARTS))
-    assert held.of(held.best.names).nats == pytest.approx(expected, rel=1e-6)
+    assert held.predict(held.best.names).nats == pytest.approx(expected, rel=1e-6)
 
 
 def test_stretches_are_dealt_in_turn(driven):
     rows = HeldOut(driven[0], driven[0].judge(NOTHING)).rows(NOTHING)
-    track, part = rows.made.point.problem.track, dealt(rows)
+    track, part = rows.made.point.problem.track, assign_folds(rows)
     since_s = track.time_s[rows.rows] - track.time_s[0]
     np.testing.assert_array_equal(part, (since_s // 2.0).astype(int) % 5)
 
@@ -196,7 +196,7 @@ def test_a_course_gains_in_its_own_frame_alone(track):
     added = 4e-3 * level[:, None] * np.array([0.6, -0.7, 0.4])
     all_sets, _ = sets_of(replace(track, mag_b_gauss=track.mag_b_gauss + added))
     held = HeldOut(all_sets, all_sets.judge({"free sensor"}))
-    told = held.told(("free sensor",))
+    told = held.held_out_gain(("free sensor",))
     assert told.nll_gain_per_sample * held.samples > 200.0
     assert told.placebo_gain < 0.8 * told.nll_gain_per_sample
 
@@ -207,19 +207,21 @@ def test_a_course_gains_in_its_own_frame_alone(track):
 def test_odds_move_with_the_probability_of_a_name_by_its_logarithm(driven):
     all_sets, space = driven
     best = all_sets.judge({key_of(space, "motor_current_field")})
-    found = on_priors(all_sets, best, all_sets.judge(NOTHING), asked=3.0)
-    (by_name,) = (one for one in found.assumed if one.what == NAME)
+    found = prior_sensitivity(all_sets, best, all_sets.judge(NOTHING), required=3.0)
+    (by_name,) = (one for one in found.assumed if one.what == EFFECT)
     assert found.log_odds == pytest.approx(best.score - all_sets.judge(NOTHING).score)
     assert by_name.half_nats == pytest.approx(found.log_odds - np.log(2.0))
     assert by_name.double_nats == pytest.approx(found.log_odds + np.log(2.0))
     assert found.stays
-    assert not on_priors(all_sets, best, all_sets.judge(NOTHING), found.log_odds).stays
+    assert not prior_sensitivity(all_sets, best, all_sets.judge(NOTHING), found.log_odds).stays
 
 
 def test_odds_in_another_noise_are_those_of_a_search_that_assumed_it(driven, monkeypatch):
     all_sets, space = driven
     names = frozenset({key_of(space, "motor_current_field")})
-    found = on_priors(all_sets, all_sets.judge(names), all_sets.judge(NOTHING), asked=3.0)
+    found = prior_sensitivity(
+        all_sets, all_sets.judge(names), all_sets.judge(NOTHING), required=3.0
+    )
     (by_noise,) = (one for one in found.assumed if one.what == NOISE)
     monkeypatch.setattr(priors, "NOISE_STEP_CLEAN", 2.0 * priors.NOISE_STEP_CLEAN)
     anew = replace(all_sets, judged={})
@@ -232,7 +234,7 @@ def test_a_rival_course_is_as_likely_as_it_is_assumed_to_be(driven):
     all_sets, space = driven
     best = all_sets.judge({key_of(space, "motor_current_field")})
     rival = all_sets.judge({"free sensor"})
-    by = {one.what: one for one in on_priors(all_sets, best, rival, 3.0).assumed}
+    by = {one.what: one for one in prior_sensitivity(all_sets, best, rival, 3.0).assumed}
     assert by[COURSE].double_nats - by[COURSE].half_nats == pytest.approx(-2 * np.log(2.0))
     assert ORDINARY not in by
 
@@ -243,7 +245,7 @@ def test_a_rival_course_is_as_likely_as_it_is_assumed_to_be(driven):
 def test_a_null_is_like_its_copies_and_no_bin_has_a_field_of_its_own(idle):
     all_sets, _ = idle
     held = HeldOut(all_sets, all_sets.judge(NOTHING))
-    found = residuals_of(held.rows(NOTHING))
+    found = fit_residuals(held.rows(NOTHING))
     maps = regime_maps(found)
     seen = checks(found, maps)
     assert {"autocorrelation", "shift_sensor", "heading", "by_rate_rad_s", "tail"} <= seen.keys()
@@ -260,7 +262,7 @@ def test_what_follows_a_column_fails_before_and_not_after_it_is_named(driven):
     all_sets, space = driven
     names = frozenset({key_of(space, "motor_current_field")})
     held = HeldOut(all_sets, all_sets.judge(names))
-    found = residuals_of(held.rows(names))
+    found = fit_residuals(held.rows(names))
     maps = regime_maps(found)
     one = checks(found, maps)["by_motor_current_a"]
     assert not one.inside_before
@@ -282,7 +284,7 @@ def test_a_source_that_is_in_no_set_fails_by_time_and_by_whiteness(track):
     bare = replace(all_sets.judge(NOTHING), at=replace(
         all_sets.judge(NOTHING).at, log_noise=quiet.at.log_noise))  # fmt: skip
     all_sets.judged[NOTHING] = bare
-    found = residuals_of(HeldOut(all_sets, bare).rows(NOTHING))
+    found = fit_residuals(HeldOut(all_sets, bare).rows(NOTHING))
     seen = checks(found, ())
     assert not seen["shift_sensor"].inside_after
     assert not seen["autocorrelation"].inside_after
@@ -291,7 +293,7 @@ def test_a_source_that_is_in_no_set_fails_by_time_and_by_whiteness(track):
 
 def test_what_would_have_shown_shows_and_a_third_of_it_does_not(idle, track):
     all_sets, space = idle
-    found = seen_alone(all_sets, space, NOTHING)
+    found = effect_evidence(all_sets, space, NOTHING)
     told = {(one.effect, one.parameter): one for one in limits(found)}
     limit = told["motor_current_field", "field_per_ampere_x"]
     assert limit.unit == "gauss/A"
@@ -318,7 +320,7 @@ def test_sizes_of_what_is_left_are_those_that_were_put_in(track):
     world = np.einsum("nji,nj->ni", truth, field)
     all_sets, _ = sets_of(replace(track, mag_b_gauss=track.mag_b_gauss + world))
     best = all_sets.judge(all_sets.remainder)
-    found = left_sizes(all_sets, best, None, ())
+    found = remainder_sizes(all_sets, best, None, ())
     parts = {one.component: one for one in found.components}
     at_s, times = all_sets.made.context.track.time_s, track.time_s
     rows = np.column_stack([np.interp(at_s, times, column) for column in world.T])
@@ -335,7 +337,7 @@ def test_sizes_of_what_is_left_are_those_that_were_put_in(track):
 
 def test_a_name_that_gains_no_more_than_its_copies_or_owes_itself_to_a_prior_is_doubted():
     held = Heldout(1e-3, 9e-4, 0.01, 0.001)
-    sure = OnPriors(20.0, 3.0, True, (Assumed(NAME, 19.3, 20.7),))
+    sure = OnPriors(20.0, 3.0, True, (Assumed(EFFECT, 19.3, 20.7),))
     told = Finding(
         effect="hysteresis", confidence=1.0, alternatives=(), where=Where((), (), "sensor"),
         parameters=(), heldout=held, cost_if_left_out=None, separate_from=None, priors=sure,
@@ -343,7 +345,7 @@ def test_a_name_that_gains_no_more_than_its_copies_or_owes_itself_to_a_prior_is_
     assert doubts((told,)) == ()
     (copied,) = doubts((replace(told, heldout=replace(held, placebo_gain=0.02)),))
     assert copied.startswith("hysteresis: it predicts readings that it was not fitted to no better")
-    owed = OnPriors(3.4, 3.0, False, (Assumed(NAME, 2.7, 4.1), Assumed(NOISE, 5.0, 1.2)))
+    owed = OnPriors(3.4, 3.0, False, (Assumed(EFFECT, 2.7, 4.1), Assumed(NOISE, 5.0, 1.2)))
     (note,) = doubts((replace(told, priors=owed),))
     assert note == (
         "hysteresis depends on a prior: with the noise steps between octaves doubled its evidence "

@@ -1,1 +1,1 @@
-"""What an answer is held against, and all that is told beside its names."""
+"""Checks of an answer, and everything that is reported besides its findings."""

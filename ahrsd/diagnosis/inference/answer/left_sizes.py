@@ -1,9 +1,9 @@
-"""The size of what a recording leaves, part by part, beside what such recordings ordinarily leave.
+"""Sizes of the ordinary remainder, part by part, next to what real recordings ordinarily leave.
 
-A part of the ordinary remainder adds to the readings what its likeliest coefficients make of its
-columns; the deviation of that over the recording, less what another calibration would take of it,
-is its size.  What 95 % of untouched recordings stay below is told in the same motion: as many times
-its size as the limit of its coefficients is theirs.
+The contribution of a part is its columns times their maximum-posterior coefficients.  Its size is
+the standard deviation of this contribution over the recording, less what another calibration would
+explain of it.  The limit that 95 % of untouched recordings stay below is given for the same motion:
+the size times the ratio of the limit of the coefficients to the coefficients.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ from ahrsd.diagnosis.inference.decision.members import (
 )
 from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
-from ahrsd.diagnosis.inference.search_rounds import Searched
+from ahrsd.diagnosis.inference.search_rounds import ModelSearchResult
 from ahrsd.diagnosis.where_and_when import locate
 from ahrsd.samples import Array
 
-_WORDS = {
+_PART_WORDS = {
     "world_course": "an outside field that varies with time and place",
     "gyro_course": "a gyro bias that varies with time",
     "by_direction": "a field that depends on attitude",
@@ -64,67 +64,75 @@ _WORDS = {
     BY_HEADING: "a field that depends on heading",
     QUICK: "a quickly varying field on the sensor",
 }
-#: what varies with time, by its frame
-_COURSES = {
+#: free processes in time, by frame
+_PROCESS_WORDS = {
     "sensor": "a field on the sensor that varies with time",
     "world": "an outside field that varies with time",
     "gyro": "a gyro error that varies with time",
 }
-#: of 95 % of a normal size
-_WITHIN = 1.96
+#: deviations that bound 95 % of a normal distribution
+_DEVIATIONS_95 = 1.96
 
 
-def told_sizes(
-    all_sets: Hypotheses, answer: Answer, left: Unexplained, nats: float, *, simulated: bool
+def with_remainder_sizes(
+    all_sets: Hypotheses, answer: Answer, unexplained: Unexplained, nats: float, *, simulated: bool
 ) -> Unexplained:
-    """What is left, with its sizes where the recording leaves what real ones do.
+    """The unexplained part, with the sizes of the remainder if the set contains one.
 
-    nats: by which it is likelier that it does;  simulated: then none of it is ordinary
+    nats: evidence of the remainder
+    simulated: the recording is known to be simulated; then no remainder is ordinary
     """
     best = answer.best
     if not all_sets.is_real(best.names):
-        return left
-    if left.detected:
-        known = dict.fromkeys(_words(all_sets, best, key) for key in answer.unknown)
-        what = ", ".join(known) or "a source of one direction, too quick to be followed in time"
-        why = f"beyond what such recordings ordinarily leave: {what}"
-        sizes = left_sizes(all_sets, best, why, answer.unknown)
-        return replace(left, ordinary=sizes)
+        return unexplained
+    if unexplained.detected:
+        parts = dict.fromkeys(_describe_part(all_sets, best, key) for key in answer.unknown)
+        described = (
+            ", ".join(parts) or "a source of one direction, too quick to be followed in time"
+        )
+        why = f"beyond what such recordings ordinarily leave: {described}"
+        sizes = remainder_sizes(all_sets, best, why, answer.unknown)
+        return replace(unexplained, ordinary=sizes)
     if simulated and nats > priors.UNKNOWN_ODDS:
-        sizes = left_sizes(all_sets, best, SIMULATED, ())
-        return replace(left, detected=True, ordinary=sizes, evidence_nats=nats)
-    return replace(left, ordinary=left_sizes(all_sets, best, None, ()), evidence_nats=nats)
+        sizes = remainder_sizes(all_sets, best, SIMULATED, ())
+        return replace(unexplained, detected=True, ordinary=sizes, evidence_nats=nats)
+    return replace(
+        unexplained, ordinary=remainder_sizes(all_sets, best, None, ()), evidence_nats=nats
+    )
 
 
-def left_sizes(
+def remainder_sizes(
     all_sets: Hypotheses, best: Hypothesis, why: str | None, keys: Sequence[str]
 ) -> Ordinary:
-    """Everything that is left beside the names.
+    """Sizes of everything besides the findings.
 
-    why: it is not ordinary, None where it is;  keys: of a course that is left besides
-    A name that is not told, being no larger than what such recordings have of its kind, is left.
+    why: reason why the remainder is not ordinary, None if it is
+    keys: unknown members of the set, which are listed as well
+    Effects that are no larger than is ordinary for their kind are no findings and are listed here.
     """
-    untold = [
+    ordinary_effects = [
         key
         for key in library_members(all_sets, best)
         if key not in keys and is_ordinary(all_sets, best, key)
     ]
     context = all_sets.made.context
-    take, nats = calibration_basis(context), _nats(all_sets, best)
-    whole = {unit: np.zeros((len(context.track), 3)) for unit in ("gauss", "rad/s")}
+    basis, nats = calibration_basis(context), _member_nats(all_sets, best)
+    totals = {unit: np.zeros((len(context.track), 3)) for unit in ("gauss", "rad/s")}
     parts = []
-    besides = [key for key in keys if key not in all_sets.remainder]
-    for key in (*all_sets.remainder, *besides, *untold):
+    unknown = [key for key in keys if key not in all_sets.remainder]
+    for key in (*all_sets.remainder, *unknown, *ordinary_effects):
         added, unit = contribution_of(all_sets, best, key)
-        added = project_out_calibration(added, take) if unit == "gauss" else added
-        whole[unit] += added
+        added = project_out_calibration(added, basis) if unit == "gauss" else added
+        totals[unit] += added
         size, frame = rms_about_mean(added), all_sets.component(key).frame
         heading_deg = heading_deviation_deg(added, context) if unit == "gauss" else None
-        up_to = size * _to_limit(all_sets, best, key)
+        up_to = size * _limit_ratio(all_sets, best, key)
         there = nats[key] > priors.ODDS_REAL
-        row = Component(
+        part = Component(
             key,
-            _untold(all_sets, key) if key in untold else _words(all_sets, best, key),
+            _describe_ordinary_effect(all_sets, key)
+            if key in ordinary_effects
+            else _describe_part(all_sets, best, key),
             frame,
             size,
             up_to,
@@ -133,67 +141,67 @@ def left_sizes(
             nats[key],
             there,
         )
-        parts.append(row)
+        parts.append(part)
     fields = [one for one in parts if one.unit == "gauss"]
     headings = [(one.heading_deg or 0.0) * one.up_to / max(one.size, 1e-300) for one in fields]
     return Ordinary(
         within=why is None,
         why=why,
-        field_gauss=rms_about_mean(whole["gauss"]),
-        field_up_to_gauss=_together([one.up_to for one in fields]),
-        heading_deg=heading_deviation_deg(whole["gauss"], context),
-        heading_up_to_deg=_together(headings),
-        gyro_rad_s=rms_about_mean(whole["rad/s"]),
-        gyro_up_to_rad_s=_together([one.up_to for one in parts if one.unit != "gauss"]),
+        field_gauss=rms_about_mean(totals["gauss"]),
+        field_up_to_gauss=_combined_limit([one.up_to for one in fields]),
+        heading_deg=heading_deviation_deg(totals["gauss"], context),
+        heading_up_to_deg=_combined_limit(headings),
+        gyro_rad_s=rms_about_mean(totals["rad/s"]),
+        gyro_up_to_rad_s=_combined_limit([one.up_to for one in parts if one.unit != "gauss"]),
         recordings=priors.RECORDINGS,
         components=tuple(parts),
     )
 
 
-def _words(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
-    """What a part is, in words."""
+def _describe_part(all_sets: Hypotheses, best: Hypothesis, key: str) -> str:
+    """A part in words."""
     one, effect = all_sets.component(key), key.split(maxsplit=1)[0]
     factors = {factor for name in library_members(all_sets, best) for factor in factor_keys(name)}
     if key in factors or not best.names.isdisjoint(factor_keys(key)):
         return f"a cause that {effect} resembles"
     if one.row is not None:
         return f"a step of a source that switches ({effect})"
-    words = _WORDS.get(key) or _WORDS.get(key.removeprefix("free "))
-    return words or _COURSES[one.frame]
+    words = _PART_WORDS.get(key) or _PART_WORDS.get(key.removeprefix("free "))
+    return words or _PROCESS_WORDS[one.frame]
 
 
-def _untold(all_sets: Hypotheses, key: str) -> str:
-    """What a name is that is not told, being ordinary, with its moments."""
+def _describe_ordinary_effect(all_sets: Hypotheses, key: str) -> str:
+    """An effect of ordinary size, which is no finding, in words with its times."""
     one = all_sets.component(key)
     when = " and ".join(f"{time_s:.0f} s" for time_s in one.moments_s)
     words = "" if one.row is None else one.row.words
     return f"{f'at {when} ' if when else ''}{words} ({one.effect})"
 
 
-def _together(limits: Sequence[float]) -> float:
-    """What parts that know nothing of each other are ordinarily at most together."""
+def _combined_limit(limits: Sequence[float]) -> float:
+    """The ordinary limit of independent parts together."""
     return float(np.linalg.norm(limits))
 
 
-def _to_limit(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
-    """How many times as large a part is ordinarily at most; 0 of what is not ordinary."""
+def _limit_ratio(all_sets: Hypotheses, best: Hypothesis, key: str) -> float:
+    """Ordinary limit of a part over its size; 0 if the part is not an ordinary one."""
     law, row = all_sets.component(key).law, all_sets.component(key).row
     if row is not None and isinstance(law, ScaledLaw):
         value, deviation = coefficients(all_sets, best, key)
-        limit = row.ordinary * law.scale + 2.0 * deviation  # beyond, it is told (`size_of`)
+        limit = row.ordinary * law.scale + 2.0 * deviation  # beyond, it is a finding (`size_of`)
         return 1.0 / max(float(np.max(np.abs(value) / limit)), 1e-12)
     if isinstance(law, FixedLaw):
         value, _ = coefficients(all_sets, best, key)
-        return _WITHIN / max(float(np.sqrt(np.mean(value**2 / law.variance))), 1e-12)
+        return _DEVIATIONS_95 / max(float(np.sqrt(np.mean(value**2 / law.variance))), 1e-12)
     if key not in priors.ORDINARY:
         return 0.0
     return priors.ORDINARY[key].up_to() / max(size_of(all_sets, best, key), 1e-12)
 
 
-def _nats(all_sets: Hypotheses, best: Hypothesis) -> dict[str, float]:
-    """By how much likelier the recording is with each member, sizes and noise as they are.
+def _member_nats(all_sets: Hypotheses, best: Hypothesis) -> dict[str, float]:
+    """Log Bayes factor of each member, with sizes and noise as they are.
 
-    Of a Gaussian: the prior's density where the coefficients are nothing, to the posterior's.
+    For a Gaussian this is the Savage-Dickey ratio at zero coefficients: prior density to posterior.
     """
     scan = candidate_scan(all_sets.made, best.keys, best.at)
     inverse = np.linalg.inv(scan.root)
@@ -204,30 +212,31 @@ def _nats(all_sets: Hypotheses, best: Hypothesis) -> dict[str, float]:
         mine = slice(begin, begin + one.width)
         begin = mine.stop
         mean, phi = best.at.mean[mine], one.law.log_variance(psi[key])
-        out[key] = _to_nothing(mean, covariance[mine, mine], phi)
+        out[key] = _savage_dickey_nats(mean, covariance[mine, mine], phi)
     return out
 
 
-def _to_nothing(mean: Array, covariance: Array, log_variance: Array) -> float:
+def _savage_dickey_nats(mean: Array, covariance: Array, log_variance: Array) -> float:
+    """Log of the prior density at zero coefficients over the posterior density there."""
     scale = np.exp(-0.5 * log_variance)
-    shrunk = covariance * scale * scale[:, None]
-    _, log_det = np.linalg.slogdet(shrunk)
+    relative = covariance * scale * scale[:, None]
+    _, log_det = np.linalg.slogdet(relative)
     z = mean * scale
-    return 0.5 * float(z @ np.linalg.solve(shrunk, z) + log_det)
+    return 0.5 * float(z @ np.linalg.solve(relative, z) + log_det)
 
 
-def with_channels(
-    left: Unexplained, found: Searched, courses: Sequence[locate.Located]
+def with_correlated_channels(
+    unexplained: Unexplained, found: ModelSearchResult, processes: Sequence[locate.Located]
 ) -> Unexplained:
-    """What is left, with the logged columns that move with it."""
-    if left.where is None or not left.course:
-        return left
-    frame, track = left.where.frame, found.all_sets.made.context.track
-    like = [one for course in courses if course.frame == frame
-            for one in locate.matching_channels(track, course)]  # fmt: skip
+    """The unexplained part, with the logged columns that correlate with it."""
+    if unexplained.where is None or not unexplained.course:
+        return unexplained
+    frame, track = unexplained.where.frame, found.all_sets.made.context.track
+    matches = [one for process in processes if process.frame == frame
+            for one in locate.matching_channels(track, process)]  # fmt: skip
     follows = tuple(
         Suspect(one.channel, one.correlation, one.p_value)
-        for one in like
+        for one in matches
         if one.p_value < priors.CHANCE and abs(one.correlation) > priors.ALIKE
     )
-    return replace(left, follows=follows)
+    return replace(unexplained, follows=follows)

@@ -1,4 +1,4 @@
-"""What a report draws of an answer: innovations, what each name adds, what was not named."""
+"""The data that a report plots: innovations, contributions of the terms, unexplained processes."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Contribution, Drawn
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit
-from ahrsd.diagnosis.inference.answer.visibility import Seen
+from ahrsd.diagnosis.inference.answer.visibility import EffectEvidence
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.decision.members import coefficients, contribution_of
 from ahrsd.diagnosis.inference.likelihood.linearisation import step_to_maximum
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
-from ahrsd.diagnosis.inference.search_rounds import Searched
+from ahrsd.diagnosis.inference.search_rounds import ModelSearchResult
 from ahrsd.diagnosis.where_and_when.locate import (
     FRAMES,
     Frame,
@@ -24,18 +24,18 @@ from ahrsd.diagnosis.where_and_when.locate import (
 from ahrsd.samples import Array
 
 
-def drawn(
+def plot_data(
     start: NullFit,
-    found: Searched,
+    found: ModelSearchResult,
     residual: Array,
     contributions: Sequence[Contribution],
-    courses: tuple[Located, ...],
-    alone: Sequence[Seen],
+    processes: tuple[Located, ...],
+    single_effects: Sequence[EffectEvidence],
 ) -> Drawn:
-    """The pictures' numbers.
+    """The data of the plots.
 
-    start: the calibration alone;  found: of which all is taken out after
-    residual: (N, 3) what that leaves, white where the model is right
+    start: the calibration alone;  found: the answer, all of which is removed for `after`
+    residual: (N, 3) what remains then, white if the model is right
     """
     best = found.answer.best
     after = step_to_maximum(found.all_sets.made, best.keys, best.at).filtered
@@ -46,13 +46,13 @@ def drawn(
         start.filtered.innovation,
         after.innovation,
         tuple(contributions),
-        courses,
-        {one.row.identifier: one.nats for one in alone},
+        processes,
+        {one.row.identifier: one.nats for one in single_effects},
     )
 
 
 def contributions(all_sets: Hypotheses, answer: Answer) -> list[Contribution]:
-    """What each term of an answer adds to the readings, in the terms' order."""
+    """What each term of an answer adds to the readings, in the order of the terms."""
     time_s = all_sets.made.context.track.time_s
     return [
         Contribution(term.identifier, time_s, *contribution_of(all_sets, answer.best, key))
@@ -60,22 +60,22 @@ def contributions(all_sets: Hypotheses, answer: Answer) -> list[Contribution]:
     ]
 
 
-def courses(all_sets: Hypotheses, best: Hypothesis) -> tuple[Located, ...]:
-    """The free course of each frame beside an answer, stretch by stretch."""
-    known = all_sets.made.seen
-    return tuple(_course(all_sets, best, f) for f in FRAMES if f"free {f}" in known)
+def locate_processes(all_sets: Hypotheses, best: Hypothesis) -> tuple[Located, ...]:
+    """The free process of each frame given the answer, in segments of the recording."""
+    fitted = all_sets.made.seen
+    return tuple(_locate_process(all_sets, best, f) for f in FRAMES if f"free {f}" in fitted)
 
 
-def _course(all_sets: Hypotheses, best: Hypothesis, frame: Frame) -> Located:
+def _locate_process(all_sets: Hypotheses, best: Hypothesis, frame: Frame) -> Located:
     key, track = f"free {frame}", all_sets.made.context.track
-    there = key in best.names
-    with_it = best if there else all_sets.judge(best.names | {key}, best)
-    without = all_sets.judge(best.names - {key}, best) if there else best
-    value, unsure = (part.reshape(-1, 3) for part in coefficients(all_sets, with_it, key))
+    included = key in best.names
+    with_it = best if included else all_sets.judge(best.names | {key}, best)
+    without = all_sets.judge(best.names - {key}, best) if included else best
+    value, deviations = (part.reshape(-1, 3) for part in coefficients(all_sets, with_it, key))
     cut = coarse_segments(track)
     phase = np.pi * (cut.middle_s - track.time_s[0]) / track.duration_s
     waves = np.cos(phase[:, None] * np.arange(1, len(value) + 1))
-    course, deviation = waves @ value, np.sqrt(np.mean(waves**2 @ unsure**2, axis=1))
+    course, deviation = waves @ value, np.sqrt(np.mean(waves**2 @ deviations**2, axis=1))
     direction, _ = single_source_direction(course, deviation)
     nats = max(with_it.at.nats - without.at.nats, 0.0)
     return Located(

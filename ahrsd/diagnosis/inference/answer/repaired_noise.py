@@ -1,7 +1,8 @@
-"""The noise of the repaired model: what a recording scatters by beside its names alone.
+"""The noise of the repaired model: the scatter that remains given the findings alone.
 
-The repaired model is calibration, names and noise.  What real recordings ordinarily leave is in no
-name, so it is noise to it, and the law is found with nothing but names taken out.
+The repaired model consists of calibration, effects and noise.  What real recordings ordinarily
+leave belongs to no effect and is noise in this model.  So the noise law is fitted with only the
+effects removed.
 """
 
 from __future__ import annotations
@@ -31,58 +32,64 @@ from ahrsd.diagnosis.inference.likelihood.linearisation import (
     step_to_maximum,
     total_contribution,
 )
-from ahrsd.diagnosis.inference.recorded_rate import Quick, at_recorded_rate
-from ahrsd.diagnosis.inference.search_rounds import Searched
+from ahrsd.diagnosis.inference.recorded_rate import RecordedRateResult, point_at_recorded_rate
+from ahrsd.diagnosis.inference.search_rounds import ModelSearchResult
 from ahrsd.diagnosis.innovation_filter.noise import level_facts
 from ahrsd.diagnosis.model import Noise
 
 
 def repaired_noise(
-    found: Searched,
-    fast: Quick,
+    found: ModelSearchResult,
+    fast: RecordedRateResult,
     library: Mapping[str, Effect],
     facts: Sequence[Fact],
-    loud: Sequence[tuple[float, float]],
+    level_intervals: Sequence[tuple[float, float]],
 ) -> Noise:
-    """The noise law of the recording's own rate.  loud: spans of another level, s."""
-    point, answer = fast.left, found.answer
+    """The noise law at the recorded rate.  level_intervals: intervals of another noise level, s."""
+    point, answer = fast.point, found.answer
     if found.all_sets.is_real(answer.best.names):
-        point = at_recorded_rate(_with_names_alone(found))
-    done = point.filtered
-    fit = NullFit(done.model, done, True, np.zeros((11, 11)), point.terms_mag, point.terms_gyro)
-    # a delay is out of the track, and what only the recorded rate shows out of the recording
+        point = point_at_recorded_rate(_remove_effects_only(found))
+    filtered = point.filtered
+    fit = NullFit(
+        filtered.model, filtered, True, np.zeros((11, 11)), point.terms_mag, point.terms_gyro
+    )
+    # a delay has been removed from the track, and quick effects from the recording
     kept = [term for term in answer.terms if not library[term.identifier].delay]
-    return constant_level_noise(fit, loud, (*kept, *rounding(facts)), library)
+    return constant_level_noise(fit, level_intervals, (*kept, *rounding(facts)), library)
 
 
-def _with_names_alone(found: Searched) -> Point:
-    """The point of an answer with nothing but its names taken out of the readings."""
+def _remove_effects_only(found: ModelSearchResult) -> Point:
+    """The point of an answer with only its effects removed from the readings."""
     all_sets, best = found.all_sets, found.answer.best
     values = coefficients_by_key(all_sets.made, best.keys, best.at)
-    names = {key: all_sets.component(key) for key in found.answer.keys if key != LAG}
+    effects = {key: all_sets.component(key) for key in found.answer.keys if key != LAG}
     count = len(all_sets.made.context.track)
-    mag, gyro = total_contribution(count, names, {key: values[key] for key in names})
+    mag, gyro = total_contribution(count, effects, {key: values[key] for key in effects})
     point = step_to_maximum(all_sets.made, best.keys, best.at)
     return replace(point, terms_mag=mag, terms_gyro=gyro)
 
 
-def loud_facts(
-    found: Searched, fast: Quick, facts: Sequence[Fact], told: Sequence[Finding], *,
+def noise_level_facts(
+    found: ModelSearchResult,
+    fast: RecordedRateResult,
+    facts: Sequence[Fact],
+    findings: Sequence[Finding],
+    *,
     spec_given: bool,
-) -> list[Fact]:  # fmt: skip
-    """What is to be said of the noise's level.
+) -> list[Fact]:
+    """Facts about the noise level.
 
-    Beside a real remainder it comes and goes, and so it does with a source of one direction; coarse
-    numbers scatter by themselves, and where turns were lost or something passed what that leaves is
-    no noise.
+    None are reported with the ordinary remainder or with a source along one direction, because both
+    come and go; nor with coarse numbers, which scatter by themselves.  A burst is not noise where
+    turns were lost or an object was passed.
     """
     real = found.all_sets.is_real(found.answer.best.names)
     if real or found.source is not None or rounding(facts):
         return []
-    short = [
-        span for one in told if one.where.frame == "world" for span in one.where.intervals_s
+    passing = [
+        span for one in findings if one.where.frame == "world" for span in one.where.intervals_s
         if span[1] - span[0] < priors.PASSING_S
     ]  # fmt: skip
-    moments = [*lost_turn_intervals(facts), *short]
-    levels = level_facts(fast.left.filtered, spec_given=spec_given)
+    moments = [*lost_turn_intervals(facts), *passing]
+    levels = level_facts(fast.point.filtered, spec_given=spec_given)
     return [fact for fact in levels if not burst_is_explained(fact, moments)]

@@ -1,13 +1,14 @@
-"""What of the residual is still unlike the model: whiteness, by time, attitude, rate and column.
+"""Tests of what the residual still shows: whiteness, and by time, attitude, rate and column.
 
-In the noise that the answer leaves, its residual is V^-1 y, y of variance V = 1 + X Phi X^T.
-Copies are drawn of that law with the residual's own tails and fitted as the recording was; each
-statistic, chosen before anything is looked at, has the band of its copies (`predictive_checks`).  A
-bin of a regime (heading, tilt, rate, a column) is asked for a field of its own, Z: its score
-Z^T V^-1 y has the variance Z^T V^-1 Z, so half of the square has three halves of a nat where
-nothing is left.
+In the noise of the answer its residual is V^-1 y, where y has the variance V = 1 + X Phi X^T.
+Copies are drawn from that law with the tails of the residual, and are fitted as the recording was.
+Each statistic, chosen in advance, is compared with the band of its copies (`predictive_checks`).
+For each bin of a regime (heading, tilt, rate, a column), a field of its own with columns Z is
+tested: its score Z^T V^-1 y has the variance Z^T V^-1 Z, so half of the normalised square has a
+mean of three halves of a nat if nothing is left.
 
-Before is the calibration alone in the same noise: what was left out would else pass for noise.
+"Before" is the calibration alone in the same noise.  In its own noise, what it lacks would count as
+noise.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from ahrsd.samples import Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """The rows of an answer, and what is left of them (3 N,) by the calibration and by all."""
+    """The rows of an answer, and their residuals (3 N,) for the calibration alone and for all."""
 
     rows: WhiteRows
     calibration: Fit
@@ -51,38 +52,40 @@ class Residuals:
 
     @property
     def whitened(self) -> Array:
-        """(rows of the track, 3) what is left by all of it, nothing where there is no reading."""
-        return self.rows.in_track(self.after.reshape(-1, 3))
+        """(rows of the track, 3) residual for the whole answer, 0 where there is no reading."""
+        return self.rows.on_track(self.after.reshape(-1, 3))
 
 
-def residuals_of(rows: WhiteRows) -> Residuals:
-    """What is left of an answer's rows."""
+def fit_residuals(rows: WhiteRows) -> Residuals:
+    """The residuals of an answer's rows."""
     y = rows.y.reshape(-1, 1)
-    few, whole = rows.fit(rows.made.seen[CALIBRATION].component.width), rows.fit()
-    return Residuals(rows, few, whole, few.left(y)[:, 0], whole.left(y)[:, 0])
+    calibration, whole = rows.fit(rows.made.seen[CALIBRATION].component.width), rows.fit()
+    return Residuals(
+        rows, calibration, whole, calibration.residual(y)[:, 0], whole.residual(y)[:, 0]
+    )
 
 
 def checks(found: Residuals, maps: Sequence[RegimeMap]) -> dict[str, Check]:
-    """Each statistic of the residual beside its copies, and each regime's bin that stands out most.
+    """Each statistic of the residual with the band of its copies, and each regime's largest bin.
 
     Deterministic.
     """
-    out = _stated(found)
+    out = _check_statistics(found)
     for one in maps:
-        each = priors.BINS_OUTSIDE / (len(maps) * len(one.after))
-        limit = float(special.chdtri(3.0, each)) / 2.0
+        probability = priors.BINS_OUTSIDE / (len(maps) * len(one.after))
+        limit = float(special.chdtri(3.0, probability)) / 2.0
         was, now = max(one.before), max(one.after)
         out[f"by_{one.quantity}"] = Check(now, (0.0, limit), was <= limit, now <= limit)
     return out
 
 
-def at_recorded_rate(slow: Mapping[str, Check], found: Residuals) -> dict[str, Check]:
-    """Checks of the working rate, and of the recorded one where that has them.
+def merge_recorded_rate_checks(slow: Mapping[str, Check], found: Residuals) -> dict[str, Check]:
+    """Checks at the working rate, replaced by those at the recorded rate where there are such.
 
-    found: rows of the recorded rate, with all that the search found taken out: where the
-    calibration alone was beside its band already, it is.
+    found: rows at the recorded rate, with all that the search found removed.  "Before" is inside of
+           its band only if it is so at both rates.
     """
-    fast = _stated(found)
+    fast = _check_statistics(found)
     return {
         name: replace(fast[name], inside_before=fast[name].inside_before and one.inside_before)
         if name in fast
@@ -91,38 +94,38 @@ def at_recorded_rate(slow: Mapping[str, Check], found: Residuals) -> dict[str, C
     }
 
 
-def _stated(found: Residuals) -> dict[str, Check]:
-    """Each statistic of the residual beside its copies."""
-    before, value, expected = _compared(found)
+def _check_statistics(found: Residuals) -> dict[str, Check]:
+    """Each statistic of the residual with the band of its copies."""
+    before, value, expected = _statistics_and_bands(found)
     return {
         name: Check(value[name], band, _inside(before[name], band), _inside(value[name], band))
         for name, band in expected.items()
     }
 
 
-def _compared(
+def _statistics_and_bands(
     found: Residuals,
 ) -> tuple[dict[str, float], dict[str, float], dict[str, tuple[float, float]]]:
-    """Statistics before and after, and the bands of copies."""
+    """Statistics before and after, and the bands of the copies."""
     rows = found.rows
     scene, shape = build_scene(rows.made.context), (-1, 3)
 
-    def stated(left: Array) -> dict[str, float]:
-        return residual_statistics(rows.in_track(left.reshape(shape)), scene)
+    def statistics(residual: Array) -> dict[str, float]:
+        return residual_statistics(rows.on_track(residual.reshape(shape)), scene)
 
     rng = np.random.default_rng(0)
-    e = _drawn(rng, found, (len(found.after), COPIES))
+    e = _draw_noise(rng, found, (len(found.after), COPIES))
     w = rng.standard_normal((rows.X.shape[2], COPIES)) * found.whole.deviation[:, None]
-    copies = found.whole.left(e + found.whole.X @ w)
+    copies = found.whole.residual(e + found.whole.X @ w)
     return (
-        stated(found.before),
-        stated(found.after),
-        predictive_bands([stated(one) for one in copies.T]),
+        statistics(found.before),
+        statistics(found.after),
+        predictive_bands([statistics(one) for one in copies.T]),
     )
 
 
-def _drawn(rng: np.random.Generator, found: Residuals, shape: tuple[int, int]) -> Array:
-    """White noise of unit variance, its tails those of what is left."""
+def _draw_noise(rng: np.random.Generator, found: Residuals, shape: tuple[int, int]) -> Array:
+    """White noise of unit variance with the tails of the residual."""
     filtered = found.rows.made.point.filtered
     freedom = tail_freedom(replace(filtered, whitened=found.whitened))
     e = rng.standard_normal(shape)
@@ -136,16 +139,16 @@ def _inside(value: float, band: tuple[float, float]) -> bool:
 
 
 def regime_maps(found: Residuals) -> tuple[RegimeMap, ...]:
-    """How much is left under which conditions, the strongest first."""
-    asked = regimes(found.rows.made.context)
-    if not asked:
+    """Evidence of a field of its own in each bin of each regime, the strongest regime first."""
+    tested = regimes(found.rows.made.context)
+    if not tested:
         return ()
-    Z = found.rows.passed([regime_columns(one) for one in asked])
+    Z = found.rows.filter_columns([regime_columns(one) for one in tested])
     Z = Z.reshape(-1, Z.shape[2])
-    before = _nats(Z, found.calibration, found.before)
-    after = _nats(Z, found.whole, found.after)
+    before = _bin_nats(Z, found.calibration, found.before)
+    after = _bin_nats(Z, found.whole, found.after)
     maps, begin = [], 0
-    for one in asked:
+    for one in tested:
         mine = slice(begin, begin + len(one.edges) - 1)
         begin = mine.stop
         edges = tuple(float(edge) for edge in one.edges)
@@ -153,9 +156,9 @@ def regime_maps(found: Residuals) -> tuple[RegimeMap, ...]:
     return tuple(sorted(maps, key=lambda one: -max(one.before)))
 
 
-def _nats(Z: Array, fit: Fit, left: Array) -> list[float]:
-    """What each three columns in turn gain."""
-    score, information = Z.T @ left, fit.information(Z)
+def _bin_nats(Z: Array, fit: Fit, residual: Array) -> list[float]:
+    """Half of the score statistic, nats, of each three columns in turn."""
+    score, information = Z.T @ residual, fit.information(Z)
     out = []
     for at in range(0, len(score), 3):
         s, G = score[at : at + 3], information[at : at + 3, at : at + 3]
@@ -164,30 +167,30 @@ def _nats(Z: Array, fit: Fit, left: Array) -> list[float]:
 
 
 def whiteness(start: NullFit, found: Residuals) -> dict[str, Whiteness]:
-    """Tests that need no idea of what may be wrong, of the null and of what the answer leaves."""
+    """Tests without an alternative hypothesis, of the null model and of the answer's residual."""
     context = found.rows.made.context
-    left = replace(found.rows.made.point.filtered, whitened=found.whitened)
-    later = {test.name: test.p_value for test in omnibus_tests(left, context)}
+    filtered = replace(found.rows.made.point.filtered, whitened=found.whitened)
+    p_after = {test.name: test.p_value for test in omnibus_tests(filtered, context)}
     return {
-        test.name: Whiteness(test.words, test.p_value, later.get(test.name, 1.0))
+        test.name: Whiteness(test.words, test.p_value, p_after.get(test.name, 1.0))
         for test in omnibus_tests(start.filtered, start.context())
     }
 
 
-#: relative: columns that are alike but for rounding would else leave no root
-_ROUNDED = 1e-10
-#: columns that pass the filter together
+#: relative increase of the diagonal: columns equal to rounding would otherwise have no root
+_ROUNDING = 1e-10
+#: number of columns that are filtered together
 _BATCH = 96
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WhiteRows:
-    """Rows of the readings that are there, and of a set's columns, in the set's noise.
+    """Rows of the used readings and of a set's columns, whitened by the set's noise.
 
     y (N, 3);  X (N, 3, q);  phi (q,): log variances of the coefficients
-    log_power: of the noise that was taken out, mean over the rows
-    rows:      of the track, numbers (N,) of those that are here
-    made, log_noise: of which and by which they were made
+    log_power: log power of the noise by which they were whitened, mean over the rows
+    rows: (N,) numbers of these rows in the track
+    made, log_noise: the linearisation and the noise from which they were made
     """
 
     y: Array
@@ -198,35 +201,37 @@ class WhiteRows:
     made: Linearised
     log_noise: Array
 
-    def like(self, rows: Array) -> Array:
-        """Other rows by frequency (3 M, p) as (N, 3, p) here."""
-        return _in_time(self.made, rows, self.log_noise)[self.rows]
+    def to_time_rows(self, rows: Array) -> Array:
+        """Other rows by frequency (3 M, p) as (N, 3, p) at these rows."""
+        return _rows_in_time(self.made, rows, self.log_noise)[self.rows]
 
-    def passed(self, columns: Sequence[Columns]) -> Array:
-        """(N, 3, p) columns of any kind as the filter and this noise leave them."""
+    def filter_columns(self, columns: Sequence[Columns]) -> Array:
+        """(N, 3, p) columns of any kind, passed through the filter and whitened by this noise."""
         made, found = self.made, []
         for batch in batch_columns(columns, _BATCH):
             cube = sensitivities(made.regressing, join_columns([columns[k] for k in batch]))
             cube = made.whiten_axes(cosine_rows(cube / made.point.loud.amplitude[:, None, None]))
-            found.append((batch, self.like(cube)))
+            found.append((batch, self.to_time_rows(cube)))
         cut = {
             number: part
             for batch, cube in found
-            for number, part in zip(batch, _cut(cube, [columns[k] for k in batch]), strict=True)
+            for number, part in zip(
+                batch, _split_by_component(cube, [columns[k] for k in batch]), strict=True
+            )
         }
         return np.concatenate([cut[k] for k in range(len(columns))], axis=2)
 
-    def in_track(self, values: Array) -> Array:
-        """(rows of the track, ...) with nothing where there is no reading."""
+    def on_track(self, values: Array) -> Array:
+        """(rows of the track, ...) values, 0 where there is no reading."""
         out = np.zeros((len(self.made.point.loud.amplitude), *values.shape[1:]))
         out[self.rows] = values
         return out
 
     def fit(self, width: int | None = None) -> Fit:
-        """The likeliest coefficients of the first `width` columns, or of all."""
+        """The fit of the first `width` columns, or of all."""
         X = self.X.reshape(-1, self.X.shape[2])[:, :width]
         deviation = np.exp(0.5 * self.phi[:width])
-        return Fit(X, deviation, root_of(X.T @ X, deviation))
+        return Fit(X, deviation, upper_root(X.T @ X, deviation))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,50 +242,50 @@ class Fit:
     deviation: Array
     root: Array
 
-    def left(self, values: Array) -> Array:
-        """(3 N, k) of values (3 N, k), the columns at their likeliest taken out."""
+    def residual(self, values: Array) -> Array:
+        """(3 N, k) residual of values (3 N, k) at the maximum-posterior coefficients."""
         D = self.deviation[:, None]
         w = D * linalg.cho_solve((self.root, False), D * (self.X.T @ values))
         return np.asarray(values - self.X @ w)
 
     def information(self, Z: Array) -> Array:
-        """(p, p) Z^T V^-1 Z of other columns (3 N, p), V with all that the fit's columns may be."""
-        seen = linalg.solve_triangular(
+        """(p, p) Z^T V^-1 Z of other columns (3 N, p), the fit's coefficients integrated out."""
+        projected = linalg.solve_triangular(
             self.root, self.deviation[:, None] * (self.X.T @ Z), trans="T", check_finite=False
         )
-        return np.asarray(Z.T @ Z - seen.T @ seen)
+        return np.asarray(Z.T @ Z - projected.T @ projected)
 
 
-def root_of(G: Array, deviation: Array) -> Array:
+def upper_root(G: Array, deviation: Array) -> Array:
     """Upper root of I + D G D."""
     A = G * deviation * deviation[:, None]
     diagonal = np.diag_indices_from(A)
-    A[diagonal] = A[diagonal] * (1.0 + _ROUNDED) + 1.0
+    A[diagonal] = A[diagonal] * (1.0 + _ROUNDING) + 1.0
     return np.asarray(linalg.cholesky(A, check_finite=False))
 
 
-def white_rows(all_sets: Hypotheses, known: Hypothesis) -> WhiteRows:
-    """A set's rows in its own noise."""
+def white_rows(all_sets: Hypotheses, hypothesis: Hypothesis) -> WhiteRows:
+    """The rows of a set in its own noise."""
     made = all_sets.made
-    rows = np.concatenate([*(made.rows(key) for key in known.keys), made.y[:, None]], axis=1)
-    cube = _in_time(made, rows, known.at.log_noise)
-    seen = np.flatnonzero(made.point.filtered.used)
-    laws = [all_sets.component(key).law for key in known.keys]
-    psi = all_sets.psi_of(known)
-    phi = [law.log_variance(psi[key]) for key, law in zip(known.keys, laws, strict=True)]
+    rows = np.concatenate([*(made.rows(key) for key in hypothesis.keys), made.y[:, None]], axis=1)
+    cube = _rows_in_time(made, rows, hypothesis.at.log_noise)
+    used = np.flatnonzero(made.point.filtered.used)
+    laws = [all_sets.component(key).law for key in hypothesis.keys]
+    psi = all_sets.psi_of(hypothesis)
+    phi = [law.log_variance(psi[key]) for key, law in zip(hypothesis.keys, laws, strict=True)]
     count = np.diff(made.edges)
-    log_power = float(count @ known.at.log_noise) / float(count.sum())
-    y, X = cube[seen, :, -1], cube[seen, :, :-1]
-    return WhiteRows(y, X, np.concatenate(phi), log_power, seen, made, known.at.log_noise)
+    log_power = float(count @ hypothesis.at.log_noise) / float(count.sum())
+    y, X = cube[used, :, -1], cube[used, :, :-1]
+    return WhiteRows(y, X, np.concatenate(phi), log_power, used, made, hypothesis.at.log_noise)
 
 
-def _in_time(made: Linearised, rows: Array, log_noise: Array) -> Array:
-    """(N, 3, p) of rows by frequency (3 M, p), the noise's powers taken out."""
+def _rows_in_time(made: Linearised, rows: Array, log_noise: Array) -> Array:
+    """(N, 3, p) of rows by frequency (3 M, p), divided by the noise's deviations."""
     scale = np.exp(-0.5 * np.repeat(log_noise, 3 * np.diff(made.edges)))
     cube = (rows * scale[:, None]).reshape(-1, 3, rows.shape[1])
     return np.asarray(idct(cube, axis=0, norm="ortho")[: len(made.point.loud.amplitude)])
 
 
-def _cut(cube: Array, columns: Sequence[Columns]) -> list[Array]:
+def _split_by_component(cube: Array, columns: Sequence[Columns]) -> list[Array]:
     edges = np.cumsum([one.width for one in columns])[:-1]
     return np.split(cube, edges, axis=2)

@@ -1,7 +1,7 @@
-"""What a recording says of each effect of the library alone, beside what is known.
+"""What a recording says about each single effect of the library, given a set.
 
-Each in its likeliest setting: how much likelier the recording is with it, its sizes averaged, and
-the smallest coefficients that would have shown in this noise.
+Each effect is taken in its most probable setting: its log Bayes factor, averaged over sizes, and
+the smallest coefficients that would have been detected in this noise.
 """
 
 from __future__ import annotations
@@ -21,25 +21,29 @@ from ahrsd.samples import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
-    """One effect: nats of it, information (p, p) of its coefficients beside all that is known."""
+class EffectEvidence:
+    """One effect: its log Bayes factor, and information (p, p) on its coefficients."""
 
     row: Effect
     nats: float
     information: Array
 
 
-def seen_alone(all_sets: Hypotheses, space: Space, names: Names) -> list[Seen]:
-    """Every effect that could be asked, each in its likeliest setting, beside a set."""
+def effect_evidence(all_sets: Hypotheses, space: Space, names: Names) -> list[EffectEvidence]:
+    """Every effect that can be tested, each in its most probable setting, given a set."""
     base = all_sets.judge(names)
     scan = candidate_scan(all_sets.made, base.keys, base.at)
-    asked = {
+    candidates = {
         name: [key for key in keys if key not in base.names] for name, keys in space.effects.items()
     }
-    if not any(asked.values()):
+    if not any(candidates.values()):
         return []
-    worth = scan.log_bayes_factors([key for keys in asked.values() for key in keys])
-    best = [max(keys, key=lambda key: worth[key]) for keys in asked.values() if keys]
+    log_bayes_factors = scan.log_bayes_factors(
+        [key for keys in candidates.values() for key in keys]
+    )
+    best = [
+        max(keys, key=lambda key: log_bayes_factors[key]) for keys in candidates.values() if keys
+    ]
     C, own, _ = all_sets.made.candidate_products(base.keys, best, scan.inverse)
     W = scan.project(C)
     out, begin = [], 0
@@ -48,24 +52,26 @@ def seen_alone(all_sets: Hypotheses, space: Space, names: Names) -> list[Seen]:
         begin = mine.stop
         row = all_sets.component(key).row
         if row is not None:
-            out.append(Seen(row, worth[key], square - W[:, mine].T @ W[:, mine]))
+            out.append(
+                EffectEvidence(row, log_bayes_factors[key], square - W[:, mine].T @ W[:, mine])
+            )
     return out
 
 
-def limits(found: Sequence[Seen]) -> tuple[Limit, ...]:
-    """The smallest value of every parameter that would have shown; None where it cannot."""
+def limits(found: Sequence[EffectEvidence]) -> tuple[Limit, ...]:
+    """The smallest detectable value of every parameter; None if the motion does not show it."""
     out = []
     for one in found:
         scale = np.array([parameter.scale for parameter in one.row.parameters])
-        smallest, hidden = _smallest(one, scale)
+        smallest, hidden = _smallest_detectable(one, scale)
         for k, parameter in enumerate(one.row.parameters):
             value = None if hidden[k] else float(smallest[k])
             out.append(Limit(one.row.identifier, parameter.name, value, parameter.unit))
     return tuple(out)
 
 
-def _smallest(one: Seen, scale: Array) -> tuple[Array, NDArray[np.bool]]:
-    """(p,) what would have shown, and which are mostly in directions that the motion hides."""
+def _smallest_detectable(one: EffectEvidence, scale: Array) -> tuple[Array, NDArray[np.bool]]:
+    """(p,) smallest detectable values, and which lie mostly in directions that the motion hides."""
     G = one.information * scale * scale[:, None]
     values, vectors = np.linalg.eigh((G + G.T) / 2)
     shown = values > one.row.least_information

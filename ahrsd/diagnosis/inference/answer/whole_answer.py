@@ -1,7 +1,7 @@
-"""An answer with all that is said beside its names, in the contract's form.
+"""A complete diagnosis: the findings and everything that is reported besides.
 
-held-out gains and moved copies, priors halved and doubled, checks of the residual, sizes of what is
-left, the smallest effects that would have shown, the repaired model with its noise, pictures
+held-out gains and those of shifted copies, priors halved and doubled, residual checks, sizes of the
+remainder, smallest detectable effects, the repaired model with its noise, data of the plots
 """
 
 from __future__ import annotations
@@ -24,99 +24,106 @@ from ahrsd.diagnosis.data_quality.preparation import PreparedRecording
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.answer import pictures, residual_checks, support, visibility
 from ahrsd.diagnosis.inference.answer.held_out import HeldOut
-from ahrsd.diagnosis.inference.answer.left_sizes import told_sizes, with_channels
-from ahrsd.diagnosis.inference.answer.repaired_noise import loud_facts, repaired_noise
+from ahrsd.diagnosis.inference.answer.left_sizes import (
+    with_correlated_channels,
+    with_remainder_sizes,
+)
+from ahrsd.diagnosis.inference.answer.repaired_noise import noise_level_facts, repaired_noise
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.decision.members import nats_of_remainder
 from ahrsd.diagnosis.inference.likelihood.logged_columns import recorded_setting
-from ahrsd.diagnosis.inference.recorded_rate import Quick
-from ahrsd.diagnosis.inference.search_rounds import Searched
+from ahrsd.diagnosis.inference.recorded_rate import RecordedRateResult
+from ahrsd.diagnosis.inference.search_rounds import ModelSearchResult
 from ahrsd.diagnosis.model import Term
 
-#: what has a setting
-Told = TypeVar("Told", Finding, Term)
+#: what has a setting by logged columns
+Reported = TypeVar("Reported", Finding, Term)
 
 
-def whole_answer(
-    asked: PreparedRecording,
+def build_diagnosis(
+    prepared: PreparedRecording,
     start: NullFit,
-    found: Searched,
-    fast: Quick,
+    found: ModelSearchResult,
+    fast: RecordedRateResult,
     library: Mapping[str, Effect],
-    still: tuple[Finding, ...],
+    rest_findings: tuple[Finding, ...],
     *,
     spec_given: bool,
     simulated: bool,
 ) -> Diagnosis:
-    """Everything that was found.
+    """The complete diagnosis.
 
-    start: the calibration alone;  spec_given: whether somebody said how loud the sensor is
-    still: what a gyro that stands tells of its bias
-    simulated: known to be no real recording
+    start: the calibration alone;  simulated: the recording is known to be simulated
+    rest_findings: bias drift of a gyro at rest;  spec_given: whether the noise level was specified
     """
     answer, all_sets = found.answer, found.all_sets
-    held, quickly = HeldOut(all_sets, answer.best), HeldOut(fast.all_sets, fast.answer.best)
-    slow = support.supported(answer, held, 0)
-    told = (*slow, *support.supported(fast.answer, quickly, len(slow)))
-    courses = pictures.courses(all_sets, answer.best)
-    contributions = [
+    held, fast_held = HeldOut(all_sets, answer.best), HeldOut(fast.all_sets, fast.answer.best)
+    slow = support.validate_findings(answer, held, 0)
+    findings = (*slow, *support.validate_findings(fast.answer, fast_held, len(slow)))
+    processes = pictures.locate_processes(all_sets, answer.best)
+    added = [
         *pictures.contributions(all_sets, answer),
         *pictures.contributions(fast.all_sets, fast.answer),
     ]
-    left = support.left_at_both_rates(found, fast.answer, (held, quickly), contributions)
-    left = with_channels(left, found, courses)
+    unknown = support.unexplained_part(found, fast.answer, (held, fast_held), added)
+    unknown = with_correlated_channels(unknown, found, processes)
     remainder_nats = nats_of_remainder(all_sets, answer.best)
-    left = told_sizes(all_sets, answer, left, remainder_nats, simulated=simulated)
-    left = max(left, fast.hum, key=lambda one: (one.detected, one.evidence_nats))
-    loud = loud_facts(found, fast, asked.facts, told, spec_given=spec_given)
-    named = (*asked.findings(library), *told, *(as_finding(fact, library) for fact in loud), *still)
-    something = bool(named) or left.detected
-    residuals = residual_checks.residuals_of(held.rows(answer.best.names))
+    unknown = with_remainder_sizes(all_sets, answer, unknown, remainder_nats, simulated=simulated)
+    unknown = max(unknown, fast.band, key=lambda one: (one.detected, one.evidence_nats))
+    level_facts = noise_level_facts(found, fast, prepared.facts, findings, spec_given=spec_given)
+    counted = [as_finding(fact, library) for fact in level_facts]
+    all_findings = (*prepared.findings(library), *findings, *counted, *rest_findings)
+    differs = bool(all_findings) or unknown.detected
+    residuals = residual_checks.fit_residuals(held.rows(answer.best.names))
     maps = residual_checks.regime_maps(residuals)
-    alone = visibility.seen_alone(all_sets, found.space, held.less(answer.keys))
-    odds = answer.log_odds, fast.answer.log_odds, remainder_nats, left.evidence_nats, 0.0
-    counted = len(named) > len(told)
-    said = support.doubts(told) if something else support.nearest(answer, all_sets)
+    evidence = visibility.effect_evidence(all_sets, found.space, held.without(answer.keys))
+    odds = answer.log_odds, fast.answer.log_odds, remainder_nats, unknown.evidence_nats, 0.0
+    any_counted = len(all_findings) > len(findings)
+    answer_notes = support.doubts(findings) if differs else support.nearest_effect(answer, all_sets)
+    terms = (*_as_recorded((*answer.terms, *fast.answer.terms), found), *rounding(prepared.facts))
     return Diagnosis(
         recording="",
         baseline=baseline_of(start),
-        mismatch=something,
-        p_value=0.0 if counted else float(np.exp(-max(odds))),
-        findings=_as_recorded(named, found),
-        unexplained=left,
-        posterior_predictive=_checked(residuals, maps, fast.answer, quickly),
-        sensitivity=() if something else visibility.limits([*alone, *_seen_quickly(fast)]),
-        notes=support.notes(asked, start, found, said, something=something),
-        model=fast.left.filtered.model,
-        noise=repaired_noise(found, fast, library, asked.facts, _spans(loud)),
-        terms=(*_as_recorded((*answer.terms, *fast.answer.terms), found), *rounding(asked.facts)),
-        drawn=pictures.drawn(start, found, residuals.whitened, contributions, courses, alone),
+        mismatch=differs,
+        p_value=0.0 if any_counted else float(np.exp(-max(odds))),
+        findings=_as_recorded(all_findings, found),
+        unexplained=unknown,
+        posterior_predictive=_check_both_rates(residuals, maps, fast.answer, fast_held),
+        sensitivity=() if differs else visibility.limits([*evidence, *_quick_evidence(fast)]),
+        notes=support.notes(prepared, start, found, answer_notes, differs=differs),
+        model=fast.point.filtered.model,
+        noise=repaired_noise(found, fast, library, prepared.facts, _intervals(level_facts)),
+        terms=terms,
+        drawn=pictures.plot_data(start, found, residuals.whitened, added, processes, evidence),
         omnibus=residual_checks.whiteness(start, residuals),
-        validation=support.validation((answer, held), (fast.answer, quickly), told, left),
+        validation=support.validation((answer, held), (fast.answer, fast_held), findings, unknown),
         regime_map=maps,
     )
 
 
-def _as_recorded(told: Sequence[Told], found: Searched) -> tuple[Told, ...]:
-    """What was told by columns as they are read, with settings by the columns as they came."""
+def _as_recorded(reported: Sequence[Reported], found: ModelSearchResult) -> tuple[Reported, ...]:
+    """Findings or terms with settings by the columns as logged, not as they were corrected."""
     problem = found.all_sets.made.point.problem
-    return tuple(replace(one, setting=recorded_setting(one.setting, problem)) for one in told)
+    return tuple(replace(one, setting=recorded_setting(one.setting, problem)) for one in reported)
 
 
-def _checked(
-    residuals: residual_checks.Residuals, maps: Sequence[RegimeMap], quick: Answer, held: HeldOut
+def _check_both_rates(
+    residuals: residual_checks.Residuals,
+    maps: Sequence[RegimeMap],
+    fast_answer: Answer,
+    held: HeldOut,
 ) -> dict[str, Check]:
-    """Of the residual, where only the recorded rate shows it at that: what was found and left."""
-    checked = residual_checks.checks(residuals, maps)
-    if not quick.keys:
-        return checked
-    fast = residual_checks.residuals_of(held.rows(quick.best.names))
-    return residual_checks.at_recorded_rate(checked, fast)
+    """Residual checks; if quick effects were found, those of the recorded rate are made there."""
+    slow_checks = residual_checks.checks(residuals, maps)
+    if not fast_answer.keys:
+        return slow_checks
+    fast = residual_checks.fit_residuals(held.rows(fast_answer.best.names))
+    return residual_checks.merge_recorded_rate_checks(slow_checks, fast)
 
 
-def _seen_quickly(fast: Quick) -> list[visibility.Seen]:
-    return visibility.seen_alone(fast.all_sets, fast.space, fast.answer.best.names)
+def _quick_evidence(fast: RecordedRateResult) -> list[visibility.EffectEvidence]:
+    return visibility.effect_evidence(fast.all_sets, fast.space, fast.answer.best.names)
 
 
-def _spans(facts: Sequence[Fact]) -> list[tuple[float, float]]:
+def _intervals(facts: Sequence[Fact]) -> list[tuple[float, float]]:
     return [span for fact in facts for span in fact.where.intervals_s]
