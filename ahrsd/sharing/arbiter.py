@@ -80,7 +80,6 @@ class Kind(Enum):
     WRITE = "write"
     CALIBRATE = "write what calibrates"
     COMPARE = "read what is not to be written"
-    REFUSE = "refuse"
 
 
 _WORDS: Final[dict[str, Kind]] = {

@@ -282,8 +282,3 @@ LIVED_WITH: Final = frozenset({S.TRIAL, S.PROVEN, S.SAVE_PREPARING, S.SAVING})
 WITHOUT_TRANSACTION: Final = frozenset(
     {S.OBSERVING, S.CANDIDATE, S.QUALIFIED, S.COMMITTED, S.CONFIRMED, S.ROLLED_BACK}
 )
-
-
-def next_state(state: State, signal: Signal) -> State:
-    """The state that `signal` leads to; `state` itself where it is ignored."""
-    return TABLE[state].get(signal, state)

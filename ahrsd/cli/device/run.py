@@ -16,9 +16,7 @@ _PORT = click.Path(path_type=Path, readable=False)
 
 @click.command()
 @click.option("--config", "path", type=click.Path(path_type=Path), help="Configuration, TOML.")
-@click.option(
-    "--port", type=click.Path(path_type=Path, readable=False), help="Serial port of the device."
-)
+@click.option("--port", type=_PORT, help="Serial port of the device.")
 @click.option(
     "--state-directory",
     "directory",

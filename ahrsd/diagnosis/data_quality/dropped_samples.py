@@ -83,12 +83,15 @@ def find_lost_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
         lost = zeros.copy()
         lost[jumps.forward] = np.round(jumps.steps[jumps.forward])
         setting = {LONG: jumps.long} if jumps.long else {}
-        return [_lost_samples_fact(track, recover_lost_steps(done, rate_b_rad_s, lost), setting)]
-    if expected:
+        turns = recover_lost_steps(done, rate_b_rad_s, lost)
+    elif expected:
+        setting = {UNSEEN: expected}
         turns = recover_lost_steps(done, rate_b_rad_s, zeros, expected)
-        if np.count_nonzero(turns.lost) >= priors.LOST_TURNS_FEWEST:
-            return [_lost_samples_fact(track, turns, {UNSEEN: expected})]
-    return []
+    else:
+        return []
+    if np.count_nonzero(turns.lost) < priors.LOST_TURNS_FEWEST:
+        return []
+    return [_lost_samples_fact(track, turns, setting)]
 
 
 def _significant_jumps(done: Filtered, rate_b_rad_s: Array) -> _Jumps | None:

@@ -11,7 +11,8 @@ import pytest
 
 from ahrsd.writeback.journal_history import JournalHistory, RecordKind
 from ahrsd.writeback.reconcile import TABLE, DeviceContents, compare_contents
-from ahrsd.writeback.states import Mode, Signal, State, next_state
+from ahrsd.writeback.states import TABLE as TRANSITIONS
+from ahrsd.writeback.states import Mode, Signal, State
 from drivers.vn100.commands import Word, Write
 
 HOLDS_OLD = {
@@ -235,7 +236,8 @@ def test_the_table_is_total_and_its_signals_are_taken():
     for row in TABLE.values():
         assert set(row) == set(DeviceContents)
         for resolution in row.values():
-            assert next_state(State.RECONCILING, resolution.signal) is not State.RECONCILING
+            target = TRANSITIONS[State.RECONCILING][resolution.signal]
+            assert target is not State.RECONCILING
             assert resolution.text
             closes = resolution.signal in (Signal.NOTHING_OPEN, Signal.READ_CONFIRMED, Signal.TORN)
             assert closes <= (resolution.record is not None)

@@ -46,7 +46,7 @@ class CandidateScan:
 
     def estimate(self, candidate: Component) -> tuple[Array, Array]:
         """(p,) coefficients of a candidate at its prior's largest size, and their deviations."""
-        self.made.add([candidate])
+        self.made.add_tentatively([candidate])
         cross_products, own_products, s = self.made.candidate_products(
             self.keys, [candidate.key], self.inverse
         )

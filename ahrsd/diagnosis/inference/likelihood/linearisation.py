@@ -40,6 +40,8 @@ from ahrsd.samples import Array
 CALIBRATION = "calibration"
 #: most columns, and most numbers in them, that pass the filter together
 _BATCH_COLUMNS, _BATCH_NUMBERS = 96, 4_000_000
+#: numbers in the rows of tentative components that are kept for the next time they are needed
+_TENTATIVE_NUMBERS = 8_000_000
 #: index of y among the batches
 _Y = -1
 #: rows that are multiplied at once
@@ -96,10 +98,11 @@ class FilteredComponent:
 class Linearised:
     """A point, its context, and products of components, each computed once.
 
-    batches: (3 M, p) rows of components that passed the filter together: divided by the noise
-             level, by frequency, whitened across axes; in single precision, one part in ten million
-             of a column
+    batches: (3 M, p) by index, rows of components that passed the filter together: divided by the
+             noise level, by frequency, whitened across axes; in single precision, one part in ten
+             million of a column
     blocks: products of two batches, band by band
+    tentative: keys of components that are only compared with others and can be added again
     apart: keys of components with a batch of their own: members of some model
     alone: indices of noise bands that are not tied to their neighbours, None for none
     whitening: (B, 3, 3) that equalise the noise of all axes in each band, None if it is equal
@@ -111,8 +114,9 @@ class Linearised:
     edges: NDArray[np.intp]
     y: Array
     seen: dict[str, FilteredComponent] = field(default_factory=dict)
-    batches: list[Array] = field(default_factory=list)
+    batches: dict[int, Array] = field(default_factory=dict)
     blocks: dict[tuple[int, int], Array] = field(default_factory=dict)
+    tentative: set[str] = field(default_factory=set)
     alone: slice | None = None
     whitening: Array | None = None
     apart: set[str] = field(default_factory=set)
@@ -122,6 +126,7 @@ class Linearised:
 
         Components that share their columns pass once.
         """
+        self.tentative.difference_update(one.key for one in components)
         new = [one for one in components if one.key not in self.seen]
         known = {id(one.component.columns): one for one in self.seen.values()}
         for one in new:
@@ -135,17 +140,45 @@ class Linearised:
         for batch in batch_columns(parts, self._batch_width()):
             cube = sensitivities(self.regressing, join_columns([parts[k] for k in batch]))
             rows = cosine_rows(np.divide(cube, amplitude, dtype=np.float32, casting="same_kind"))
-            self.batches.append(self.whiten_axes(rows))
-            start = 0
+            number, start = self._store_batch(self.whiten_axes(rows)), 0
             for k in batch:
                 columns = slice(start, start + distinct[k].width)
-                self.seen[distinct[k].key] = FilteredComponent(
-                    distinct[k], len(self.batches) - 1, columns
-                )
+                self.seen[distinct[k].key] = FilteredComponent(distinct[k], number, columns)
                 start += distinct[k].width
         for one in new:
             twin = self.seen[first[id(one.columns)].key]
             self.seen[one.key] = replace(twin, component=one)
+
+    def add_tentatively(self, components: Sequence[Component]) -> None:
+        """Add components that may be forgotten once `keep` was called without them.
+
+        They stay while there is room: the same ones are compared again and again.
+        """
+        new = [one for one in components if one.key not in self.seen]
+        self.add(new)
+        self.tentative.update(one.key for one in new)
+
+    def keep(self, keys: Sequence[str]) -> None:
+        """Keep these components; forget the other tentative ones if they take too much memory."""
+        self.tentative -= {*keys, *self.apart}
+        kept = {one.batch for key, one in self.seen.items() if key not in self.tentative}
+        numbers = {self.seen[key].batch for key in self.tentative} - kept
+        if sum(self.batches[k].size for k in numbers) <= _TENTATIVE_NUMBERS:
+            return
+        for key in self.tentative:
+            del self.seen[key]
+        self.tentative.clear()
+        for number in numbers:
+            del self.batches[number]
+        self.blocks = {
+            pair: found for pair, found in self.blocks.items() if numbers.isdisjoint(pair)
+        }
+
+    def _store_batch(self, rows: Array) -> int:
+        """The index of rows that are stored."""
+        number = max(self.batches, default=-1) + 1
+        self.batches[number] = rows
+        return number
 
     def whiten_axes(self, rows: Array) -> Array:
         """Rows by frequency (3 M, p) in axes along which the noise is equal."""
@@ -174,8 +207,14 @@ class Linearised:
 
     def copy(self) -> Linearised:
         """A copy to which components can be added without changing this one."""
-        seen, rows, blocks = dict(self.seen), list(self.batches), dict(self.blocks)
-        return replace(self, seen=seen, batches=rows, blocks=blocks, apart=set(self.apart))
+        return replace(
+            self,
+            seen=dict(self.seen),
+            batches=dict(self.batches),
+            blocks=dict(self.blocks),
+            tentative=set(self.tentative),
+            apart=set(self.apart),
+        )
 
     def rows(self, key: str) -> Array:
         """(3 M, q) of a component, by frequency, lowest first."""
@@ -196,9 +235,11 @@ class Linearised:
         """
         for key in sorted(set(keys) - self.apart):
             one = self.seen[key]
-            self.batches.append(self.batches[one.batch][:, one.columns].copy())
-            own = slice(0, one.component.width)
-            self.seen[key] = replace(one, batch=len(self.batches) - 1, columns=own)
+            together = self.batches[one.batch]
+            if one.component.width < together.shape[1]:
+                number = self._store_batch(together[:, one.columns].copy())
+                own = slice(0, one.component.width)
+                self.seen[key] = replace(one, batch=number, columns=own)
         self.apart.update(keys)
 
     def add_back(self, values: Mapping[str, Array]) -> None:

@@ -562,12 +562,13 @@ def refine_candidate(
         )
         if not neighbours:
             continue
-        made.add(neighbours)
+        made.add_tentatively(neighbours)
         found = scan.log_bayes_factors([one.key for one in neighbours])
         log_odds = {one: nats + all_sets.component(one).prior for one, nats in found.items()}
         best = max(log_odds, key=lambda one: log_odds[one])
         if log_odds[best] > worth:
             key, worth = best, log_odds[best]
+    made.keep([key])
     return register_candidate(all_sets, space, key)
 
 
