@@ -83,8 +83,8 @@ LAG_IS_FILTER = 0.5
 #: MOSTLY: if the sensor hardly turns for a larger share of the time, this is how it moves, and
 #: there are no intervals at rest.
 STILL_RAD_S, STILL_PART, MOSTLY = 0.05, 0.2, 0.8
-#: SMOOTHED_S: s over which the rate is averaged for that.
-#: STILL_S: s, shortest interval at rest.
+#: SMOOTHED_S: time over which the rate is averaged for that, s.
+#: STILL_S: length of the shortest interval at rest, s.
 #: MOST_SPELLS: only so many of the longest intervals are kept.
 SMOOTHED_S, STILL_S, MOST_SPELLS = 0.5, 3.0, 4
 
@@ -98,11 +98,11 @@ MOVED, MOVED_LEAST = 10.0, 2.0
 EFFECT = 1.0 / 60.0
 #: Prior odds of a delay between the sensors: recordings ordinarily have one.
 DELAY = 0.5
-#: s.  Steps of one kind nearer than this are one step; and a step this near to either end of the
-#: recording is not proposed.
+#: Time, s, within which two steps of one kind are one step, and within which a step at either end
+#: of the recording is not proposed.
 TRANSITION_S = 2.0
-#: s before and after a step in which the source of the step may be anywhere: a strong magnet is
-#: visible from half a metre on, and a movement by hand takes its time.
+#: Time, s, before and after a step in which the source of the step may be anywhere: a strong magnet
+#: is visible from half a metre on, and a movement by hand takes its time.
 APPROACH_S = 4.0
 #: Prior odds of each further step of a kind that is already in the model: what was put on is also
 #: taken off.  It replaces EFFECT for effects that recur.
@@ -125,10 +125,10 @@ COURSE_CORNERS = (1.0, 40.0)
 #: walk has its corner at one half wave.
 DRIFT_CORNER = 3.0
 #: A source that comes and goes: a two-state Markov chain in time.
-#: SPELL_S: s, mean time for which it is on.
-#: BETWEEN_S: s, mean time for which it is off; also between changes of a level, for a source with a
-#: changing level.
-#: SPELL_PIECE_S: s, piece of time in which the chain has one state; also the shortest half wave.
+#: SPELL_S: mean time for which it is on, s.
+#: BETWEEN_S: mean time for which it is off, s; also the mean time between the changes of a source
+#: with a changing level.
+#: SPELL_PIECE_S: piece of time in which the chain has one state, s; also the shortest half wave.
 #: SPELL_CORNERS: bounds of the corner of its spectrum, in half waves per second.
 SPELL_S, BETWEEN_S, SPELL_PIECE_S, SPELL_CORNERS = 2.0, 20.0, 0.2, (0.1, 10.0)
 #: MOST_ON: share of the time for which such a source is on, beyond which it does not come and go
@@ -138,7 +138,7 @@ SPELL_S, BETWEEN_S, SPELL_PIECE_S, SPELL_CORNERS = 2.0, 20.0, 0.2, (0.1, 10.0)
 MOST_ON, MOST_WAVES = 0.3, 100
 #: Number of directions that noise along one direction may have: its evidence costs log of this.
 DIRECTIONS = 100.0
-#: s.  Times that differ by less are the same time: settings are rounded to 1 ms.
+#: Difference, s, below which two times are the same: settings are rounded to 1 ms.
 SAME_MOMENT_S = 2e-3
 #: Prior probability that a switching source is outside the vehicle (fixed in the world).  Source:
 #: 3 nats, as an earlier rule of the engine had.
@@ -158,8 +158,8 @@ LOGGED_LATE_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
 #: LOGGED_LOST: noise-to-signal power ratio of the Wiener filter that undoes the average: where the
 #: average passes less power than this, the frequency stays suppressed.  Source: chosen.
 LOGGED_MEANS_S, LOGGED_LOST = (0.2, 0.4, 0.8), 0.02
-#: s.  A column's clock is searched only if the column fits best at a lag longer than this: shorter
-#: lags are covered by LOGGED_LATE_S.
+#: Lag, s, beyond which the clock of a column is searched: shorter lags are covered by
+#: LOGGED_LATE_S.
 ON_TIME_S = 1.0
 #: Ordinary time, s, over which a logger averages.  It scales the form of a logged cause.  Source: a
 #: battery monitor filters over a tenth of a second.
@@ -196,7 +196,7 @@ NOISE_RANGE = (-9.0, 9.0)
 #: Degrees of freedom that are tried for the readings given their noise level, next to normal ones.
 #: Source: 3 in a flight.
 FREEDOMS = (3.0, 5.0, 8.0, 15.0)
-#: LEVEL_S: s, width of the moving median that gives the noise level.
+#: LEVEL_S: width of the moving median that gives the noise level, s.
 #: LEVELS: bounds of the noise power, relative to its median.
 LEVEL_S, LEVELS = 4.0, (0.02, 50.0)
 #: Largest number of octaves of the noise's spectrum.
@@ -259,8 +259,8 @@ OWN_PART = 0.5
 #: Largest number of coefficients of a set that is fitted; the time grows with the cube.  Source: to
 #: find the current and the added magnets of a flight took up to 770, counted once.
 WIDEST = 800
-#: Nats.  In the search, a set that is more than ten times this below the best of its class is not
-#: expanded.
+#: Nats.  The search does not expand a set whose score is more than ten times this below the best of
+#: its class (with the remainder or without).
 MOVE = 2.0
 #: A delay is a filter's if its filter share differs from 1 by less than this (or by less than two
 #: standard deviations, if that is more).
@@ -271,8 +271,8 @@ HALF_STEP = 0.1
 
 # --- checks of an answer -------------------------------------------------------------------------
 #: PARTS: number of parts of a recording, each predicted from the others.
-#: STRETCH_S: s, intervals that are dealt to the parts in turn: longer than a whitened reading
-#: remembers, shorter than the passage of an object.
+#: STRETCH_S: length of the intervals that are dealt to the parts in turn, s: longer than a whitened
+#: reading remembers, shorter than the passage of an object.
 PARTS, STRETCH_S = 5, 2.0
 #: Shares of a recording by which copies of a cause are shifted in time.  They are no simple
 #: fractions: what recurs would meet itself.
@@ -282,7 +282,7 @@ SHIFTS = (0.236, 0.382, 0.472, 0.618, 0.764, 0.854)
 SHOWN_AT = 6.5
 #: Probability that any bin of any regime is outside its band if nothing is left.
 BINS_OUTSIDE = 0.01
-#: s, longest time for which an object that is passed is visible: a noise level that rises while it
+#: Longest time for which an object that is passed is visible, s: a noise level that rises while it
 #: is passed is no fact about the noise.
 PASSING_S = 30.0
 #: A logged column is listed as moving with an unknown process if both conditions hold.
@@ -377,14 +377,14 @@ LEVEL_SHARE, LEVEL_LEAST_SHARE = 0.5, 0.1
 # --- a narrow band -------------------------------------------------------------------------------
 #: Power of a band, relative to both sides.  Source: noise of a few coefficients is not so steep.
 BAND_STANDS_OUT = 3.0
-#: Hz, lower limit of such a band: below are processes in time and the rates of the motion itself.
+#: Lower limit of such a band, Hz: below are processes in time and the rates of the motion itself.
 BAND_LOWEST_HZ = 0.75
 #: Share of the band's power along the field, below which the source is an error of the gyro, which
 #: turns the field and does not change its size; for others it is about a third.
 BAND_ALONG = 0.1
 
 # --- a simulation that is compared with the recording ---------------------------------------------
-#: s that both have to have in common.  Source: chosen.
+#: Time that both have to have in common, s.  Source: chosen.
 OVERLAP_S = 20.0
 #: Correlation of the two gyros, above which the motion is the same; another motion is far below.
 SAME_MOTION = 0.8
@@ -403,7 +403,8 @@ IRON_TURNED = 0.1
 #: Number of readings per independent one, from which on the deviations of the prior are divided by
 #: its square root.
 REPEATED = 3.0
-#: rad/s by which the mean of a gyro at rest may differ from its bias, if the field shows the rest.
+#: Prior standard deviation of the gyro bias about the mean of the gyro at rest, rad/s, if the field
+#: shows that it rests.
 STILL_BIAS_RAD_S = 1e-3
 #: Fit of the centre of a sphere.
 #: SPHERE_ROWS: number of independent rows that a recording counts for.
@@ -519,14 +520,14 @@ STEPS_ALIKE, STEPS_ALIKE_SHARE = 0.25, 0.95
 #: If a delay differs from half a step by less than this share of it, it is half a step and the
 #: gyro's alone.
 HALF_STEP_WITHIN = 0.1
-#: s, longest ordinary delay of a magnetometer.  Readings nearer than this to the beginning of a run
+#: Longest ordinary delay of a magnetometer, s.  Readings nearer than this to the beginning of a run
 #: are left out.  Source: see ORDINARY_LAG_S.
 BEGIN_S = 0.1
 #: Share of a run from which on those readings are too many to be left out.  Source: chosen.
 BEGIN_SHARE = 0.1
 
 # --- logged columns ------------------------------------------------------------------------------
-#: s, longest gap in a column that is interpolated.  Source: a column of 1 Hz next to samples of
+#: Longest gap in a column that is interpolated, s.  Source: a column of 1 Hz next to samples of
 #: 25 Hz has such gaps; a failed logger has longer ones.
 COLUMN_GAP_S = 2.0
 #: Share of rows without a value, beyond which a column is left out.  Source: chosen.
@@ -537,7 +538,7 @@ COLUMN_HOLES = 0.5
 #: Rows for which a column of 0 and 1 stays on, beyond which it is a switch; otherwise it is a train
 #: of pulses.
 SWITCH_ROWS = 4
-#: s between new values of a column, at most, for it to be held between them: what changes more
+#: Longest time between new values of a column for it to be held between them, s: what changes more
 #: seldom is a level.
 COLUMN_HELD_S = 5.0
 #: COLUMN_REGULAR: least share of the values of a held column that come one period after the last.
@@ -558,7 +559,7 @@ CLOCK_SHARE, CLOCK_SURE = 0.5, 4.0
 #: Nats required of a column's corrected clock over the column as logged, and of a drift of the
 #: clock over a constant lag.
 CLOCK_NATS = 30.0
-#: s.  A smaller lag of a column, without drift, is no clock error.
+#: Lag of a column, s, below which its clock has no error, unless it drifts.
 CLOCK_SMALLEST_S = 0.1
 
 # --- data quality: confidence of a fact ----------------------------------------------------------
@@ -586,9 +587,9 @@ STAMPED_NATS = 5.0
 STAMPED_OUTLIER = 5.0
 #: Relative rate between two clocks, from which on it is reported.
 CLOCK_RATE = 2e-4
-#: BREAK_BELIEVED_S: s.  A gap that is longer than this and than all recorded time is a jump of the
-#: clock.
-#: BREAK_LEFT_S: s, length of the gap that replaces such a jump.
+#: BREAK_BELIEVED_S: length of a gap, s, up to which it is always believed.  A gap that is longer
+#: than this and than all recorded time is a jump of the clock.
+#: BREAK_LEFT_S: length of the gap that replaces such a jump, s.
 BREAK_BELIEVED_S, BREAK_LEFT_S = 60.0, 10.0
 #: Limits from which on a fact about time stamps is a finding and no note.
 #: MISSING_FINDING_SHARE: share of missing samples.
@@ -747,7 +748,7 @@ HELD_REPEATS = 20
 #: Share of repeated readings while the sensor turns, relative to the whole recording, at least.
 #: Source: coarse numbers change while it turns, and a held reading does not.
 HELD_MOVING_SHARE = 0.7
-#: s between new readings of a magnetometer, below which it has an ordinary rate of its own.
+#: Time between new readings of a magnetometer, s, below which it has an ordinary rate of its own.
 #: Source: 202 readings a second in all recordings of BROAD, rows at 286.
 HELD_ORDINARY_S = 0.01
 #: Variance of the time from one new reading to the next, relative to chance, below which they come
