@@ -176,20 +176,19 @@ REMEMBERED = 1.0 / 20.0
 VARIES, VARIES_MOST = 0.25, 10.0
 
 # --- noise --------------------------------------------------------------------------------------
-#: Prior of the log power spectrum, in nats of power.  The first three are standard deviations of
-#: the change from one octave to the next.
-#: NOISE_STEP_CLEAN: of a sensor's own noise.
-#: NOISE_STEP_REAL: in a model with the ordinary remainder.
-#: NOISE_STEP_FREE: where only a delay is searched.
+#: Prior standard deviations of the logarithm of the noise power.
+#: NOISE_STEP_CLEAN: of its change from octave to octave, for a sensor's own noise.
+#: NOISE_STEP_REAL: the same in a model with the ordinary remainder.
+#: NOISE_STEP_FREE: the same where only a delay and logged causes are in the model.
 #: NOISE_TOP: of the highest octave about the filter's noise, and of the changes into and out of
-#: narrow bands that have a free power.
+#: narrow bands, which may have any power.
 NOISE_STEP_CLEAN, NOISE_STEP_REAL, NOISE_STEP_FREE, NOISE_TOP = 0.25, 0.6, 1.5, 3.0
-#: Start of a fit of the noise: if an octave's log power exceeds the highest octave's by more than
-#: this, the noise contains an effect that the model lacks, and all octaves start at the highest's
-#: power or below.
+#: Where a fit of the noise starts: if an octave's log power exceeds the highest octave's by more
+#: than this, the noise contains an effect that the model lacks, and no octave starts above the
+#: highest octave's power.
 LOUD = 2.0
-#: Ratio of the noise power of a narrow band to that of its sides, at least, for the band to be an
-#: unknown source and no colour of the noise.
+#: Ratio of the noise power of a narrow band to that of its sides, from which on the band is an
+#: unknown source and not coloured noise.
 STANDS_OUT = 3.0
 #: Bounds of the log power of each octave.
 NOISE_RANGE = (-9.0, 9.0)
@@ -211,16 +210,16 @@ DIRECTED_COSINES = 12
 #: Powers of noise along one direction, relative to the other noise of the octave, over which it is
 #: averaged.
 DIRECTED_SHARES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-#: Nats from which on noise along one direction is unknown in a model with the ordinary remainder.
-#: Source: eleven untouched recordings have up to 106.
+#: Nats from which on noise along one direction is an unknown source in a model with the ordinary
+#: remainder.  Source: eleven untouched recordings have up to 106.
 DIRECTED_REAL = 200.0
 #: An effect and something unknown are one source if both act along one direction.
 #: ONE_SOURCE: least share of the effect's contribution that has one direction.
 #: SAME_DIRECTION: least cosine between the two directions: twenty degrees, as near as six of a
 #: hundred random directions are.
 ONE_SOURCE, SAME_DIRECTION = 0.8, 0.94
-#: Least share of something unknown that has one direction for that.  It is smaller than ONE_SOURCE
-#: because a free process takes up noise along the other axes as well.
+#: The same as ONE_SOURCE, of the contribution of something unknown.  It is smaller, because a free
+#: process takes up noise along the other axes as well.
 MAINLY_ONE = 0.5
 
 #: Size of a free process by frame, gauss, up to which it is ordinary in a model with the remainder:
@@ -244,8 +243,9 @@ NAME_ODDS, FORM_ODDS = 3.0, 3.0
 #: law lacks.  Source: null simulations of other authors' generators had 4, 7, 9, 14 and 37 (slow
 #: noise, host stamps that jitter); the others had less than 3.
 UNKNOWN_ODDS = 12.0
-#: Log odds required of either in a model with the ordinary remainder: its laws are not exact, so a
-#: few nats show nothing.
+#: Log odds required of an effect, a factor or anything unknown in a model with the ordinary
+#: remainder: its laws are not exact, so a few nats show nothing.  Also the gain required of each
+#: step of the delay, and of each correction of a column for its logger.
 ODDS_REAL = 12.0
 #: Prior odds that a wider effect takes exactly the form of a narrower one, which no reading can
 #: tell apart: one cause may change all axes of a gyro alike, but more often they differ.
@@ -256,14 +256,14 @@ BESIDE_UNKNOWN = 0.5
 #: Least share, of the power of an effect with its form, that the effect's own columns have to hold.
 #: Source: 0.92 (pulses that grow and fade) and 1.0; 0.29 for a square current taken for pulses.
 OWN_PART = 0.5
-#: Largest number of coefficients of a set that is fitted; the time grows with the cube.  Source: to
-#: find the current and the added magnets of a flight took up to 770, counted once.
+#: Largest number of coefficients of a set that is fitted: the time grows with the cube.  Source:
+#: the current and the added magnets of a flight were found with sets of up to 770.
 WIDEST = 800
 #: Nats.  The search does not expand a set whose score is more than ten times this below the best of
 #: its class (with the remainder or without).
 MOVE = 2.0
-#: A delay is a filter's if its filter share differs from 1 by less than this (or by less than two
-#: standard deviations, if that is more).
+#: A filter is the cause of a delay if its share of the delay differs from 1 by less than this (or
+#: by less than two standard deviations, if that is more).
 NEARLY_ALL = 0.25
 #: Prior odds that a delay is exactly half a step of the recording, because the gyro reports the
 #: rate at an instant.
@@ -274,8 +274,8 @@ HALF_STEP = 0.1
 #: STRETCH_S: length of the intervals that are dealt to the parts in turn, s: longer than a whitened
 #: reading remembers, shorter than the passage of an object.
 PARTS, STRETCH_S = 5, 2.0
-#: Shares of a recording by which copies of a cause are shifted in time.  They are no simple
-#: fractions: what recurs would meet itself.
+#: Shares of a recording by which copies of a cause are shifted in time.  Simple fractions are
+#: avoided, because a cause that recurs would coincide with itself.
 SHIFTS = (0.236, 0.382, 0.472, 0.618, 0.764, 0.854)
 #: Smallest detectable coefficient, in its standard deviations: it would have been found nine times
 #: in ten.
@@ -305,18 +305,18 @@ CHANCE_LOUD = 2.0
 #: The same for the bias of the calibration by the gyro's noise, in the calibration's own standard
 #: deviations.
 #: Source: 0.6 to 0.9 in simulations that hardly tilt, 0.2 at most in those that tilt, next to
-#: nothing in real recordings but one that never moves.
+#: nothing in real recordings except one that never moves.
 CHANCE_BENT = 0.3
 #: CHANCE_FITS: number of simulations to which the calibration alone is fitted.  If the recording's
 #: own fit lies in the bands of these, nothing is reported.
 #: CHANCE_COPIES: how many of these are diagnosed at most.
 #: Source: chosen.
 CHANCE_FITS, CHANCE_COPIES = 16, 5
-#: Share of chance findings that are reported, at the last copy and at each earlier one.
-#: CHANCE_P: after all CHANCE_COPIES copies were diagnosed.
-#: CHANCE_EARLY_P: after fewer, if so little chance is left that the rest need not be diagnosed.
-#: Source: an exponential tail of unknown scale: four times the largest of five, and 43 times the
-#: larger of two.
+#: Probability that a finding by chance is reported.
+#: CHANCE_P: once all CHANCE_COPIES copies are diagnosed.
+#: CHANCE_EARLY_P: at each earlier copy, for the remaining copies not to be diagnosed.
+#: Source: evidence by chance has an exponential tail of unknown scale.  So it has to be four times
+#: the largest of five copies, or 43 times the larger of two.
 CHANCE_P, CHANCE_EARLY_P = 1 / 126, 1e-3
 
 # --- checks of the residual ----------------------------------------------------------------------
