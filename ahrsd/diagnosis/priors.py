@@ -150,8 +150,8 @@ JUMPS = 31.0
 EFFECT_SIZES = (1e-2, 10.0)
 #: The sizes over which a candidate is averaged where candidates are only ranked.
 EFFECT_GRID = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
-#: Shifts in time, s, at which a logged cause is tried (positive: logged late).  Source: a logger's
-#: averages are late; the motor current of a flight was logged 0.32 s late.
+#: Shifts in time, s, at which a logged cause is tried (positive: its log is delayed).  Source: the
+#: averages of loggers; the motor current of a flight was logged with a delay of 0.32 s.
 LOGGED_LATE_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
 #: A column whose logger averaged it.
 #: LOGGED_MEANS_S: averaging times, s, from which the search starts: a log at 1 to 5 Hz.
@@ -323,8 +323,9 @@ CHANCE_P, CHANCE_EARLY_P = 1 / 126, 1e-3
 #: Probability that any two-sided statistic of a further simulation is outside its band.
 CHECKS_OUTSIDE = 0.01
 #: Upper end of the band of a statistic that is a largest value, in standard deviations of 16 copies
-#: above their mean.  Source: Gumbel's law: one further value stays below in 999 of 1000 draws, so
-#: that ten statistics share 1 %; drawn in tests/diagnosis/answer/test_predictive_checks.py.
+#: above their mean (of their logarithms, where the largest of many differences is compared).
+#: Source: Gumbel's law: one further value stays below in 999 of 1000 draws, so that ten statistics
+#: share 1 %; drawn in tests/diagnosis/answer/test_predictive_checks.py.
 CHECKS_LARGEST_REACH = 6.5
 #: Power of the residual's means over segments, relative to that of noise, beyond which these means
 #: are no noise and are left out of the noise law.  Source: chosen.
@@ -578,8 +579,8 @@ MISSING_SHARE = 1e-3
 #: Scatter of the stamps as a share of the step.  From this on it is jitter, unless the field shows
 #: that the steps are as stamped; below, only if the field shows that the steps are equal.
 JITTER_SHARE = 0.03
-#: Correlation of neighbouring steps, below which their scatter is jitter.  Source: -1/2 for late
-#: stamps.
+#: Correlation of neighbouring steps, below which their scatter is jitter.  Source: -1/2 for
+#: delayed stamps.
 JITTER_OPPOSED = -0.25
 #: Nats that are needed to show that the steps are as stamped, or that they are equal.
 STAMPED_NATS = 5.0
@@ -739,7 +740,7 @@ STUCK_ROWS, STUCK_LONGER = 8, 5.0
 #: Noise levels by which the field has to turn during the repetition.  Source: chosen.
 STUCK_TURNED_NOISE = 8.0
 #: Total time, s, from which on a stuck magnetometer is a finding.  Source: a reading held for less
-#: came late and is not used; that is no fault of the sensor unless it recurs.
+#: was delayed and is not used; that is no fault of the sensor unless it recurs.
 STUCK_FINDING_S = 0.25
 #: Steps of coarse numbers by which the field has to turn for a new reading to be expected.
 HELD_STEPS = 3.0
