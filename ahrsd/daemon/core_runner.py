@@ -40,9 +40,9 @@ log = logging.getLogger("ahrsd")
 
 
 SWITCH_S = 0.0005
-MOST_WAITING = 40  # pieces, of up to two seconds of samples each: older verdicts are of no use
-_STUCK_S = 5.0  # no piece takes so long; the service manager's watchdog then goes hungry
-_MOST_REASONS = 16  # whose traceback is logged, once each
+MOST_WAITING = 40  # pieces of up to 2 s of samples each: older verdicts are of no use
+_STUCK_S = 5.0  # no piece takes so long: then the service manager's watchdog gets no message
+_MOST_REASONS = 16  # different failures of which the traceback is logged, once each
 
 
 class Worker:
@@ -137,10 +137,10 @@ class Worker:
 
 
 _LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40}
-_CLOSE_S = 8.0  # where nobody waits for the end
+_CLOSE_S = 8.0  # to close, where nobody waits for the end
 _LEAST_S = 0.2
-_FOLD_S = 60.0
-_FOLD_TEXTS = 64
+_FOLD_S = 60.0  # a text that is repeated within this time is only counted
+_FOLD_TEXTS = 64  # largest number of texts that are counted at one time
 DAEMON_KEEPS = 64  # decisions and gaps in memory; the capture has them all
 
 

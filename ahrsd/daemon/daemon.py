@@ -89,14 +89,14 @@ class Recall:
 
 
 _REOPEN_S = (0.05, 0.5)  # first wait for a port to come back, longest wait
-_LONGEST_WAIT_S = 0.2
-_BEHIND_S = 0.05
-_SHORTEST_WAIT_S = 0.002  # after long work the reader must come to its turn
-_STOP_S = 1.6  # for putting things back; a service manager's patience is limited
-_CLEANUP_S = 2.0
-_WATCH_S = 1.0
-_WALL_STEP_S = 1.0
-_SUSPENDED_S = 0.5
+_LONGEST_WAIT_S = 0.2  # longest wait for bytes in one turn of the loop
+_BEHIND_S = 0.05  # longest wait for an estimator that is behind
+_SHORTEST_WAIT_S = 0.002  # so that the reader has its turn after long work
+_STOP_S = 1.6  # to put the device's settings back; a service manager waits only so long
+_CLEANUP_S = 2.0  # to put the device's output back after a bug
+_WATCH_S = 1.0  # interval of the health log
+_WALL_STEP_S = 1.0  # step of the wall clock that is passed to the core
+_SUSPENDED_S = 0.5  # a longer suspension of the host restarts the link
 
 
 def _asleep_s() -> float:

@@ -13,8 +13,8 @@ from ahrsd.calibration_json import UNKNOWN_HEADING_DEG
 from ahrsd.core.core import Core
 from ahrsd.printable import counted
 
-STATUS_S = 60.0
-_AMISS_S = 5.0  # something must be amiss for so long before it is said
+STATUS_S = 60.0  # interval of the status line
+_AMISS_S = 5.0  # a fault is reported when it has lasted this long
 _SILENT = "nothing comes from the device: check its power and cable"
 _DEAF = "bytes arrive but no message: not a VN-100, or not the rate of its port"
 

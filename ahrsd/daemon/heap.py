@@ -19,9 +19,9 @@ from ahrsd.estimator.parameters import EstimatorParameters
 EVIDENCE_BYTES = 20 << 20  # an hour of segments, their tracks, small temporaries, and the holes
 STEP_BYTES = 512  # one step of the estimator's window: data, directions, response
 _PIECE_BYTES = 64 << 10
-_MAPPED_BYTES = 256 << 10  # from this size on a block is mapped by itself
+_MAPPED_BYTES = 256 << 10  # from this size on a block is mapped separately
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -2, -3, -4, -8
-_PAD_BYTES = 64 << 20  # by which a heap grows at once that is never given back
+_PAD_BYTES = 64 << 20  # step in which a heap grows that is never given back
 
 
 def needed_bytes(estimator: EstimatorParameters) -> int:

@@ -35,10 +35,10 @@ from ahrsd.recording.capture import make_private_folder
 VERBS: Final = ("arm", "disarm", "approve", "lock", "unlock", "rollback")
 LONGEST_S: Final = 30.0
 _LARGEST_BYTES = 1024
-_MOST_ENTRIES = 4096  # of the folder that are looked at in one turn
-_EVERY_S = 0.1
+_MOST_ENTRIES = 4096  # entries of the folder that are read in one turn
+_EVERY_S = 0.1  # interval at which the folder is read
 _ANSWERS_S = 60.0  # an answer that nobody fetched is removed
-_ASK_S = 0.02
+_ASK_S = 0.02  # interval at which a command looks for its answer
 _READABLE = 0o644  # in a folder that only its owner may enter
 
 log = logging.getLogger(__name__)

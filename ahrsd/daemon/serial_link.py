@@ -32,10 +32,10 @@ from drivers.vn100.commands import Command, Procedure
 from drivers.vn100.device import Device
 from drivers.vn100.errors import DriverError
 
-BACKLOG_BYTES = 4 << 20  # what waits costs this much memory at most: minutes at 200 Hz
-_READ_BYTES = 128  # what one read costs besides its data
-_POLL_S = 0.2
-_PATIENT_POLL_S = 0.001
+BACKLOG_BYTES = 4 << 20  # largest backlog in memory: minutes at 200 Hz
+_READ_BYTES = 128  # memory of one read in addition to its data
+_POLL_S = 0.2  # longest wait of one read
+_PATIENT_POLL_S = 0.001  # wait for the core where reading waits for it
 # To other programs: the system hands their bytes over in a thread of its own, and what the core
 # does with the same bytes takes longer than that, on a machine that may have two cores
 _GIVE_WAY_S = 0.00015

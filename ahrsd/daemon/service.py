@@ -27,9 +27,9 @@ from drivers.serial_port import BaudFound, PortError, find_device, spelled
 
 log = logging.getLogger("ahrsd")
 
-_EXIT_S = 2.6  # from a signal to the end of everything that is waited for
+_EXIT_S = 2.6  # from a signal to the end of all waiting
 _LEAST_S = 0.2
-_SEARCH_AGAIN_S = 0.5
+_SEARCH_AGAIN_S = 0.5  # wait before the next search for a device
 
 
 class _Stopped(Exception):

@@ -48,12 +48,12 @@ from ahrsd.telemetry.protocol import Outbox
 
 log = logging.getLogger("ahrsd")
 
-MOST_READERS = 16  # of one share
-_UNREAD_BYTES = 1 << 16  # that wait for one reader here, and about as many in the kernel
-_PIECE = 1 << 16
-_HEARD_BYTES = 1 << 12  # of a reader that talks, at a time
-_AGAIN_S = 0.02  # how often a reader that did not take all is tried again
-_IDLE_S = 1.0
+MOST_READERS = 16  # connections of one share
+_UNREAD_BYTES = 1 << 16  # kept for one slow reader; the kernel keeps about as many
+_PIECE = 1 << 16  # bytes of one send
+_HEARD_BYTES = 1 << 12  # received from a reader at a time
+_AGAIN_S = 0.02  # until a reader that did not take everything is tried again
+_IDLE_S = 1.0  # longest wait for a connection if no bytes are waiting
 _JOIN_S = 2.0
 _KEEPALIVE: Final = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}  # s, s, probes
 _WHY: Final = {
@@ -398,13 +398,13 @@ def _why(error: OSError) -> str:
 # -- Ports -----------------------------------------------------------------------------------------
 
 
-_POLL_S = 0.02  # how often it is looked who has opened a port, and what could not be written
-_RENEW_S = 1.0  # after a program closed its port
-_MOST_UNREAD_BYTES = 1 << 16
-_LINE_BYTES_PER_S = 11_520.0  # of a line at 115200 baud
-_BURST_BYTES = 4096
-_MODE = 0o660
-_LOCAL_FLAGS = 3  # of what tcgetattr returns
+_POLL_S = 0.02  # interval at which ports are checked for programs and for unwritten bytes
+_RENEW_S = 1.0  # until a port that a program closed is replaced by a new one
+_MOST_UNREAD_BYTES = 1 << 16  # kept for one slow program
+_LINE_BYTES_PER_S = 11_520.0  # rate allowed to one program: a line at 115200 baud
+_BURST_BYTES = 4096  # allowed to one program at once
+_MODE = 0o660  # permissions of a port: owner and group
+_LOCAL_FLAGS = 3  # index in the result of tcgetattr
 
 
 @dataclass(slots=True)

@@ -143,8 +143,8 @@ def _is_number(value: object) -> bool:
 # -- All of them, when they are due ----------------------------------------------------------------
 
 
-_INTERLOCK_S = 0.2
-_COLUMNS_S = 0.04
+_INTERLOCK_S = 0.2  # longest interval at which the interlock is read
+_COLUMNS_S = 0.04  # interval at which the columns are read
 
 
 class Vehicle(Protocol):

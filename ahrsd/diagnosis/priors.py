@@ -1,7 +1,18 @@
-"""Every prior, loss, ordinary size and threshold of a diagnosis, with unit, meaning and source.
+"""All priors, losses, ordinary sizes and thresholds of a diagnosis, with unit, meaning and source.
 
-Ordinary sizes are printed by `python tests/benchmarks/diagnosis/bench_remainder_priors.py`, which
-measures them on untouched real recordings: lognormal about a median, `spread` in the logarithm.
+Terms that the comments use:
+
+* a nat is a natural logarithm of odds or of a likelihood ratio: 3 nats are 20 to 1;
+* an effect is a cause of the library, such as a logged current or a bias drift of the gyro;
+* the remainder is the residual that every real recording has, and a simulation does not have;
+* a free process is a Gaussian process in time, on the axes of the sensor, of the world or of the
+  gyro, of any size.  Together with switching sources it represents what no effect explains.
+
+The ordinary sizes are measured on untouched real recordings and printed by
+`python tests/benchmarks/diagnosis/bench_remainder_priors.py`.  Each is log-normal: a median, and
+`spread` as the standard deviation of the logarithm.  `docs/design/engine.md` describes how all of
+this is used.  Where a comment says "source: chosen", or gives neither a source nor a reason, the
+value was chosen and not measured.
 """
 
 from __future__ import annotations
@@ -17,9 +28,10 @@ from ahrsd.estimator import locked
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """A deviation that is lognormal.
+    """Log-normal prior of the standard deviation of a component's coefficients.
 
-    median: in the component's unit;  spread: of its logarithm;  most: what physics allows
+    median: in the component's unit;  spread: standard deviation of the logarithm;  most: upper
+    limit, which physics sets
     """
 
     median: float
@@ -27,579 +39,731 @@ class Size:
     most: float
 
     def up_to(self) -> float:
-        """What 95 % stay below, the component's unit."""
+        """The 95 % quantile, in the component's unit."""
         return self.median * exp(1.645 * self.spread)
 
 
-# --- what every real recording leaves: measured ----------------------------------------------
-#: untouched recordings that were measured
+# --- the ordinary remainder: measured on real recordings ----------------------------------------
+#: Number of untouched recordings on which the ordinary sizes were measured.
 RECORDINGS = 19
-#: deviation over the recording, gauss and rad/s; of the others of the coefficient of unit functions
+#: Prior size of each component of the remainder.  Of the two processes in time it is the standard
+#: deviation over the recording; of the others, of the coefficients of functions of unit size.
+#: Source: measured (see above).
 ORDINARY: Mapping[str, Size] = {
-    "world_course": Size(locked.COURSE, 1.53, 0.1),  # gauss
-    "gyro_course": Size(1.28e-03, 1.73, 0.05),  # rad/s
+    "world_course": Size(locked.COURSE, 1.53, 0.1),  # gauss: world field in time and place
+    "gyro_course": Size(1.28e-03, 1.73, 0.05),  # rad/s: gyro bias in time
     "by_direction": Size(locked.BY_DIRECTION, 1.74, 0.2),  # gauss: harmonics of degree 2 and 3
-    "by_change": Size(locked.BY_CHANGE, 1.51, 0.03),  # s: axes that are late by different times
-    "bending": Size(5.58e-01, 1.10, 3.0),  # of the library's usual flexible mount
+    "by_change": Size(locked.BY_CHANGE, 1.51, 0.03),  # s: different delays of the axes
+    "bending": Size(5.58e-01, 1.10, 3.0),  # usual sizes of the library's flexible mount
     "by_rate_squared": Size(locked.BY_RATE_SQUARED, 2.10, 0.03),  # rad/s at 1 rad/s
     "field_by_rate": Size(locked.FIELD_BY_RATE, 1.72, 0.02),  # gauss at 1 rad/s
     "by_force": Size(2.79e-03, 1.74, 0.03),  # rad/s at 1 g
 }
-#: of a gyro's matrix: how crooked it sits (1.2 degrees), scales and shears of its axes
+#: Prior standard deviations of the gyro's matrix in the remainder, per element.
+#: ORDINARY_MISALIGNMENT_RAD: of the three rotations by which the gyro is misaligned (1.2 degrees).
+#: ORDINARY_SCALE: of the three scales and three shears of its axes.
 ORDINARY_MISALIGNMENT_RAD, ORDINARY_SCALE = 0.02, 0.012
-#: deviations by which three turns of it are off together in one recording of twenty
+#: Length of the rotation of that matrix, in ORDINARY_MISALIGNMENT_RAD, beyond which the
+#: misalignment is reported as a finding.  Source: of three normal numbers, 5 % are longer.
 CROOKED = 2.8
 
-#: of a delay between the sensors, s: BROAD 11 ms, a VN-100 by hand 25 to 40, a flight 50 to 100
+#: Prior standard deviation of the delay between the sensors, s, and the step in which the delay is
+#: searched.  Source: 11 ms in BROAD, 25 to 40 ms with a hand-held VN-100, 50 to 100 ms in flights.
 ORDINARY_LAG_S = 0.04
-#: turn within a step, rad, from which on its gyro's sample does not tell it: a rate that goes from
-#: nothing to twice its mean within the step leaves a sixth of it, 3 degrees
+#: Turn within one step, rad, beyond which one gyro sample does not determine the rotation: the
+#: gap-free run ends before such a step.  Source: if the rate grows from zero to twice its mean
+#: within the step, a sixth of the turn remains unknown, 3 degrees.
 SAMPLED_TURN_RAD = 0.3
-#: how much of a delay is a filter's, 1 all of it
+#: Prior standard deviation of the share of a delay that a filter (low-pass) causes, 1 if all of it.
 LAG_IS_FILTER = 0.5
 
-#: rad/s below which a sensor stands still, and part of its ordinary rate;  of all of its time,
-#: above which this is how it moves;  source: hands of BROAD at rest turn by less than 0.05
+#: Intervals at rest, in which a sensor hardly turns.
+#: STILL_RAD_S: largest rate, rad/s; hands of BROAD at rest turn by less than 0.05.
+#: STILL_PART: largest rate as a share of the root mean square rate; the smaller limit applies.
+#: MOSTLY: if the sensor hardly turns for a larger share of the time, this is how it moves, and
+#: there are no intervals at rest.
 STILL_RAD_S, STILL_PART, MOSTLY = 0.05, 0.2, 0.8
-#: s over which the rate is taken;  of a spell at rest, at least;  and how many, the longest
+#: SMOOTHED_S: time over which the rate is averaged for that, s.
+#: STILL_S: length of the shortest interval at rest, s.
+#: MOST_SPELLS: only so many of the longest intervals are kept.
 SMOOTHED_S, STILL_S, MOST_SPELLS = 0.5, 3.0, 4
 
-# --- what may be there besides ------------------------------------------------------------------
-#: deviations of a reading by which the way of a step's source is off a step for it to be unread,
-#: and those to which it then is
+# --- prior odds and priors of effects, processes and sources --------------------------------------
+#: Readings near a step that are left out because something was being moved.  Both are sizes of the
+#: form of the step (its component for the transition), in standard deviations of a reading.
+#: MOVED: the form has to exceed this somewhere.
+#: MOVED_LEAST: the omitted interval extends as far as the form exceeds this.
 MOVED, MOVED_LEAST = 10.0, 2.0
-#: probability of any one effect of the library;  source: the brief of the engine, 1 in 60
+#: Prior odds of any one effect of the library.  Source: the requirements of the engine, 1 in 60.
 EFFECT = 1.0 / 60.0
-#: of a delay between the sensors, which recordings ordinarily have
+#: Prior odds of a delay between the sensors: recordings ordinarily have one.
 DELAY = 0.5
-#: steps of a kind that are nearer than that are one, s
+#: Time, s, within which two steps of one kind are one step, and within which a step at either end
+#: of the recording is not proposed.
 TRANSITION_S = 2.0
-#: seconds before and after a step for which whatever makes it may be anywhere: a strong magnet is
-#: seen from half a metre on, and a hand takes its time
+#: Time, s, before and after a step in which the source of the step may be anywhere: a strong magnet
+#: is visible from half a metre on, and a movement by hand takes its time.
 APPROACH_S = 4.0
-#: of a further step of a kind that is there: what was put on is taken off
+#: Prior odds of each further step of a kind that is already in the model: what was put on is also
+#: taken off.  It replaces EFFECT for effects that recur.
 AGAIN = 0.3
-#: steps of a kind from which on they are one source that changes, which has no name
+#: From this number on, steps of one kind are one source with a changing level, which is unknown.
+#: It is also the least number of change points of such a source.
 CHANGES = 3
-#: of a course in time that nothing names, in one frame
+#: Prior odds of a free process in one frame, and of any other source that no effect explains.
 COURSE = 1.0 / 20.0
-#: that a recording leaves what real ones do, and not what a simulation does: nothing
+#: Prior probability that a recording has the ordinary remainder, as real ones do and simulations
+#: do not.
 REAL = 0.5
-#: sizes of a course in its unit (1 mG, 0.1 mrad/s), and its time constants as shares of it all
+#: Unit of the size of a free process or a source, by frame: gauss, gauss and rad/s.
 COURSE_UNIT: Mapping[str, float] = {"sensor": 1e-3, "world": 1e-3, "gyro": 1e-4}
+#: Bounds of that size, in this unit; between them the prior is uniform in the logarithm.
 COURSE_SIZES = (1e-2, 5e2)
-#: corner of a course's spectrum, in half waves a recording
+#: Bounds of the corner of a free process's spectrum, in half waves per recording.
 COURSE_CORNERS = (1.0, 40.0)
-#: corner, in half waves a recording, below which a course is a drift: a walk has one
+#: Corner, in half waves per recording, below which a free process is a drift.  Source: a random
+#: walk has its corner at one half wave.
 DRIFT_CORNER = 3.0
-#: of a source that comes and goes: s that it is on and off at a time, of which its course is free
-#: in such pieces; half waves a second between which its corner is
+#: A source that comes and goes: a two-state Markov chain in time.
+#: SPELL_S: mean time for which it is on, s.
+#: BETWEEN_S: mean time for which it is off, s; also the mean time between the changes of a source
+#: with a changing level.
+#: SPELL_PIECE_S: piece of time in which the chain has one state, s; also the shortest half wave.
+#: SPELL_CORNERS: bounds of the corner of its spectrum, in half waves per second.
 SPELL_S, BETWEEN_S, SPELL_PIECE_S, SPELL_CORNERS = 2.0, 20.0, 0.2, (0.1, 10.0)
-#: part of the time that it is on, beyond which it does not come and go; and half waves of all of
-#: its spells, at most
+#: MOST_ON: share of the time for which such a source is on, beyond which it does not come and go
+#: and is not used.
+#: MOST_WAVES: largest number of half waves of all of its intervals together; also the largest
+#: number of change points of a source with a changing level.
 MOST_ON, MOST_WAVES = 0.3, 100
-#: directions that a source of one may have
+#: Number of directions that noise along one direction may have: its evidence costs log of this.
 DIRECTIONS = 100.0
-#: s by which two moments may differ that are one, rounded
+#: Difference, s, below which two times are the same: settings are rounded to 1 ms.
 SAME_MOMENT_S = 2e-3
-#: how often what switches is outside of the vehicle;  three nats
+#: Prior probability that a switching source is outside the vehicle (fixed in the world).  Source:
+#: 3 nats, as an earlier rule of the engine had.
 SWITCHES_OUTSIDE = 0.05
-#: square of a jump of the mean, in its deviations, of three axes: one in 1e6 by chance
+#: Least chi square (three axes) of a jump of the mean between two windows at which the level of a
+#: source may change.  Source: one in 1e6 by chance.
 JUMPS = 31.0
-#: how many times its usual scale an effect is, evenly in the logarithm
+#: Bounds of the size of an effect, in multiples of its usual scale; uniform in the logarithm.
 EFFECT_SIZES = (1e-2, 10.0)
-#: the same where candidates are only ranked
+#: The sizes over which a candidate is averaged where candidates are only ranked.
 EFFECT_GRID = (0.01, 0.033, 0.1, 0.33, 1.0, 3.0)
-#: s by which a logged cause may come late into the log, or early;  source: averages of loggers; the
-#: motor's current of a flight came 0.32 s late
+#: Shifts in time, s, at which a logged cause is tried (positive: its log is delayed).  Source: the
+#: averages of loggers; the motor current of a flight was logged with a delay of 0.32 s.
 LOGGED_LATE_S = (-0.4, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.4)
-#: s over which a logger may take its means, sought on from there: a row of a log at 1 to 5 Hz;  and
-#: the part of a column's power that is lost where a mean leaves nothing.  Chosen, not measured
+#: A column whose logger averaged it.
+#: LOGGED_MEANS_S: averaging times, s, from which the search starts: a log at 1 to 5 Hz.
+#: LOGGED_LOST: noise-to-signal power ratio of the Wiener filter that undoes the average: where the
+#: average passes less power than this, the frequency stays suppressed.  Source: chosen.
 LOGGED_MEANS_S, LOGGED_LOST = (0.2, 0.4, 0.8), 0.02
-#: s by which a column's clock is off from which on it is sought: nearer, its setting is
+#: Lag, s, beyond which the clock of a column is searched: shorter lags are covered by
+#: LOGGED_LATE_S.
 ON_TIME_S = 1.0
-#: s over which a logger ordinarily takes its mean: a battery's monitor filters over a tenth
+#: Ordinary time, s, over which a logger averages.  It scales the form of a logged cause.  Source: a
+#: battery monitor filters over a tenth of a second.
 LOGGED_BLUR_S = 0.05
-#: that iron has something along an axis from before the recording, and of twenty values this one
+#: Prior odds, per axis, that iron has one particular magnetisation from before the recording.
+#: Source: it is one of twenty values.
 REMEMBERED = 1.0 / 20.0
 
-#: deviation of a name's coefficient that is free in time or attitude, relative to itself: from
-#: which on the name stands in for something else, and the largest;  source: in time twelve names
-#: that are there have .1 at most, stand-ins .36 to 1.3 (workboat 501, 601, road_and_air 502, 602)
+#: Factor by which an effect's coefficient varies, in time or in attitude: standard deviation
+#: relative to the coefficient.
+#: VARIES: beyond this the coefficient is not constant, and the effect stands for another source.
+#: VARIES_MOST: upper bound of the prior.
+#: Source: in time, twelve effects that were present have 0.1 at most; wrong ones 0.36 to 1.3.
 VARIES, VARIES_MOST = 0.25, 10.0
 
 # --- noise --------------------------------------------------------------------------------------
-#: deviation of a log power from that of the next octave: of a sensor's own noise, of what a real
-#: recording leaves as well, and where only a delay is sought;  of the highest from the filter's
+#: Prior standard deviations of the logarithm of the noise power.
+#: NOISE_STEP_CLEAN: of its change from octave to octave, for a sensor's own noise.
+#: NOISE_STEP_REAL: the same in a model with the ordinary remainder.
+#: NOISE_STEP_FREE: the same where only a delay and logged causes are in the model.
+#: NOISE_TOP: of the highest octave about the filter's noise, and of the changes into and out of
+#: narrow bands, which may have any power.
 NOISE_STEP_CLEAN, NOISE_STEP_REAL, NOISE_STEP_FREE, NOISE_TOP = 0.25, 0.6, 1.5, 3.0
-#: log power by which a band is louder than the highest where the noise has what a model lacks
+#: Where a fit of the noise starts: if an octave's log power exceeds the highest octave's by more
+#: than this, the noise contains an effect that the model lacks, and no octave starts above the
+#: highest octave's power.
 LOUD = 2.0
-#: times as loud as its sides that a narrow band is for it to be a source that hums and no colour
+#: Ratio of the noise power of a narrow band to that of its sides, from which on the band is an
+#: unknown source and not coloured noise.
 STANDS_OUT = 3.0
-#: log powers between which a band stays
+#: Bounds of the log power of each octave.
 NOISE_RANGE = (-9.0, 9.0)
-#: degrees of freedom of readings beyond their level, beside normal ones;  source: 3 on a flight
+#: Degrees of freedom that are tried for the readings given their noise level, next to normal ones.
+#: Source: 3 in a flight.
 FREEDOMS = (3.0, 5.0, 8.0, 15.0)
-#: seconds over which the noise's level is taken;  powers between which it stays, of the median's
+#: LEVEL_S: width of the moving median that gives the noise level, s.
+#: LEVELS: bounds of the noise power, relative to its median.
 LEVEL_S, LEVELS = 4.0, (0.02, 50.0)
-#: octaves of the noise's spectrum, at most
+#: Largest number of octaves of the noise's spectrum.
 BANDS = 7
-#: deviation of the log power of a magnetometer's axis from the mean of the three;  source: up to .5
-#: on eight of eleven untouched recordings, .6, .7 and 1.2 on the others
+#: Prior standard deviation of the log noise power of a magnetometer's axis, relative to the mean of
+#: the three.  Source: up to 0.5 on eight of eleven untouched recordings; 0.6, 0.7, 1.2 on the
+#: others.
 AXES_DIFFER = 0.4
-#: cosines that an octave has at least for its covariance to be asked
+#: Number of cosines, scaled by the share of readings, below which an octave is left out of the fit
+#: of noise along one direction.
 DIRECTED_COSINES = 12
-#: power of a source of one direction, relative to the noise's in an octave: where there is one
+#: Powers of noise along one direction, relative to the other noise of the octave, over which it is
+#: averaged.
 DIRECTED_SHARES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-#: nats of such a source beside what real recordings leave, from which it is unknown;  source:
-#: eleven untouched recordings have up to 106
+#: Nats from which on noise along one direction is an unknown source in a model with the ordinary
+#: remainder.  Source: eleven untouched recordings have up to 106.
 DIRECTED_REAL = 200.0
-#: share of what a name adds that has one direction, and cosine to that of something unknown, from
-#: which the two are one source: twenty degrees, six of a hundred directions by chance
+#: An effect and something unknown are one source if both act along one direction.
+#: ONE_SOURCE: least share of the effect's contribution that has one direction.
+#: SAME_DIRECTION: least cosine between the two directions: twenty degrees, as near as six of a
+#: hundred random directions are.
 ONE_SOURCE, SAME_DIRECTION = 0.8, 0.94
-#: the same share of something unknown: a free course takes noise along the other axes as well
+#: The same as ONE_SOURCE, of the contribution of something unknown.  It is smaller, because a free
+#: process takes up noise along the other axes as well.
 MAINLY_ONE = 0.5
 
-#: size of a free course, by frame, that one in ten untouched recordings is beyond beside the
-#: remainder, gauss or rad/s: it is a finding only where it is larger;  source: the same command.
-#: Of effects it is a column of the library, `ordinary`
+#: Size of a free process by frame, gauss, up to which it is ordinary in a model with the remainder:
+#: only a larger one is a finding.  Source: one in ten untouched recordings is beyond (same command
+#: as ORDINARY).  Of an effect the size is `ordinary` in the library.
 ORDINARY_COURSE: Mapping[str, float] = {"sensor": 0.017}
 
-# --- where it is linearised --------------------------------------------------------------------
-#: deviations of calibration and delay to which a point is where its model wants it
+# --- point of linearisation -----------------------------------------------------------------------
+#: Step to the model's maximum, in standard deviations of calibration and delay, below which the
+#: linearisation has converged.
 NEAR = 0.7
-#: deviations by which the readings say at a delay that it is nearer to none, for it not to be one
+#: If the readings point from a delay back towards zero by more standard deviations than this, the
+#: delay is not accepted.
 POINTS_BACK = 2.0
 
 # --- the decision -------------------------------------------------------------------------------
-#: log odds from which an effect is told: a false name costs more than a missed one;  from which a
-#: factor that is free says that a name stands in for something else
+#: NAME_ODDS: log odds required of an effect; a false finding costs more than a missed one.
+#: FORM_ODDS: log odds required of a factor by which an effect's coefficient varies.
 NAME_ODDS, FORM_ODDS = 3.0, 3.0
-#: from which something is called unknown: a course explains whatever the noise has that its law
-#: lacks;  source: nulls of other authors' generators had 4, 7, 9, 14 and 37 where others had less
-#: than 3 (slow noise, host stamps that jitter)
+#: Log odds required of anything unknown, because a free process explains all in the noise that its
+#: law lacks.  Source: null simulations of other authors' generators had 4, 7, 9, 14 and 37 (slow
+#: noise, host stamps that jitter); the others had less than 3.
 UNKNOWN_ODDS = 12.0
-#: both on a recording with an ordinary remainder: its laws are not exact, a few nats say nothing
+#: Log odds required of an effect, a factor or anything unknown in a model with the ordinary
+#: remainder: its laws are not exact, so a few nats show nothing.  Also the gain required of each
+#: step of the delay, and of each correction of a column for its logger.
 ODDS_REAL = 12.0
-#: odds that what one effect explains is a wider one's in just that form, which no reading tells:
-#: one cause may make a gyro's axes all be off alike, but more often they differ
+#: Prior odds that a wider effect takes exactly the form of a narrower one, which no reading can
+#: tell apart: one cause may change all axes of a gyro alike, but more often they differ.
 SAME_FORM = 0.5
-#: part of the evidence of what is unknown that a name beside it must have;  source: stand-ins .25
-#: and .46 there, the one that is there .75
+#: Share of the evidence of something unknown that an effect in the same model has to have.  Source:
+#: wrong effects had 0.25 and 0.46, one that was present 0.75.
 BESIDE_UNKNOWN = 0.5
-#: part of the square of what a name and its form add that the name's own columns hold at least;
-#: source: pulses .92 (that swell and fade) and 1.0, a square current taken for pulses .29
+#: Least share, of the power of an effect with its form, that the effect's own columns have to hold.
+#: Source: 0.92 (pulses that grow and fade) and 1.0; 0.29 for a square current taken for pulses.
 OWN_PART = 0.5
-#: coefficients of a set that is asked, at most: the time that it takes goes by the cube;  source:
-#: a flight with its current and magnets put on were told with sets of up to 770, counted once
+#: Largest number of coefficients of a set that is fitted: the time grows with the cube.  Source:
+#: the current and the added magnets of a flight were found with sets of up to 770.
 WIDEST = 800
-#: nats that a move of the search must gain
+#: Nats.  The search does not expand a set whose score is more than ten times this below the best of
+#: its class (with the remainder or without).
 MOVE = 2.0
-#: how near to all of a delay must be a filter's to be called one
+#: A filter is the cause of a delay if its share of the delay differs from 1 by less than this (or
+#: by less than two standard deviations, if that is more).
 NEARLY_ALL = 0.25
-#: of a delay to be half a step of the recording: a gyro that tells the rate of the moment
+#: Prior odds that a delay is exactly half a step of the recording, because the gyro reports the
+#: rate at an instant.
 HALF_STEP = 0.1
 
-# --- what is held against an answer --------------------------------------------------------------
-#: parts into which a recording is dealt, each foretold from the others, and seconds of a stretch:
-#: longer than a whitened reading remembers, shorter than an object that is passed by
+# --- checks of an answer -------------------------------------------------------------------------
+#: PARTS: number of parts of a recording, each predicted from the others.
+#: STRETCH_S: length of the intervals that are dealt to the parts in turn, s: longer than a whitened
+#: reading remembers, shorter than the passage of an object.
 PARTS, STRETCH_S = 5, 2.0
-#: shares of a recording by which copies of a cause are moved: no simple ones, what comes again and
-#: again would meet itself
+#: Shares of a recording by which copies of a cause are shifted in time.  Simple fractions are
+#: avoided, because a cause that recurs would coincide with itself.
 SHIFTS = (0.236, 0.382, 0.472, 0.618, 0.764, 0.854)
-#: deviations of a coefficient from which on it would have been told nine times in ten
+#: Smallest detectable coefficient, in its standard deviations: it would have been found nine times
+#: in ten.
 SHOWN_AT = 6.5
-#: probability that any bin of any regime is outside of its band where nothing is left
+#: Probability that any bin of any regime is outside its band if nothing is left.
 BINS_OUTSIDE = 0.01
-#: s that an object which is passed by shows at most: what it leaves there is no noise
+#: Longest time for which an object that is passed is visible, s: a noise level that rises while it
+#: is passed is no fact about the noise.
 PASSING_S = 30.0
-#: probability by chance, and correlation, of a logged column that is said to move with a course
+#: A logged column is listed as moving with an unknown process if both conditions hold.
+#: CHANCE: the p-value of the correlation is below this.
+#: ALIKE: the absolute correlation is above this.
 CHANCE, ALIKE = 0.2, 0.5
 
-# --- simulations against which an answer is held -------------------------------------------------
-# Smaller probabilities and more nats make the engine more silent (`answer/null_simulations.py`).
-#: probability by chance below which an answer that tells nothing is held against simulations all
-#: the same;  chosen
+# --- simulations of the null model that an answer is compared with --------------------------------
+# Smaller probabilities and more nats make the engine report less (`answer/null_simulations.py`).
+#: If an answer without a finding has a smaller p-value than this, it is compared with simulations
+#: all the same.  Source: chosen.
 FAMILY_P = 1e-3
-#: nats that simulations of the calibration alone are taken to show at least;  source: of 300 nulls
-#: of five noise laws three have more, errors of a gyro whose bias walks
+#: Evidence, nats, that simulations of the calibration alone show at least.  Source: of 300 null
+#: simulations with five noise laws three have more, because of gyros whose bias walks.
 ALONE_NATS = 9.0
-#: gyro beside magnetometer: turns of the field by its noise in a step, in the deviations of a
-#: reading, from which on evidence is held against simulations;  source: above every real recording
-#: that was looked at, below the simulations that were told to differ from themselves
+#: Turn of the field in a step due to the gyro's noise, in standard deviations of a reading, from
+#: which on an answer is compared with simulations.  Source: every real recording that was looked at
+#: is below, and simulations that were found to differ from themselves are above.
 CHANCE_LOUD = 2.0
-#: the same where the gyro's noise moves the calibration by so many deviations to which it is known;
-#: source: simulations that hardly tilt have .6 to .9, those that do .2 at most, real recordings
-#: next to nothing but one that never moves
+#: The same for the bias of the calibration by the gyro's noise, in the calibration's own standard
+#: deviations.
+#: Source: 0.6 to 0.9 in simulations that hardly tilt, 0.2 at most in those that tilt, next to
+#: nothing in real recordings except one that never moves.
 CHANCE_BENT = 0.3
-#: simulations to which the calibration alone is fitted, for the bands in which the recording's own
-#: fit has to be where nothing is told;  and how many of these are diagnosed at most;  chosen
+#: CHANCE_FITS: number of simulations to which the calibration alone is fitted.  If the recording's
+#: own fit lies in the bands of these, nothing is reported.
+#: CHANCE_COPIES: how many of these are diagnosed at most.
+#: Source: chosen.
 CHANCE_FITS, CHANCE_COPIES = 16, 5
-#: of what chance makes, the part that is told when all of these were asked, and when so many fewer
-#: were that the rest need not be;  source: an exponential tail of unknown scale, four times the
-#: largest of five and 43 times the larger of two
+#: Probability that a finding by chance is reported.
+#: CHANCE_P: once all CHANCE_COPIES copies are diagnosed.
+#: CHANCE_EARLY_P: at each earlier copy, for the remaining copies not to be diagnosed.
+#: Source: evidence by chance has an exponential tail of unknown scale.  So it has to be four times
+#: the largest of five copies, or 43 times the larger of two.
 CHANCE_P, CHANCE_EARLY_P = 1 / 126, 1e-3
 
-# --- checks of what is left ----------------------------------------------------------------------
-#: probability that any statistic of a simulation is outside of its band
+# --- checks of the residual ----------------------------------------------------------------------
+#: Probability that any two-sided statistic of a further simulation is outside its band.
 CHECKS_OUTSIDE = 0.01
-#: deviations beyond the mean of the largest values of 16 copies that one more is below in 999 of
-#: 1000 draws, a thousandth for each of ten statistics;  source: Gumbel's law, drawn in
-#: tests/diagnosis/answer/test_predictive_checks.py
+#: Upper end of the band of a statistic that is a largest value, in standard deviations of 16 copies
+#: above their mean (of their logarithms, where the largest of many differences is compared).
+#: Source: Gumbel's law: one further value stays below in 999 of 1000 draws, so that ten statistics
+#: share 1 %; drawn in tests/diagnosis/answer/test_predictive_checks.py.
 CHECKS_LARGEST_REACH = 6.5
-#: times the power that noise has in means over segments, beyond which these are no noise;  chosen
+#: Power of the residual's means over segments, relative to that of noise, beyond which these means
+#: are no noise and are left out of the noise law.  Source: chosen.
 SLOW_BEYOND = 2.0
-#: mean square of the innovations below which an assumed noise is not there;  source: two of the
-#: three axes have the gyro's, 2 / 3 where the magnetometer has none
+#: If the magnetometer's noise is at its floor and the mean square of the innovations is below this,
+#: the assumed noise is not there, and the omnibus tests are not made.  Source: two of three axes
+#: have the gyro's noise, so the mean square is 2 / 3 if the magnetometer has none.
 ABSENT_NOISE = 0.8
-#: probability by chance below which a test of the innovations is said to fail;  chosen
+#: p-value below which a test of the innovations has failed.  Source: chosen.
 TEST_FAILED = 1e-4
 
-# --- what is said of a finding -------------------------------------------------------------------
-#: log odds: none is told surer;  chosen
+# --- what a finding states -----------------------------------------------------------------------
+#: Largest log odds from which a confidence is computed.  Source: chosen.
 SUREST_ODDS = 30.0
-#: probability from which on another name is told beside one;  chosen
+#: Probability, given the place, above which an alternative effect is reported.  Source: chosen.
 SMALLEST_SHARE = 0.01
-#: part of the squares that may be left where one component's columns hold another's;  chosen
+#: Share of the power of one component's columns that may lie outside the span of another's, if the
+#: other contains them; also for a logged cause, whether its shift in time matters.  Source: chosen.
 COLUMNS_ALIKE = 1e-3
-#: deviation of each number of a setting, in the changes of which its slopes are made
-#: (`inference/search/near_settings.py`);  chosen
+#: Prior standard deviation of each number of a setting, in units of the change from which its slope
+#: is computed (`inference/search/near_settings.py`).  Source: chosen.
 SETTING_OFF = 25.0
-#: settings that an onset which was sought finely counts for at least;  onsets among which one that
-#: the data proposed was chosen
+#: Number of settings among which one was chosen; they share the prior odds.
+#: SOUGHT_SETTINGS: of a refined setting, at least (its square for both ends of an interval).
+#: PROPOSED_ONSETS: of a step at an onset that the data proposed.
 SOUGHT_SETTINGS, PROPOSED_ONSETS = 40, 200
-#: part of the largest axis that an axis has on which a term acts;  part of the largest stretch that
-#: a stretch has in which it does;  part of the whole time, from where on it is everywhere
+#: Place of an effect.
+#: ACTS_ON_AXIS: it acts on an axis whose contribution exceeds this share of the largest axis's.
+#: ACTS_IN_STRETCH: it acts in a segment of time whose contribution exceeds this share of the
+#: largest.
+#: ACTS_EVERYWHERE: if these segments cover a larger share of the time, it acts everywhere.
 ACTS_ON_AXIS, ACTS_IN_STRETCH, ACTS_EVERYWHERE = 0.2, 0.15, 0.6
-#: part of a course's largest departure from its usual level, from which on it is away;  deviations
-#: by which its beginning and end are still away
+#: Intervals in which a process in time departs from its usual level.
+#: DEPARTED: distance from the usual level, as a share of the largest distance.
+#: STILL_DEPARTED: an interval is extended as far as the departure exceeds so many standard
+#: deviations.
 DEPARTED, STILL_DEPARTED = 0.25, 2.0
-#: range that a quantity has at least for what is left to be told by it, in its unit
+#: Range that a quantity has to have for the residual to be tested by it.  The unit is in its name.
 REGIME_RANGE: Mapping[str, float] = {
     "heading_deg": 60.0,
     "pitch_deg": 10.0,
     "roll_deg": 10.0,
     "rate_rad_s": 0.05,
 }
-#: horizontal part of the field where no accelerometer says what is level: at 60 degrees of dip;
-#: and the smallest in which a heading is told
+#: Horizontal share of the field.
+#: LEVEL_SHARE: assumed where no accelerometer shows what is horizontal: that at 60 degrees of dip.
+#: LEVEL_LEAST_SHARE: the least that is used to convert an added field to a change of heading.
 LEVEL_SHARE, LEVEL_LEAST_SHARE = 0.5, 0.1
 
 # --- a narrow band -------------------------------------------------------------------------------
-#: times as loud as both sides;  source: the colour of a few coefficients is not so steep
+#: Power of a band, relative to both sides.  Source: noise of a few coefficients is not so steep.
 BAND_STANDS_OUT = 3.0
-#: Hz below which none is sought: there are courses in time and the motion's own rates
+#: Lower limit of such a band, Hz: below are processes in time and the rates of the motion itself.
 BAND_LOWEST_HZ = 0.75
-#: part of the power that is along the field, at most, in an error of the gyro; else about a third
+#: Share of the band's power along the field, below which the source is an error of the gyro, which
+#: turns the field and does not change its size; for others it is about a third.
 BAND_ALONG = 0.1
 
-# --- a simulation that somebody brought ----------------------------------------------------------
-#: s that it has in common with the recording, at least;  chosen
+# --- a simulation that is compared with the recording ---------------------------------------------
+#: Time that both have to have in common, s.  Source: chosen.
 OVERLAP_S = 20.0
-#: correlation of the two gyros that is the same motion; another motion is far below
+#: Correlation of the two gyros, above which the motion is the same; another motion is far below.
 SAME_MOTION = 0.8
-#: deviations: parameters that differ by less are the same effect;  chosen
+#: Standard deviations: if all parameters differ by less, two effects are the same.  Source: chosen.
 SAME_SIGMAS = 4.0
 
 # --- the calibration -----------------------------------------------------------------------------
-#: prior deviations of the 11: soft iron about I, hard iron (gauss) about 0, gyro bias (rad/s);
-#: source: a thousand times too wide to matter where the motion shows anything
+#: Prior standard deviations of the 11 parameters: 5 of soft iron about the identity, 3 of hard iron
+#: about 0 (gauss), 3 of gyro bias (rad/s).  Source: they are a thousand times too wide to matter
+#: where the motion determines a parameter at all.
 CALIBRATION_DEVIATION = np.array([0.15] * 5 + [0.5] * 3 + [0.03] * 3)
 CALIBRATION_DEVIATION.flags.writeable = False
-#: scatter of the field over its size that shows the iron; below, the prior is narrower
+#: Scatter of the field over its size, above which the field determines the iron; below, the prior
+#: of the iron is narrowed in proportion, as a sensor that never turns does not show iron.
 IRON_TURNED = 0.1
-#: of how many data one says something new, from which on the prior is made to count
+#: Number of readings per independent one, from which on the deviations of the prior are divided by
+#: its square root.
 REPEATED = 3.0
-#: rad/s that the mean of a resting gyro may differ from its bias, where the field shows that it
-#: rests
+#: Prior standard deviation of the gyro bias about the mean of the gyro at rest, rad/s, if the field
+#: shows that it rests.
 STILL_BIAS_RAD_S = 1e-3
-#: rows that a recording counts for where the centre of its sphere is sought, and how far it is from
-#: a sphere, of the mean square;  chosen
+#: Fit of the centre of a sphere.
+#: SPHERE_ROWS: number of independent rows that a recording counts for.
+#: SPHERE_OFF: standard deviation of the squared field from that of a sphere, of its mean square.
+#: Source: chosen.
 SPHERE_ROWS, SPHERE_OFF = 100, 0.1
-#: steps that a fit needs;  chosen
+#: Least number of steps for a fit.  Source: chosen.
 FIT_STEPS = 15
-#: deviation of the field at the first row of a run that has no reading, of its size, in all
-#: directions
+#: Prior standard deviation of the field at the first row of a gap-free run that has no reading, in
+#: any direction and relative to its size.
 UNSEEN_FIELD = 0.5
 
 # --- levels of noise -----------------------------------------------------------------------------
-#: times the gyro's differenced noise that its noise may be at most;  source: free, it swallows
-#: every drift of the gyro
+#: Largest noise of the gyro, in multiples of the noise that the differences of its readings show.
+#: Source: without a limit the noise absorbs every drift of the gyro.
 GYRO_NOISE_CAP = 1.5
-#: deviation of the logarithm of the gyro's noise from its differenced one before the data speak;
-#: the same below that where the differences are mostly of the motion
+#: Prior standard deviation of the logarithm of the gyro's noise about that of its differences.
+#: GYRO_NOISE_TRUST: in either direction.
+#: SHAKEN_TRUST: below it, if the differences are mostly motion.
 GYRO_NOISE_TRUST, SHAKEN_TRUST = 0.25, 1.5
-#: random walk of the bias, rad/s per square root of a second, beyond which it is no longer noise:
-#: 50 deg/h after 400 s
+#: Largest random walk of the gyro bias, rad/s per square root of a second, that counts as noise: 50
+#: deg/h after 400 s.
 WALK_CAP_RAD_S_SQRT_S = 1.2e-5
-#: nats that a wandering bias must gain;  source: two standard deviations are not enough
+#: Nats that a walk of the bias has to gain.  Source: two standard deviations are not enough.
 WALK_NATS = 6.0
-#: noise of a magnetometer whose readings are too far apart to be compared with each other, gauss
+#: Noise of the magnetometer, gauss, if its readings are too far apart to be compared.
 USUAL_MAG_GAUSS = 1e-3
-#: least noise of the magnetometer, gauss, and of the gyro, rad/s;  source: below the
-#: magnetometer's, what the filter leaves out (it is linear) would be more than the noise
+#: Least noise of magnetometer (gauss) and gyro (rad/s).  Source: below the magnetometer's, what the
+#: linear filter leaves out would exceed the noise.
 FLOOR_MAG_GAUSS, FLOOR_GYRO_RAD_S = 2e-5, 1e-5
 
-# --- noise that is louder for a while ------------------------------------------------------------
-#: nats by which a change of level must be likelier than none;  source: with the 20,000 stretches
-#: that 400 s have, one recording of one level in ten thousand has such a one
+# --- a higher noise level for a while -------------------------------------------------------------
+#: Log likelihood ratio, nats, required of a change of level against none.  Source: of 400 s, with
+#: 20,000 possible intervals, one recording of one level in ten thousand shows such a change.
 LOUDER_NATS = 17.0
-#: of the two variances, at least;  chosen
+#: Least ratio of the two variances.  Source: chosen.
 LOUDER_RATIO = 1.3
-#: deviations from which a reading is no more a sign of a louder noise
+#: Standard deviations at which a difference is clipped, so that a single outlier is no higher
+#: level.
 LOUDER_OUTLIER = 3.0
-#: part of the recording that a burst may last;  part of a stretch that is loud, from which on it is
-#: loud throughout;  chosen
+#: BURST_SHARE: share of the recording that a single burst may last; longer, the level changed.
+#: BURST_FILLED: several intervals are bursts if they fill less than this of the time from the first
+#: to the last; otherwise the level is high throughout.
+#: Source: chosen.
 BURST_SHARE, BURST_FILLED = 0.4, 0.7
-#: correlation of successive differences of noise, at most;  source: -1/2 where it is white
+#: Correlation of successive differences, above which they are no noise.  Source: -1/2 if white.
 NOISE_OPPOSED = -0.3
-#: variance over the spec's, from which on the noise is above it;  chosen
+#: Ratio of the variance to that of the specification, from which on it is too high.  Source:
+#: chosen.
 LEVEL_RATIO = 1.15
 
 # --- what a gyro's readings are ------------------------------------------------------------------
-#: a gyro's noise per sample, rad/s, below which none is;  coning that is no more than so many times
-#: its square, summed, is lost even in this and left
+#: CONING_QUIETEST_RAD_S: rad/s, noise per sample that every gyro exceeds.
+#: CONING_LOST: if the summed square of the coning (less its mean) is below this multiple of the
+#: square of that noise, no gyro shows it, and no correction is made.
 CONING_QUIETEST_RAD_S, CONING_LOST = 1e-4, 10.0
-#: deviations that none and all of it must be apart to be told;  deviations beyond all of it from
-#: which on it is something else
+#: CONING_RESOLVED: standard deviations between no coning and all of it that the estimate has to
+#: resolve.
+#: CONING_OFF: standard deviations beyond all of it (with a margin of half), from which on the
+#: readings show something else.
 CONING_RESOLVED, CONING_OFF = 3.0, 4.0
-#: change of the rate from step to step over the rate, root mean squares, beyond which the product
-#: of neighbours says nothing of what was between them
+#: Root mean square change of the rate from sample to sample, relative to the rate, beyond which the
+#: samples do not resolve the motion, and products of neighbours show nothing of the time between.
 CONING_UNRESOLVED = 0.5
-#: of the usual level, what the quiet seconds of noise are at least; a motion's are quieter;
-#: source: of twelve real recordings eleven have a tenth of their seconds below .67, of 120
-#: simulated motions none below .76
+#: If a tenth of the seconds have less noise than this multiple of the usual level, the differences
+#: of the gyro's readings are mostly motion (the gyro is shaken): noise has the same level in every
+#: second.  Source: eleven of twelve real recordings have a tenth of their seconds below 0.67, and
+#: none of 120 simulated motions has it below 0.76.
 SHAKEN_STEADY = 0.7
-#: noise of the magnetometer over its differences beyond which something else is wrong;  noise of
-#: the gyro over its differences below which these were the motion's
+#: SHAKEN_WRONG: if the fitted noise of the magnetometer exceeds this multiple of that of its
+#: differences, something else is wrong, and the gyro's noise is left as it was.
+#: SHAKEN_QUIETER: if the gyro's noise is below this multiple of that of its differences, the
+#: differences are motion.
 SHAKEN_WRONG, SHAKEN_QUIETER = 1.5, 0.7
 
 # --- a gyro that stands still --------------------------------------------------------------------
-#: 1 - |mean direction| of the field in the sensor, below which it hardly turns: directions within
-#: about 5 degrees
+#: 1 - |mean direction| of the field in the sensor, below which the field hardly turns: directions
+#: within about 5 degrees.
 REST_SPREAD = 4e-3
-#: walk of an ordinary gyro's bias, rad/s per square root of a second: 20 deg/h in 400 s is noise
-#: and gets no name
+#: Random walk of an ordinary gyro's bias, rad/s per square root of a second.  Source: 20 deg/h in
+#: 400 s is noise and is not reported.
 ORDINARY_WALK_RAD_S_SQRT_S = 5e-6
-#: what may move the bias, and log prior odds;  source: that the recording began when the power came
-#: on, as a start-up needs, is seldom so
+#: Effects that may move the bias of a gyro at rest, and their log prior odds.  Source: a recording
+#: seldom begins when the power comes on, as a start-up needs.
 REST_CAUSES: Mapping[str, float] = {
     "gyro_bias_temperature": 0.0,
     "gyro_bias_drift": 0.0,
     "gyro_bias_step": 0.0,
     "gyro_startup": -5.0,
 }
-#: prior deviation of the bias itself, rad/s
+#: Prior standard deviation of the constant bias, rad/s.
 REST_BIAS_RAD_S = 1e-2
-#: seconds of standing that are needed;  how far a still second's scatter may be, of the usual one,
-#: and its mean, rad/s
+#: REST_S: number of seconds at rest that are required.
+#: REST_SCATTER: largest scatter within a second at rest, relative to the median of all seconds.
+#: REST_AWAY_RAD_S: largest distance of a second's mean rate from the median, rad/s.
 REST_S, REST_SCATTER, REST_AWAY_RAD_S = 60, 3.0, 0.01
-#: nats over its walk alone for a cause of the bias: odds 50 to 1 for every candidate's size
+#: Nats required of a cause of the bias over a random walk alone, each candidate averaged over its
+#: sizes: odds of 50 to 1.
 REST_NATS = 4.0
-#: deviations of an ordinary walk: a change below is one
+#: Change of the bias, in standard deviations of an ordinary walk, below which it is one.
 REST_LARGE = 3.0
-#: probability from which on another cause is told beside one;  chosen
+#: Probability, above which an alternative cause is reported.  Source: chosen.
 REST_SMALLEST_SHARE = 0.005
-#: share of the gyro's integral that the field follows, beyond which the vehicle does turn
+#: Share of the integral of the gyro's rate that the field follows, beyond which the vehicle does
+#: turn.
 REST_TURNS = 0.3
 
 # --- a delay -------------------------------------------------------------------------------------
-#: part of the middle step within which steps are alike, and so many must be
+#: STEPS_ALIKE: steps of a recording are alike if they differ from the median by less than this
+#: share.
+#: STEPS_ALIKE_SHARE: least share of the steps that have to be alike for a regular step to exist.
 STEPS_ALIKE, STEPS_ALIKE_SHARE = 0.25, 0.95
-#: part of half a step within which a delay is one: then it is the gyro's
+#: If a delay differs from half a step by less than this share of it, it is half a step and the
+#: gyro's alone.
 HALF_STEP_WITHIN = 0.1
-#: s that a magnetometer is ordinarily late at most: readings so near to a run's first row are left
-#: out;  source: BROAD 11 ms, a VN-100 by hand 25 to 40, a flight 50 to 100
+#: Longest ordinary delay of a magnetometer, s.  Readings nearer than this to the beginning of a run
+#: are left out.  Source: see ORDINARY_LAG_S.
 BEGIN_S = 0.1
-#: part of a run from which on its first readings are too many to be left out.  Chosen, not measured
+#: Share of a run from which on those readings are too many to be left out.  Source: chosen.
 BEGIN_SHARE = 0.1
 
 # --- logged columns ------------------------------------------------------------------------------
-#: s without values that are filled;  source: a column of 1 Hz beside samples of 25 Hz has them, a
-#: failed logger has more
+#: Longest gap in a column that is interpolated, s.  Source: a column of 1 Hz next to samples of
+#: 25 Hz has such gaps; a failed logger has longer ones.
 COLUMN_GAP_S = 2.0
-#: part of the rows without a value beyond which a column is left out;  chosen
+#: Share of rows without a value, beyond which a column is left out.  Source: chosen.
 COLUMN_MISSING = 0.98
-#: the same of a column with long holes, whose other readings are used: with more holes than values
-#: it says too little
+#: The same for a column with longer gaps, of which only the rows with values are used: with more
+#: gaps than values it shows too little.
 COLUMN_HOLES = 0.5
-#: rows that a 0/1 column stays on, beyond which it is a switch, else a train of pulses
+#: Rows for which a column of 0 and 1 stays on, beyond which it is a switch; otherwise it is a train
+#: of pulses.
 SWITCH_ROWS = 4
-#: s between a column's values, at most: what changes more seldom is a level
+#: Longest time between new values of a column for it to be held between them, s: what changes more
+#: seldom is a level.
 COLUMN_HELD_S = 5.0
-#: share of the values that come after one period, and by how much of one they may miss it
+#: COLUMN_REGULAR: least share of the values of a held column that come one period after the last.
+#: COLUMN_MISS: how far from one period they may come, as a share of it.
 COLUMN_REGULAR, COLUMN_MISS = 0.6, 0.25
-#: fewest values that tell how a column was logged
+#: Least number of new values that shows how a column was logged.
 COLUMN_UPDATES = 20
-#: deviations of its own scatter by which a logger's noise may depart from flat, and from Gaussian
+#: Standard deviations by which the high frequencies of a column may depart from a flat spectrum,
+#: and from a Gaussian fourth moment, to be noise of the logger.
 COLUMN_NOISE_SCATTER = 3.0
-#: part of a column's power that its course has at least, where its noise is taken off
+#: Least share of a column's variance that remains after this noise was filtered out.
 COLUMN_COURSE = 0.8
-#: share of an unknown course that a column of another clock must explain, and deviations of what it
-#: explains at other times
+#: A column whose clock may be off is one that explains an unknown process at a shifted time.
+#: CLOCK_SHARE: least share of the process that it explains.
+#: CLOCK_SURE: how many times the root mean square at all other shifts its correlation must be
+#: (both as the inverse hyperbolic tangent).
 CLOCK_SHARE, CLOCK_SURE = 0.5, 4.0
-#: nats of a column's clock over the column as logged, and of a drift over a lag that stays
+#: Nats required of a column's corrected clock over the column as logged, and of a drift of the
+#: clock over a constant lag.
 CLOCK_NATS = 30.0
-#: s: a column's lag below is none
+#: Lag of a column, s, below which its clock has no error, unless it drifts.
 CLOCK_SMALLEST_S = 0.1
 
-# --- data quality: how sure a fact is ------------------------------------------------------------
-#: probability of a name that was counted and compared: a limit, coarse steps, stamps, axes, units
+# --- data quality: confidence of a fact ----------------------------------------------------------
+#: Confidence of a fact that is counted or compared: a limit, coarse steps, time stamps, axes,
+#: units.
 SURE_OF_READINGS = 0.99
-#: the same of lost turns and of louder noise, which are told against noise
+#: The same for lost turns and a higher noise level, which are found against noise.
 SURE_OF_NOISE = 0.98
-#: of samples that came twice;  of a clock's rate against another;  of time that goes back
+#: The same for doubled samples, for the rate of one clock against another, and for time that runs
+#: backwards, in this order.
 SURE_OF_DOUBLED, SURE_OF_CLOCK, SURE_BACKWARDS = 0.95, 0.95, 0.9
 
 # --- data quality: time stamps -------------------------------------------------------------------
-#: share of the samples that are missing, from which on it is said;  chosen
+#: Share of missing samples from which on they are reported.  Source: chosen.
 MISSING_SHARE = 1e-3
-#: of the step, from which on scatter is jitter unless the field says that the steps are as stamped;
-#: below, only where the field says that they are even
+#: Scatter of the stamps as a share of the step.  From this on it is jitter, unless the field shows
+#: that the steps are as stamped; below, only if the field shows that the steps are equal.
 JITTER_SHARE = 0.03
-#: correlation of neighbouring steps that scatter, at most;  source: -1/2 of late stamps
+#: Correlation of neighbouring steps, below which their scatter is jitter.  Source: -1/2 for
+#: delayed stamps.
 JITTER_OPPOSED = -0.25
-#: nats for steps as stamped, against steps of a regular clock, or the reverse
+#: Nats that are needed to show that the steps are as stamped, or that they are equal.
 STAMPED_NATS = 5.0
-#: deviations beyond which a change of the field is not asked for that
+#: Changes of the field that are more standard deviations off than this are left out of that test.
 STAMPED_OUTLIER = 5.0
-#: relative rate between two clocks that is worth a word
+#: Relative rate between two clocks, from which on it is reported.
 CLOCK_RATE = 2e-4
-#: s of a break that is believed whatever the recording's length;  what is left of one that is not
+#: BREAK_BELIEVED_S: length of a gap, s, up to which it is always believed.  A gap that is longer
+#: than this and than all recorded time is a jump of the clock.
+#: BREAK_LEFT_S: length of the gap that replaces such a jump, s.
 BREAK_BELIEVED_S, BREAK_LEFT_S = 60.0, 10.0
-#: share of the samples that are missing, and scatter of the stamps of the step, from which on they
-#: are a finding;  source: by honest stamps they are part of the recording and no difference from
-#: its simulation, which has the same stamps, unless there are so many
+#: Limits from which on a fact about time stamps is a finding and no note.
+#: MISSING_FINDING_SHARE: share of missing samples.
+#: JITTER_FINDING_SHARE: scatter of the stamps as a share of the step.
+#: Source: with correct stamps they are part of the recording and no difference from its simulation,
+#: which has the same stamps, unless there are so many.
 MISSING_FINDING_SHARE, JITTER_FINDING_SHARE = 0.02, 0.05
 
 # --- data quality: lost turns --------------------------------------------------------------------
-#: samples before and after a jump, and how many deviations of a mean a step's turn must have;
-#: source: over more samples there are fewer jumps by chance
+# A turn is lost if a gyro sample is missing and the stamps do not show it: the innovation of the
+# field then jumps by the turn of whole steps.
+#: Averages of the innovation before and after a jump, tried in this order.  Each is a number of
+#: samples, and the turn of one step that it needs, in standard deviations of such a mean.  Source:
+#: over more samples fewer jumps occur by chance.
 LOST_TURN_AVERAGED = ((3, 7.0), (12, 5.0))
-#: steps by which a jump may be off a whole number
+#: Distance of a jump from a whole number of steps, at most, in steps.
 LOST_TURN_NEAR = 0.3
-#: jumps, at least;  source: of 18 untouched recordings and 240 simulations (eight draws of two
-#: worlds) none without lost samples has so many that the nats below hold for
+#: Least number of jumps.  Source: of 18 untouched recordings and 240 simulations (eight draws of
+#: two worlds) none without lost samples has so many that also reach the nats below.
 LOST_TURNS_FEWEST = 3
-#: nats by which they must be whole steps rather than noise;  source: others have 160 and more
+#: Nats by which the jumps are whole steps rather than noise.  Source: true ones have 160 and more.
 LOST_TURNS_NATS = 12.0
-#: and nats that each must have in the mean;  source: a gyro that reads 3 % too little is ahead all
-#: the time, and on a path through a room 13 jumps had 2.4 each; lost turns have 3.8 and more
+#: Nats per jump, in the mean.  Source: a gyro that reads 3 % too little is ahead all the time, and
+#: on a path through a room 13 jumps had 2.4 each; lost turns have 3.8 and more.
 LOST_TURN_EACH_NATS = 3.0
-#: deviations of a mean that no noise jumps by;  part of such a jump that is across the turn, more
-#: than a lost one has
+#: JUMP_CLEAR: size of a jump, in standard deviations of a mean, that no noise reaches.
+#: JUMP_ACROSS: share of such a jump across the turn, beyond which no lost turn causes it.
 JUMP_CLEAR, JUMP_ACROSS = 8.0, 0.5
-#: deviations of a jump that many turns in a row were lost at, which nobody can count
+#: Size of a jump, in standard deviations, beyond which many turns in a row were lost, too many to
+#: count.
 JUMP_LONG = 30.0
-#: nats of one lost turn beyond its share of the rows;  chosen
+#: Nats required of a single lost turn beyond log of the ratio of rows to lost turns.  Source:
+#: chosen.
 LOST_TURN_BEYOND_SHARE_NATS = 3.0
-#: times as many rows as are averaged: else their spread is not known
+#: Least number of rows, in multiples of those averaged: otherwise the spread of the means is not
+#: known.
 LOST_TURN_ROWS = 10
-#: nats that each further step of a gap costs: one in four gaps is longer by one more
+#: Cost, nats, of each further step of a gap: one gap in four is longer by one step.
 LONGER_GAP_NATS = log(4.0)
-#: chi square, of two axes, of a jump's part across the turn that one in 400 is beyond
+#: Largest chi square (two axes) of a jump's part across the turn.  Source: one in 400 is beyond.
 JUMP_ACROSS_CHI2 = 12.0
-#: nats for a step that counts twice;  source: one in twenty does, and must be surer than chance
+#: Cost, nats, of taking back a step that was counted twice.  Source: one in twenty is, and it must
+#: be more certain than chance.
 COUNTED_TWICE_NATS = 6.0
-#: nats that one jump is worth at most: several must say it, not a field that jumps once
+#: Largest evidence, nats, of one jump: several have to agree, not a field that jumps once.
 JUMP_MOST_NATS = 6.0
-#: of a step, in the mean over the rows that have a part of it: what a lost turn has there, and what
-#: it has not
+#: Size of a jump, in steps, in means over rows that contain only a part of it.
+#: LOST_TURN_PART: of a lost turn.
+#: OTHER_PARTS: sizes of jumps that are no lost turns, which have to explain the data less well.
 LOST_TURN_PART, OTHER_PARTS = 0.7, (0.3, 1.4)
-#: nats by which all jumps together must be lost turns, less so many times those backward;  source:
-#: 3.5 is the most of 370 recordings with none lost
+#: LOST_TURNS_TOGETHER_NATS: nats required of all jumps together, for lost turns.
+#: LOST_TURNS_BACKWARD: weight with which the nats of backward jumps are subtracted.
+#: Source: 3.5 is the most of 370 recordings without lost turns.
 LOST_TURNS_TOGETHER_NATS, LOST_TURNS_BACKWARD = 12.0, 3.0
 
 # --- data quality: limits and steps of the numbers -----------------------------------------------
-#: samples at a limit, and their share of all samples, at least;  chosen
+#: Least number and least share of samples at a limit of a sensor.  Source: chosen.
 LIMIT_FEWEST, LIMIT_SHARE = 8, 1e-3
-#: times as many at a limit as at each number just inside it;  chosen
+#: Samples at a limit, in multiples of those at each number just inside it, at least.  Source:
+#: chosen.
 LIMIT_PILED = 6.0
-#: noise levels, and share of the limit, at which it begins to act
+#: Distance from a limit, within which readings are biased and not used: the smaller of so many
+#: noise levels and of this share of the limit.
 LIMIT_MARGIN_NOISE, LIMIT_MARGIN_SHARE = 5.0, 0.02
-#: steps of coarse numbers: as many at the top as one step below are no limit
+#: Steps of coarse numbers: the numbers just inside a limit are taken from at least so far.  Also
+#: the largest usual change of coarse numbers, in steps; a stuck sensor jumps by more.
 LIMIT_TOP_STEPS = 1.5
-#: noise levels that hold a heap of readings at a limit that noise is added to
+#: Width of a cluster of readings at a limit, in noise levels, if noise is added behind the limit.
 LIMIT_HEAP_NOISE = 7.0
-#: sides of axes that end at a shared limit, and how alike they are, of it
+#: LIMIT_SIDES: least number of sides of axes that end at a shared limit.
+#: LIMIT_ALIKE: largest difference of their limits, as a share.
 LIMIT_SIDES, LIMIT_ALIKE = 3, 0.01
-#: share of the readings that differ from all others, where numbers are fine
+#: Least share of distinct readings for numbers to be fine.
 FINE_NUMBERS = 0.5
-#: steps of the numbers over the noise's deviation that matter
+#: Step of the numbers, in standard deviations of the noise, beyond which they are coarse.
 COARSE_STEPS = 2.0
 
 # --- data quality: axes and units ----------------------------------------------------------------
-#: cost of the best frame, of that of no motion, at most;  chosen
+# The cost of a frame (axes and signs of the gyro) is the power of the field's changes that the
+# rates in this frame leave, relative to that without any motion.
+#: Largest cost of the best frame.  Source: chosen.
 FRAME_EXPLAINED = 0.6
-#: times the cost, and nats, by which the frame as recorded must be worse;  chosen
+#: The frame as recorded is wrong if its cost is that many times the best one's, and the best one is
+#: more probable by that many nats.  Source: chosen.
 FRAME_BETTER, FRAME_NATS = 1.5, 20.0
-#: times the cost by which iron that deforms may favour another frame: it is left out there
+#: Ratio of costs up to which the frame as recorded is kept: the fit leaves out soft iron, which may
+#: favour another frame.
 FRAME_BENT = 3.0
-#: rad/s that no vehicle has for long;  factor from that of degrees within which the scale is theirs
+#: FAST_RAD_S: rate, rad/s, that no vehicle has for a tenth of the time.
+#: DEGREES_NEAR: factor from the ratio of degrees to radians, within which the rates are in degrees.
 FAST_RAD_S, DEGREES_NEAR = 3.0, 1.1
-#: factor from a unit's own within which the gyro's scale is that unit
+#: Factor from a unit's own ratio, within which the gyro has that unit.
 SAME_UNIT = 1.2
-#: factor of the gyro's scale beyond which it is another unit
+#: Factor of the gyro's scale, beyond which it has another unit.
 OTHER_UNIT = 2.0
-#: part of the rates' variance that is noise, at most, for a factor that is no unit's to be believed
+#: Largest share of noise in the variance of the rates for which a factor that belongs to no unit is
+#: reported.
 RATES_NOISE_SHARE = 0.05
-#: cost below which a part of a recording is explained;  chosen
+#: Cost below which a part of a recording is explained.  Source: chosen.
 PART_EXPLAINED = 0.1
-#: part of gravity's turns that the gyro may leave, and how many times more by other axes;  chosen
+#: GRAVITY_EXPLAINED: largest cost of the best frame of the gyro relative to the accelerometer, and
+#: of a free linear map between gyro and magnetometer.
+#: GRAVITY_BETTER: least cost of the second-best frame of the accelerometer, relative to the best.
+#: Source: chosen.
 GRAVITY_EXPLAINED, GRAVITY_BETTER = 0.5, 1.5
-#: readings of an ellipsoid, more than;  chosen
+#: A fit of an ellipsoid needs more readings than this.  Source: chosen.
 ELLIPSOID_READINGS = 100
-#: sine of the inclination from which up and down are told
+#: Sine of the inclination that decides whether the field points up or down.
 STEEP = 0.15
-#: degrees of a turn beyond any quarter from which a mount is askew, and no crooked sensor any more
+#: Angle, degrees, from every quarter turn, from which on a sensor is mounted askew; less is a
+#: misalignment.
 ASKEW_DEG = 10.0
-#: of a map that is a turn: its longest axis over its shortest, at most;  deviations by which it is
-#: no quarter
+#: A map is a rotation that is no quarter turn if both hold.
+#: ASKEW_ROUND: its largest singular value over its smallest is at most this.
+#: ASKEW_TOLD: its angle from the quarter turn is at least so many standard deviations.
 ASKEW_ROUND, ASKEW_TOLD = 1.25, 4.0
-#: cosine of a turn's axis to the sensor's, to be called by its name
+#: Cosine between the axis of a rotation and an axis of the sensor, beyond which the text names that
+#: axis.
 ASKEW_ABOUT = 0.97
 
 # --- data quality: stuck, held and doubled readings ----------------------------------------------
-#: part of the field, and noise levels, by which a reading should have moved;  chosen
+#: A reading should certainly have changed if the expected change exceeds both: this share of the
+#: field, and so many noise levels.  Source: chosen.
 STUCK_MOVED_SHARE, STUCK_MOVED_NOISE = 0.1, 8.0
-#: steps of coarse readings by which it should: they repeat themselves where they turn the least
+#: The same in steps of coarse numbers, which repeat where the sensor turns least.
 STUCK_MOVED_STEPS = 20.0
-#: rad that the gyro turned by while a magnetometer never changed, beyond which it is stuck;  chosen
+#: Turn by the gyro, rad, beyond which a magnetometer that never changed is stuck.  Source: chosen.
 STUCK_TURNED_RAD = 0.3
-#: rows that one axis, or the gyro, repeats at least;  chosen
+#: Rows that one axis, or the gyro, has to repeat.  Source: chosen.
 AXIS_STUCK_ROWS = 8
-#: part of what is left of the field's changes which lies as a turn about one axis of the gyro;
-#: noise levels that this is at least;  rad about that axis, by the field, beyond which it is dead
+#: An axis of the gyro that never changes is dead if the field shows a turn about it.
+#: DEAD_AXIS_SHOWN: share of the unexplained changes of the field that this turn explains, at least.
+#: DEAD_AXIS_NOISE: scatter of these changes in noise levels, at least.
+#: DEAD_AXIS_TURNED_RAD: angle of the turn, rad, at least.
 DEAD_AXIS_SHOWN, DEAD_AXIS_NOISE, DEAD_AXIS_TURNED_RAD = 0.5, 3.0, 0.1
-#: usual size of a reading in any unit of a field, from tesla to nanotesla
+#: Range of the usual field, in the recording's unit: it holds for every unit from tesla to
+#: nanotesla.
 FIELD_READINGS = (1e-6, 1e6)
-#: readings so many times the usual field are none;  nor are rates so many times the quickest but
-#: for one in a thousand and beyond what is quick in any unit
+#: IMPOSSIBLE_FIELD: readings beyond so many times the usual field are left out.
+#: IMPOSSIBLE_RATE: so are rates beyond so many times the 99.9 % quantile of the rates, if they also
+#: exceed the next constant.
+#: IMPOSSIBLE_RAD_S: rad/s, a rate that is quick in any unit.
 IMPOSSIBLE_FIELD, IMPOSSIBLE_RATE, IMPOSSIBLE_RAD_S = 100.0, 100.0, 40.0
-#: rows that a stuck reading lasts at least, and so many times as long as a reading usually does
+#: Length of a stuck reading: at least so many rows, and so many times the usual time from one new
+#: reading to the next.
 STUCK_ROWS, STUCK_LONGER = 8, 5.0
-#: noise levels by which the field must have turned during the repetition;  chosen
+#: Noise levels by which the field has to turn during the repetition.  Source: chosen.
 STUCK_TURNED_NOISE = 8.0
-#: s, all together, from which on a stuck magnetometer is a finding;  source: a reading that is held
-#: for less came late and is not used; that is no fault of the sensor, but again and again it is
+#: Total time, s, from which on a stuck magnetometer is a finding.  Source: a reading held for less
+#: was delayed and is not used; that is no fault of the sensor unless it recurs.
 STUCK_FINDING_S = 0.25
-#: steps of coarse numbers by which the field must turn to have a new reading
+#: Steps of coarse numbers by which the field has to turn for a new reading to be expected.
 HELD_STEPS = 3.0
-#: repeated readings, at least;  chosen
+#: Least number of repeated readings.  Source: chosen.
 HELD_REPEATS = 20
-#: share of repeated readings where the sensor turns, of that in all, at least;  source: numbers
-#: that are coarse change there, and a reading that is held does not
+#: Share of repeated readings while the sensor turns, relative to the whole recording, at least.
+#: Source: coarse numbers change while it turns, and a held reading does not.
 HELD_MOVING_SHARE = 0.7
-#: s between readings of a magnetometer: less is a rate of its own;  source: 202 a second in all
-#: recordings of BROAD, rows at 286
+#: Time between new readings of a magnetometer, s, below which it has an ordinary rate of its own.
+#: Source: 202 readings a second in all recordings of BROAD, rows at 286.
 HELD_ORDINARY_S = 0.01
-#: variance of the time from one new reading to the next, in that of chance, at most
+#: Variance of the time from one new reading to the next, relative to chance, below which they come
+#: at regular intervals.
 HELD_CLOCKWORK = 0.3
-#: sums of such times that tell it, at least;  variances that one counts, at most;  chosen
+#: That variance is computed from sums of such times.
+#: HELD_FEWEST_SUMS: least number of sums.
+#: HELD_MOST_VARIANCES: largest square that one sum counts with, in variances of chance.
+#: Source: chosen.
 HELD_FEWEST_SUMS, HELD_MOST_VARIANCES = 15, 4.0
-#: share of the samples that came twice, at least;  chosen
+#: Least share of doubled samples.  Source: chosen.
 DOUBLED_SHARE = 2e-3
-#: times as many as if each sensor repeated for itself;  source: a slow turn makes it nearly two
+#: Least number of doubled samples, in multiples of what chance gives if each sensor repeats by
+#: itself.  Source: with a slow turn it is nearly two.
 DOUBLED_BEYOND_CHANCE = 5.0
-#: noise levels of the gyro beyond which the sensor turns;  chosen
+#: Noise levels of the gyro beyond which the sensor turns.  Source: chosen.
 DOUBLED_TURNING_NOISE = 5.0

@@ -1,9 +1,9 @@
-"""Residuals of real instruments and places as columns that follow attitude, rate or time.
+"""Residuals that real recordings have, as columns that follow attitude, rate or time.
 
-A sensor is not quite linear, a gyro not quite straight, a room differs from place to place, and its
-field from time to time. `diagnose` has these functions in its model of a recording (its ordinary
-remainder), and the estimator tests the residuals of its epochs for them (`model_checks`). Pure
-functions of directions, rates and times; the sizes are those of untouched real recordings.
+Neither sensor is exactly linear, and the field of a room varies with place and time. `diagnose` has
+these functions in its model of a recording (the ordinary remainder), and the estimator tests the
+residuals of its epochs for them (`model_checks`). These are pure functions of directions, rates and
+times. Their sizes were measured on untouched real recordings.
 """
 
 from __future__ import annotations
@@ -13,16 +13,22 @@ import numpy as np
 from ahrsd import so3
 from ahrsd.samples import Array
 
-#: (5, 3, 3) directions of the soft iron that keep its trace: xx - zz, yy - zz, xy, xz, yz
+#: (5, 3, 3) symmetric matrices of trace zero, the changes of soft iron that keep its trace:
+#: xx - zz, yy - zz, xy, xz, yz
 TRACELESS = np.zeros((5, 3, 3))
 TRACELESS[0, [0, 2], [0, 2]] = TRACELESS[1, [1, 2], [1, 2]] = 1.0, -1.0
 for _at, (_i, _j) in enumerate(((0, 1), (0, 2), (1, 2)), start=2):
     TRACELESS[_at, _i, _j] = TRACELESS[_at, _j, _i] = 1.0
 TRACELESS.flags.writeable = False
 
-#: median deviation of a coefficient in untouched recordings, for functions of unit size (`python
-#: tests/benchmarks/diagnosis/bench_remainder_priors.py`; their spread is in `priors.py` of the
-#: diagnosis). Gauss; gauss and rad/s at 1 rad/s; s; gauss
+#: Standard deviation of the coefficients of functions of unit size: medians over untouched real
+#: recordings, measured by `python tests/benchmarks/diagnosis/bench_remainder_priors.py`. How much
+#: recordings differ from the median is in `ahrsd/diagnosis/priors.py: ORDINARY`.
+#: BY_DIRECTION: field by its direction in the sensor (`harmonics`), gauss.
+#: FIELD_BY_RATE: field by the turn rate, gauss at 1 rad/s.
+#: BY_RATE_SQUARED: gyro error by products of the rates, rad/s at 1 rad/s.
+#: BY_CHANGE: field by its rate of change (`change_columns`), a difference of delays, s.
+#: COURSE: field by time, gauss; the standard deviation over the recording.
 BY_DIRECTION, FIELD_BY_RATE, BY_RATE_SQUARED, BY_CHANGE = 2.90e-3, 7.4e-4, 1.42e-3, 1.23e-3
 COURSE = 7.75e-3
 
@@ -46,28 +52,28 @@ def harmonics(field_b: Array) -> Array:
 
 
 def rate_products(rate: Array) -> Array:
-    """(N, 6) products of the rates. Their mean is not subtracted: it is a bias, which the
-    calibration has.
+    """(N, 6) products of the rates. Their mean is not subtracted: it is a gyro bias, which is part
+    of the calibration.
     """
     x, y, z = rate.T
     return np.column_stack([x * x, y * y, z * z, x * y, y * z, z * x])
 
 
 def change_columns(change_b: Array) -> Array:
-    """(N, 3, 8) columns of a matrix on the field's change (N, 3), without the part common to all
-    axes, which is a delay.
+    """(N, 3, 8) columns of a matrix applied to the field's rate of change (N, 3), without the
+    multiple of the identity, which is a delay of all axes.
     """
     matrix = np.concatenate([TRACELESS, so3.skew(np.eye(3))])
     return np.asarray(np.einsum("aij,nj->nia", matrix, change_b))
 
 
 def on_each_axis(functions: Array) -> Array:
-    """(N, 3, 3 k) columns: each of the functions (N, k) along each axis of the sensor."""
+    """(N, 3, 3 k) columns: each of the functions (N, k) acting along each axis of the sensor."""
     flat = np.einsum("nk,ia->nika", functions, np.eye(3))
     return np.asarray(flat.reshape(len(functions), 3, -1))
 
 
 def cosine_modes(time_s: Array, modes: int) -> Array:
-    """(N, modes) cosines of mean square 1 over the times, of 1 half wave, 2 and so on."""
+    """(N, modes) cosines with 1, 2, ... half waves over the times, of mean square 1."""
     since = (time_s - time_s.min()) / max(float(np.ptp(time_s)), 1e-9)
     return np.asarray(np.sqrt(2.0) * np.cos(np.pi * since[:, None] * np.arange(1, modes + 1)))

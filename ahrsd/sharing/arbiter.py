@@ -233,7 +233,7 @@ def _reply_matches(reply: Reply, values: Values) -> bool:
 # -- Order of commands -----------------------------------------------------------------------------
 
 
-PATIENCE_S = 2.5  # the longest time that a known driver waits for an answer
+PATIENCE_S = 2.5  # a command expires in the queue: no known driver waits longer for an answer
 MOST_WAITING = 16  # pending commands of one client
 COUNTED = ("commands", "answered", "refused", "absorbed", "dropped", "unanswered")
 

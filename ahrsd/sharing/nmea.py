@@ -74,9 +74,9 @@ def _format_number(value: float | None) -> str:
 
 
 SETTLED_S = 5.0  # time constant of the correction, and time until the direction is used
-_LOST_S = 15.0  # without a specific force of about 1 g
-_LONGEST_STEP_S = 0.5
-_G_M_S2, _NEAR_G = 9.81, 0.1
+_LOST_S = 15.0  # without a specific force of about 1 g: then the direction is unknown
+_LONGEST_STEP_S = 0.5  # a longer time step restarts the direction
+_G_M_S2, _NEAR_G = 9.81, 0.1  # largest relative difference from 1 g that counts as gravity
 _STEEP = math.sin(math.radians(60.0))  # pitch above which heading is undefined: it turns into roll
 
 

@@ -114,7 +114,7 @@ Action = (
 # -- The outbox ------------------------------------------------------------------------------------
 
 
-JOURNAL_AGAIN_S = 30.0
+JOURNAL_AGAIN_S = 30.0  # wait before a failed write to the journal is repeated
 _RECORDED_BEFORE_ACTION = (
     RecordKind.PREPARED,
     RecordKind.RAM_VERIFIED,

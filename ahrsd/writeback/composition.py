@@ -33,12 +33,12 @@ from ahrsd.samples import Array
 from drivers.vn100.registers import Values, as_stored, register_lines
 
 MAG, GYRO = 23, 84
-MAX_CONDITION: Final = 8.0  # daemon.md 4.3 G9: hard limits, not configurable
+MAX_CONDITION: Final = 8.0  # as gate G9 (docs/reference/gates.md), but not configurable
 MAX_OFFSET_GAUSS: Final = 1.3
 MAX_GYRO_BIAS_RAD_S: Final = 0.175  # 10 deg/s, what the data sheet allows a cold sensor
-HELD_WITHIN_SIGMA: Final = 0.5  # an undetermined direction must stay within this
-HELD_WITHIN: Final = 1e-5  # and for rounding on the wire
-DIGITS: Final = 6
+HELD_WITHIN_SIGMA: Final = 0.5  # largest change along a direction that is undetermined, in sigmas
+HELD_WITHIN: Final = 1e-5  # added to that, for rounding on the wire
+DIGITS: Final = 6  # significant digits of a register's values
 
 _NAMES: Final = (
     *(f"soft iron {pair}" for pair in ("xx", "xy", "xz", "yy", "yz", "zz")),

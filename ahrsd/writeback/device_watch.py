@@ -30,7 +30,7 @@ from ahrsd.writeback.journal_history import CLOCK_RATE, LATENCY_S, Stamp, restar
 # -- Recheck ---------------------------------------------------------------------------------------
 
 
-LEAST_S = 2.0  # minimum between two reads: a poor link must not be filled with them
+LEAST_S = 2.0  # shortest time between two reads: they must not fill a poor link
 
 
 @dataclass(slots=True)
@@ -69,7 +69,7 @@ class Recheck:
 # -- Restarts --------------------------------------------------------------------------------------
 
 
-SETTLE_S: Final = 1.0
+SETTLE_S: Final = 1.0  # after its first time since it was bound, before its time proves a restart
 
 
 class RestartWatch:

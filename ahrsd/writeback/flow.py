@@ -72,7 +72,7 @@ from drivers.vn100.registers import COMPENSATING, Unit, Values, register_lines, 
 # -- Programs on shared ports ----------------------------------------------------------------------
 
 
-SETTLE_S: Final = 2.0
+SETTLE_S: Final = 2.0  # after the acknowledgement, before the device may be asked
 
 
 @dataclass(slots=True)
@@ -134,7 +134,7 @@ class ClientWrite:
 # -- The state machine -----------------------------------------------------------------------------
 
 
-RETRY_SAVE_S = 600.0  # after a save that was not sent
+RETRY_SAVE_S = 600.0  # wait after a save that was not sent
 Answer = tuple[bool, str]  # to an operator: whether it is accepted, and consequences or reason
 COUNTED = frozenset({"trial", "interlock", "operator"})  # causes that count against the values
 _ASIDE = (State.ROLLING_BACK, State.SET_ASIDE, State.PREPARING)  # states that keep `aside`

@@ -28,7 +28,7 @@ from drivers.vn100.registers import Values, same
 
 
 DAY_S: Final = 86400.0
-CLEAR_SIGMAS: Final = 4.0
+CLEAR_SIGMAS: Final = 4.0  # of the estimate: a smaller change contradicts nothing
 VERDICT_AGE_S: Final = 600.0  # a save, like an approval, needs a recent verdict
 
 
@@ -247,10 +247,10 @@ class Stillness:
 
 
 HSI_CONTROL, HSI_APPLIED = 44, 3
-UNEXAMINED_S = 2.0  # samples not yet in the estimate may contain a step
-SAVE_CHECKS_S = 0.5  # checks before VNWNV read every register, without samples meanwhile
-SAVE_CHECKS_PER_ASKING = 6.0  # these checks need four to five times the replies of a look
-ASKINGS = 5  # looks considered: the quickest had no late reply; more would hide a slower line
+UNEXAMINED_S = 2.0  # longest lag of the estimate: samples that are not in it may contain a step
+SAVE_CHECKS_S = 0.5  # always allowed for the checks before VNWNV, which pause the samples
+SAVE_CHECKS_PER_ASKING = 6.0  # or so many quickest looks: the checks need 4 to 5 times the replies
+ASKINGS = 5  # newest looks: the quickest had no late reply; more would hide a line that got slower
 NOT_ARMED = "nobody has armed this run: `ahrsd operator arm`"
 
 

@@ -64,7 +64,7 @@ from ahrsd.samples import Array, SampleBlock
 # -- Verdicts --------------------------------------------------------------------------------------
 
 
-JUMP_NOISE_DEG = 1.0  # of a heading from single samples; no smaller jump is unexpected
+JUMP_NOISE_DEG = 1.0  # noise of a heading from single samples: a smaller jump is never unexpected
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,14 +226,14 @@ def _describe_worsening(metrics: TrialMetrics, factor: float) -> str | None:
 # -- Leftover error --------------------------------------------------------------------------------
 
 
-SHORTEST_S, LONGEST_S = 5.0, 20.0  # of a stretch
-LEFTOVER_STRETCHES = 60  # the newest ones, that are remembered
-LEFTOVER_FEWEST = 6  # minimum for a result
-TURNED = 0.02  # variance of u over a stretch that says something; 0.02 is some 8 deg each way
-_WELL_TURNED = 0.15  # enough to end the segment early
-_FEWEST_ROWS = 20
+SHORTEST_S, LONGEST_S = 5.0, 20.0  # lengths of a segment
+LEFTOVER_STRETCHES = 60  # only the newest segments are kept
+LEFTOVER_FEWEST = 6  # segments that a result needs
+TURNED = 0.02  # variance of u that a segment needs: a turn of about 8 deg to each side
+_WELL_TURNED = 0.15  # variance of u at which a segment ends before its longest time
+_FEWEST_ROWS = 20  # fields that a segment needs
 _BELIEF = 0.05  # prior sigma of d and S, as a share of the field
-_LEAST_SIGMA = 1e-7  # of Q: rounding errors, if there is no noise
+_LEAST_SIGMA = 1e-7  # least sigma of Q, for rounding errors if there is no noise
 _UPPER = np.triu_indices(3)
 
 
@@ -322,9 +322,9 @@ def _fit_leftover(stretches: list[_Stretch]) -> tuple[Array, Array]:
 # -- Steadiness of the carried field ---------------------------------------------------------------
 
 
-STRETCH_S = 10.0
-CARRIED_STRETCHES = 6  # that are remembered: a minute
-_CARRIED_FEWEST = 10  # samples of a stretch that count
+STRETCH_S = 10.0  # length of a segment
+CARRIED_STRETCHES = 6  # only the newest segments are kept: one minute
+_CARRIED_FEWEST = 10  # usable samples that a segment needs
 
 
 class CarriedField:
@@ -376,12 +376,12 @@ class CarriedField:
 # -- Live figures ----------------------------------------------------------------------------------
 
 
-_WINDOW_S = 60.0
-_JUMP_S = 3.0
-_PIECE_S = 0.25  # one heading each; a vehicle turns by little in it
-_LEVEL = np.cos(np.radians(15.0))
-_OLD_GYRO = 2  # of the pairs that are carried: the new magnetometer's register, the old gyro's
-_SPACING_S = 0.1  # samples closer than this add nothing to a spread
+_WINDOW_S = 60.0  # newest samples from which the spread of the field is computed
+_JUMP_S = 3.0  # samples, near level, from which the heading jump is computed
+_PIECE_S = 0.25  # samples averaged to one heading: a vehicle turns by little in this time
+_LEVEL = np.cos(np.radians(15.0))  # least vertical component of the direction down, near level
+_OLD_GYRO = 2  # index of the pair with the new magnetometer register and the old gyro register
+_SPACING_S = 0.1  # samples closer in time than this add nothing to a spread
 
 
 class LiveTrial:
