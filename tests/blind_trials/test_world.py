@@ -209,6 +209,7 @@ def test_every_effect_of_the_contract_is_in_the_ring():
     assert listed == named
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes_and_no_label(tmp_path):
     """Once as a whole, once in parts, as `challenge make` has it made by several processes."""
     for folder, parts in (("a", (None,)), ("b", ((1, 2), (0, 1)))):

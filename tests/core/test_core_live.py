@@ -174,6 +174,7 @@ def test_through_a_whole_write_back_with_approval(tmp_path):
     assert kinds == ["PREPARED", "RAM_VERIFIED", "PROVEN", "ROLLBACK", "ROLLED_BACK"]
 
 
+@pytest.mark.slow
 def test_through_replugs_resets_and_damage(tmp_path):
     faults = ("unplug=0@20+2", "reset@45", "bit_flip=0.0005@60+5", "byte_drop=0.0005@70+5")
     scene = Setup("rov", seed=2, output="binary", rate_hz=50, baud=BAUD, faults=faults)

@@ -192,6 +192,7 @@ def test_an_output_below_a_file_is_one_line(tmp_path, run, capsys):
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_demo_without_enough_time_says_no(tmp_path, run, capsys):
     assert run("demo", "--output", tmp_path, "--seconds", "60", "--seed", "3") == 1
     out = capsys.readouterr().out

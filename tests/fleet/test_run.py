@@ -143,6 +143,7 @@ def test_a_file_that_was_mended_has_a_row_of_its_own(archive, tmp_path):
         assert asked.counts()["recordings"] == 2
 
 
+@pytest.mark.slow
 def test_options_are_in_the_key_and_labels_come_from_folders(archive, tmp_path):
     deep = tmp_path / "archive" / "harbour" / "SN100032"
     deep.mkdir(parents=True)

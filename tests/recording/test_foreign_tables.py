@@ -610,6 +610,7 @@ def test_a_bomb_without_a_message_is_given_up(tmp_path):
     refused(limited("calibrate", bomb, gigabytes=1.5), "no VN-100 message in 16", "bytes")
 
 
+@pytest.mark.slow
 def test_parquet_that_unpacks_to_far_too_much_ends_in_one_line(tmp_path):
     names = [f"c{k}" for k in range(90)]
     schema = pyarrow.schema([(name, pyarrow.float64()) for name in (*REQUIRED, *names)])

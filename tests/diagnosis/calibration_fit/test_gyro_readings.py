@@ -102,6 +102,7 @@ def test_real_motion_is_shaken(name: str) -> None:
     assert is_shaken(recorded(name))
 
 
+@pytest.mark.slow
 def test_what_else_is_wrong_is_not_taken_for_quiet() -> None:
     """Three minutes of a motor's field of 50 mG: the noise of the gyro is not found beside it."""
     track = shaking(4)

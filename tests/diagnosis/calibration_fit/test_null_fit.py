@@ -165,6 +165,7 @@ def test_short_interrupted_and_holed_tracks_are_fitted() -> None:
         assert np.isfinite(fit.covariance).all()
 
 
+@pytest.mark.slow
 def test_a_gyro_that_fits_nothing_leaves_a_finite_answer() -> None:
     track = track_of(experiment(samples=1200))
     for gyro in (np.zeros((1200, 3)), track.gyro_b_rad_s * 2000):

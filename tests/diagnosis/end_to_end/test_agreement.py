@@ -48,9 +48,8 @@ def _agrees(found: Diagnosis) -> None:
     assert found.p_value > 1e-3
 
 
-@pytest.mark.parametrize(
-    "kind", [PLAIN[0], *(pytest.param(kind, marks=pytest.mark.slow) for kind in PLAIN[1:])]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", PLAIN)
 def test_an_exact_reference_attitude_is_no_mismatch_and_changes_nothing(
     kind: tuple[str, str, int, float, float],
 ) -> None:

@@ -17,6 +17,7 @@ def quiet() -> Track:
     return replace(made(Trial(seed=8, samples=6000)).track, covariates={})
 
 
+@pytest.mark.slow
 def test_bursts_are_located_and_not_named(quiet: Track) -> None:
     times = np.array([31.0, 62.0, 75.5, 120.0, 171.0, 203.0])
     on = np.any(np.abs(quiet.time_s[:, None] - times) < 0.6, axis=1)[:, None]

@@ -34,6 +34,7 @@ def jumped(made, track):
     return replace(track, mag_b_gauss=track.mag_b_gauss + later * read)
 
 
+@pytest.mark.slow
 def test_a_field_that_jumps_has_its_name_and_its_time(jumped):
     """For some seconds it looks like a field of another strength."""
     found = diagnose(jumped)

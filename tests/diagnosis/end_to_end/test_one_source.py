@@ -27,9 +27,8 @@ def _found(added: Array, current: Array, speed: Array) -> Diagnosis:
     return diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added).with_columns(columns))
 
 
-@pytest.mark.parametrize(
-    "seed", [3, *(pytest.param(one, marks=pytest.mark.slow) for one in (4, 5, 6, 7, 8))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 4, 5, 6, 7, 8])
 def test_columns_that_go_with_an_unlogged_source_in_part_are_no_names_of_it(seed: int) -> None:
     """What they draw of it and what is left have one direction: it was a field of the speed."""
     rng = np.random.default_rng(seed)

@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
+@pytest.mark.slow
 def test_wild_readings_are_no_object_and_no_step():
     track = made(Trial(9, samples=4_500, rate_hz=25.0)).track
     rng = np.random.default_rng(4)

@@ -33,6 +33,7 @@ def test_unlogged_pulses_are_named(quiet: Track) -> None:
     assert abs(found[0].parameters[0].value - 2e-3) < 5e-4
 
 
+@pytest.mark.slow
 def test_pulses_that_swell_and_fade_are_one_name() -> None:
     """Folded by the working rate they look like what real recordings leave.
 

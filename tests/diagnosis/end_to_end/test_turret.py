@@ -24,7 +24,8 @@ def turret(gauss: float) -> Track:
     return replace(trial.track, mag_b_gauss=trial.track.mag_b_gauss + gauss * field_b)
 
 
-@pytest.mark.parametrize("library", [{}, pytest.param(EFFECTS, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("library", [{}, EFFECTS])
 def test_a_weak_turret_is_unknown_and_on_the_vehicle(library) -> None:
     """Of 60 uG, 29 nats: courses in time and forms of the library's own see nothing."""
     found = diagnose(turret(6e-5), library=library)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from mismatch_trials import Trial, made
 
 from ahrsd.diagnosis.inference.diagnose import diagnose
@@ -11,6 +12,7 @@ from ahrsd.simulation import simulate
 PLACES = ("position_north_m", "position_east_m", "position_down_m")
 
 
+@pytest.mark.slow
 def test_a_field_along_a_way_that_nobody_logged_is_no_set_of_names():
     """Three gains of an on-board calibration followed it to a quarter of a hundredth."""
     trial = made(Trial(2, (), PLACES, scenario="lam", samples=4000))

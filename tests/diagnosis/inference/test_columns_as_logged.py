@@ -38,6 +38,7 @@ def driven():
     )
 
 
+@pytest.mark.slow
 def test_a_quick_current_that_was_held_is_drawn_straight_where_the_field_follows_it():
     track = track_of(experiment("wam", motion="rov", seed=4, samples=3000, rate_hz=RATE_HZ))
     course = gaussian_filter1d(np.random.default_rng(5).normal(size=3000), 8.0)

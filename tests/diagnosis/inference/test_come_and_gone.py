@@ -20,6 +20,7 @@ def _with_magnet(track: Track, begin_s: float, end_s: float) -> Track:
     return replace(track, mag_b_gauss=track.mag_b_gauss + np.outer(there, MAGNET_GAUSS))
 
 
+@pytest.mark.slow
 def test_a_magnet_that_is_put_on_and_taken_off_is_one_step_with_its_end():
     track = track_of(experiment("wam", seed=14, samples=2000))
     begin_s, end_s = float(track.time_s[600]), float(track.time_s[1300])

@@ -128,6 +128,7 @@ def test_a_source_that_is_louder_for_a_while_is_no_louder_noise():
     assert abs(np.array(found.unexplained.where.direction) @ AXIS) > 0.95
 
 
+@pytest.mark.slow
 def test_iron_on_a_joint_that_nobody_logged_is_unknown_on_the_sensor():
     track = track_of(experiment("wam", seed=14, samples=3500, sigma_mag=5e-4))
     angle = coloured(np.random.default_rng(5), (len(track), 1), (0.1, 0.4))  # to and fro in seconds

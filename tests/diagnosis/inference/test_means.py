@@ -27,9 +27,10 @@ def driven(seed: int, memory_s: float, mean_s: float):
     return replace(track, mag_b_gauss=mag, covariates={"motor_current_a": logged})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("memory_s", "mean_s"),
-    [(0.5, 0.4), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((6.0, 0.2), (2.0, 0.4)))],
+    [(0.5, 0.4), (6.0, 0.2), (2.0, 0.4)],
 )
 def test_it_is_one_name(memory_s: float, mean_s: float):
     found = diagnose(driven(16, memory_s, mean_s))

@@ -115,6 +115,7 @@ def runs_once(begin_s: float, end_s: float, gauss: float):
     return replace(track, mag_b_gauss=track.mag_b_gauss + added), added
 
 
+@pytest.mark.slow
 def test_what_runs_for_seven_seconds_once_is_unknown_where_it_does():
     """A single spell is a source."""
     track, _ = runs_once(56.0, 63.0, 0.005)

@@ -79,6 +79,7 @@ def test_a_column_that_is_missing_is_named():
         remove_terms(track_of(made), true_model(made), [term])
 
 
+@pytest.mark.slow
 def test_calibrate_with_the_model_gives_the_calibration_without_the_effect(run, tmp_path, capsys):
     path, model_path = tmp_path / "x.csv", tmp_path / "model.json"
     wanted = ("--motion", "rov", "--seconds", 200, "--seed", 4)
