@@ -46,6 +46,7 @@ def test_a_slow_low_pass_is_one_name_and_leaves_nothing_for_others():
     assert found.findings[0].parameters[0].value == pytest.approx(0.09, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_two_effects_are_both_named_and_nothing_else():
     found, one = answer(("hard_iron_step", 1.0), ("gyro_scale", 1.0), samples=5000)
     assert sorted(x.effect for x in found.findings) == ["gyro_scale", "hard_iron_step"]
