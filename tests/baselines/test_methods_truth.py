@@ -161,6 +161,7 @@ def test_noisy_wam_is_as_published(method, derivative, wam_runs):
             assert limits[0] < np.mean(column) < limits[1]
 
 
+@pytest.mark.slow
 def test_the_thesis_incremental_gyro_bias_is_half_of_the_truth(wam_runs):
     """[R] Table 5.1: (1.775, -2.136, 0.852) mrad/s of a true (4, -5, 2)."""
     found = [1e3 * run("magical-ifg", data).gyro_bias_rad_s for data in wam_runs]

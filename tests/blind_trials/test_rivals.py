@@ -38,6 +38,7 @@ def problem(coefficients, noise=1.0, seed=0):
     )
 
 
+@pytest.mark.slow
 def test_the_true_column_is_among_the_first(strong, tmp_path):
     table = read_table(strong)
     order = Order("single", (("motor_current_field", 1.0),), motion="wam")
@@ -71,6 +72,7 @@ def test_a_sensor_at_rest_gets_no_names(tmp_path):
     assert (said["mismatch"], said["findings"]) == (False, [])
 
 
+@pytest.mark.slow
 def test_a_package_that_is_missing_is_one_line(strong, monkeypatch):
     monkeypatch.setitem(sys.modules, "pysindy", None)
     monkeypatch.setitem(sys.modules, "pysindy.optimizers", None)
@@ -111,6 +113,7 @@ def test_change_points_are_those_of_the_residual():
     assert rivals.change_points_s(stepped) == pytest.approx([120], abs=2)
 
 
+@pytest.mark.slow
 def test_the_answer_has_the_contracts_form(tmp_path, strong, monkeypatch):
     monkeypatch.setattr(
         rivals, "_TOOLS", {"stlsq": lambda p: rivals._answer([("gyro_scale", 0.5, [1.0, 9.0])])}

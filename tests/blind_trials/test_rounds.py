@@ -322,6 +322,7 @@ def test_a_key_among_the_cases_and_a_folder_in_use_are_refused(tmp_path):
         making.make(tmp_path / "r", tmp_path / "key.json", "nulls", 1)
 
 
+@pytest.mark.slow
 def test_the_command_makes_runs_and_scores(tmp_path):
     """End to end with the real generator and a tool that finds nothing."""
     folder, key_path = tmp_path / "nulls", tmp_path / "keys" / "key.json"

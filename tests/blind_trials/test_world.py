@@ -174,7 +174,8 @@ def test_the_ideal_observer_agrees_with_a_dense_solution():
     assert np.allclose(gram(Z), flat.T @ np.linalg.solve(noise, flat), rtol=1e-6)
 
 
-@pytest.mark.parametrize("most", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("most", [1, 3])
 def test_unidentifiable_cases_cannot_be_seen_and_others_can(most):
     for n, (key, name, warm) in enumerate(rings.UNIDENTIFIABLE[1 : 1 + most]):
         order = cases.Order("unidentifiable", ((key, 2.0),), motion=name, warm_up_c=warm)
@@ -235,6 +236,7 @@ def test_same_seed_same_bytes_and_no_label(tmp_path):
             assert set(spec) <= {"rate_hz", "sigma_mag_gauss", "sigma_gyro_rad_s", "field_gauss"}
 
 
+@pytest.mark.slow
 def test_a_withheld_column_is_not_there():
     order = cases.Order("withheld", (("motor_current_field", 2.0),), withheld="motor")
     made = cases.make_case(order, [4, 4])

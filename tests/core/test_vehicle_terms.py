@@ -113,6 +113,7 @@ def test_without_a_model_the_block_is_the_same_object():
     assert said == ["the model of the terms is no model: its schema must be 'ahrsd.model/1'"]
 
 
+@pytest.mark.slow
 def test_the_core_calibrates_as_if_the_current_were_off():
     made = simulate(ScenarioSettings("mam", "rov", seed=4, samples=5000, rate_hz=25.0))
     s, host_s = made.samples, made.samples.time_s + 100.0

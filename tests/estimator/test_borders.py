@@ -55,6 +55,7 @@ def _asked(block, every_s=10.0):
     return out
 
 
+@pytest.mark.slow
 def test_noise_and_sigma_of_a_stream_do_not_grow_with_epochs_that_are_linearised_once():
     found = _asked(_stream(300.0, ((120.0, 170.0),), seed=5))
     late = [e for e in found if e is not None and e.duration_s > 100.0]

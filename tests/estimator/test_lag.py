@@ -69,7 +69,8 @@ def test_where_there_is_no_lag_none_is_found(bench, seeds):
     assert lags == [0.0] * 2 * seeds
 
 
-@pytest.mark.parametrize("factor", [pytest.param(0.75, marks=pytest.mark.slow), 1.1])
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.75, 1.1])
 def test_times_or_units_that_are_wrong_are_no_answer(bench, factor):
     run = bench.simulate("mam", "rov", 2, samples=3500)
     gyro = run.block.gyro_b_rad_s * factor

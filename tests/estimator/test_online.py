@@ -60,15 +60,16 @@ def same(a, b):
 # -- accuracy and honesty ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "motion"),
     [
         ("mam", "rov"),
-        pytest.param("lam", "slow", marks=pytest.mark.slow),
-        pytest.param("lam", "rov", marks=pytest.mark.slow),
-        pytest.param("mam", "slow", marks=pytest.mark.slow),
-        pytest.param("wam", "rov", marks=pytest.mark.slow),
-        pytest.param("wam", "slow", marks=pytest.mark.slow),
+        ("lam", "slow"),
+        ("lam", "rov"),
+        ("mam", "slow"),
+        ("wam", "rov"),
+        ("wam", "slow"),
     ],
 )
 def test_errors_are_of_the_size_of_the_bound_and_of_the_covariance(kind, motion):
@@ -161,7 +162,8 @@ def _tilted_over_level(run, estimate):
     return estimate.heading_sigma_deg / level
 
 
-@pytest.mark.parametrize("runs", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("runs", [2, 4])
 def test_a_planar_turn_is_not_converged_and_its_sigmas_say_so(runs):
     """What is known to no better than half of what is believed is named: the vertical, in most."""
     named = 0

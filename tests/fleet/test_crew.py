@@ -119,7 +119,8 @@ def slowly(task: GoneThere) -> int:
     return task.number
 
 
-@pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("jobs", [1, 2])
 def test_a_task_that_no_process_can_take_is_lost_and_the_others_go_on(jobs):
     tasks = [GoneThere(number, os.getpid() if number == 1 else 0) for number in range(5)]
     limits = Limits(begin_s=8.0)

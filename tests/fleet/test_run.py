@@ -122,6 +122,7 @@ def test_again_there_is_nothing_to_do_but_copies_and_what_is_new(archive, out):
     assert rows(out) == before
 
 
+@pytest.mark.slow
 def test_failures_are_done_again_when_asked(archive, out):
     before = rows(out)
     done = ran(archive, out, again=True)
@@ -132,6 +133,7 @@ def test_failures_are_done_again_when_asked(archive, out):
     assert after["dive_20260701_0.parquet"] == before["dive_20260701_0.parquet"]
 
 
+@pytest.mark.slow
 def test_a_file_that_was_mended_has_a_row_of_its_own(archive, tmp_path):
     small = tmp_path / "archive"
     small.mkdir()
@@ -177,6 +179,7 @@ def test_through_fsspec_the_rows_are_the_same(archive, out, tmp_path):
     assert found["recording"].startswith("file://")
 
 
+@pytest.mark.slow
 def test_logs_of_autopilots_are_recordings_too(tmp_path):
     pytest.importorskip("pyulog", reason="pyulog (the extra px4) is not installed")
     (tmp_path / "archive").mkdir()
@@ -195,6 +198,7 @@ def test_a_run_refuses_a_place_where_another_is_at_work(archive, tmp_path):
         ran(archive, tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_what_a_recording_has_to_say_is_in_its_row_and_not_between_the_lines(tmp_path, capfd):
     """The gyro's x axis is negated, which the core tells while it reads, and the verdict."""
     made = simulate(ScenarioSettings("wam", "slow", seed=1, samples=3000))

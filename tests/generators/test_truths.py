@@ -60,6 +60,7 @@ def test_the_word_for_an_answer(case: dict, answer: dict, word: str) -> None:
     assert judge(truth_of(case), read_answer(answer)).word == word
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", sorted(WORLDS))
 def test_a_written_case_has_its_table_its_truth_and_a_spec_or_none(
     world: str, tmp_path: Path

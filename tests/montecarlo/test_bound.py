@@ -119,6 +119,7 @@ def quick(samples=60):
     return measured("quick", Iron(), matrices, rate, t, (SM, SG), (rng, rng))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("full", [False, True], ids=["symmetric", "full 3x3"])
 def test_equals_a_dense_fisher_matrix(full):
     experiment = quick()
@@ -202,6 +203,7 @@ PUBLISHED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "motion"),
     [

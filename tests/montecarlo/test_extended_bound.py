@@ -129,6 +129,7 @@ def besides(experiment, kind, around):
     return trajectory, nuisances.together(*parts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "around"),
     [
@@ -153,6 +154,7 @@ def test_equals_a_dense_fisher_matrix_with_what_is_known_of_the_imperfections(ki
     )
 
 
+@pytest.mark.slow
 def test_answers_scatter_as_it_says_where_the_imperfections_are_drawn():
     """Most probable answers to readings of which everything was drawn: noise and imperfections.
 

@@ -41,6 +41,7 @@ def without_time(records):
     return json.loads(text)
 
 
+@pytest.mark.slow
 def test_a_run_says_everything_and_its_seed_decides_it():
     one = run_one(SHORT, 3)
     assert [(r["method"], r["at_s"]) for r in one["results"]] == [
@@ -86,6 +87,7 @@ def test_a_seed_that_was_lost_is_a_failure_of_every_method_and_is_run_again(tmp_
     assert all(result["failure"] is None for result in again[1]["results"])
 
 
+@pytest.mark.slow
 def test_the_command_on_processes_says_what_this_process_says(run, tmp_path):
     """All seeds by two processes; then a limit that none can meet."""
     path, words = tmp_path / "m.json", ("--motion", "rov", "--runs", 3, "--at", "40", "--jobs", 2)
@@ -251,6 +253,7 @@ def test_the_bound_of_an_ordinary_instrument_stands_beside_the_plain_one(run, tm
     )
 
 
+@pytest.mark.slow
 def test_sweeps_over_noise_and_hard_iron(run, tmp_path):
     path = tmp_path / "m.json"
     arguments = ("--motion", "rov", "--runs", 3, "--at", "60", "--jobs", 1, "--method", "ellipsoid")

@@ -190,6 +190,7 @@ def test_tables_replay(recordings, name):
     assert any("a table says nothing of registers" in w for w in summary["calibration"]["warnings"])
 
 
+@pytest.mark.slow
 def test_a_replay_costs_little_more_than_its_parsing(recordings):
     """Measured: 12 times the calls of parsing alone, 300 a message.
 

@@ -140,6 +140,7 @@ def test_too_few_samples(tmp_path, seed, n):
     refused_by(result, ["magical-bfg", "magical-ifg", "magyc-bfg", "magyc-ifg"])
 
 
+@pytest.mark.slow
 @settings(FEW, max_examples=2)
 @given(seed=seeds)
 def test_a_planar_turn(tmp_path, seed):
@@ -163,6 +164,7 @@ def test_the_field_in_another_unit(tmp_path, seed, factor):
     assert "convert it to gauss" in said
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=seeds, factor=st.sampled_from([1e3, 1e-3, 180 / np.pi, np.pi / 180]))
 def test_the_rate_in_another_unit(tmp_path, seed, factor):

@@ -590,6 +590,7 @@ def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
         assert word in shown
 
 
+@pytest.mark.slow
 def test_a_gzip_that_unpacks_to_far_too_much_ends_in_one_line(tmp_path):
     bomb = zeros(tmp_path / "bomb.csv.gz")
     refused(limited("calibrate", bomb, gigabytes=1.5), "has no line end within its first")
@@ -637,6 +638,7 @@ def test_a_span_of_years_is_refused(tmp_path):
         calibrated_times(stamps, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_file_with_a_name_that_is_no_text(tmp_path):
     name = os.fsencode(str(tmp_path)) + b"/\xff\x1b[31mred.csv"
     Path(os.fsdecode(name)).write_text(PLAIN)

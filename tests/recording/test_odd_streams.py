@@ -55,6 +55,7 @@ STAMPS = {
 TOLD = ("epoch", "counts", "csv")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [pytest.param(kind, marks=() if kind in TOLD else pytest.mark.slow) for kind in STAMPS],
@@ -97,6 +98,7 @@ CHANGED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "name"),
     [

@@ -257,6 +257,7 @@ def test_blanks_around_names_are_none_of_them(tmp_path):
     assert len(read_table(path).rows) > 0
 
 
+@pytest.mark.slow
 def test_every_real_table_loads(recordings):
     paths = [
         path

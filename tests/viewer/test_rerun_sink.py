@@ -425,6 +425,7 @@ def test_a_closed_sink_leaves_a_complete_file(tmp_path):
     sink.push(Noted(0.0, 0.0, "info", "too late"), 0.0)  # ignored, not an error
 
 
+@pytest.mark.slow
 def test_a_replay_that_is_faster_than_rerun_loses_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr("ahrsd.viewer.sink.WAIT_S", 120.0)  # of a busy machine
     with opened(tmp_path / "run.rrd", queue_batches=4, wait=True) as sink:
@@ -546,6 +547,7 @@ def test_a_nearly_full_disk_is_left_to_those_who_need_it(small_disk):
     assert list(small_disk.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_parts_change_at_their_size_and_the_oldest_go(tmp_path):
     limits = RerunLimits(part_bytes=200_000, quota_bytes=600_000, reserve_bytes=0)
     path = tmp_path / "run.rrd"

@@ -84,14 +84,15 @@ def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> 
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_fits")
 @pytest.mark.parametrize(
     ("nats", "is_told", "chance", "asked"),
     [
         (30.0, False, 48, 1),
-        pytest.param(100.0, True, 48, 5, marks=pytest.mark.slow),
-        pytest.param(300.0, True, 194, 3, marks=pytest.mark.slow),
-        pytest.param(2000.0, True, 519, 2, marks=pytest.mark.slow),
+        (100.0, True, 48, 5),
+        (300.0, True, 194, 3),
+        (2000.0, True, 519, 2),
     ],
 )
 def test_what_simulations_show_is_said_beside_what_is_told(

@@ -47,6 +47,7 @@ def test_without_a_thermometer_the_same_bias_drifts():
     )
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_turns_a_little_on_its_straight_course_does_not_stand():
     passed = np.arange(COUNT) / RATE_HZ
     rate = 1e-3 * np.cos(2 * np.pi * passed / 290.0)[:, None] * np.array([1.0, -0.6, 0.8])

@@ -30,6 +30,7 @@ def _difference(fit: NullFit, truth: NullModel) -> Array:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "motion", "sigma_gyro"), [("mam", "rov", 5e-4), ("wam", "slow", 5e-3)]
 )

@@ -25,7 +25,8 @@ def quiet() -> Track:
     return replace(made(Trial(seed=8)).track, covariates={})
 
 
-@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 3])
 def test_noise_that_forgets_in_two_seconds_is_no_unknown(seed: int) -> None:
     quiet = replace(made(Trial(seed=8, samples=6000)).track, covariates={})
     noise = 5e-4 * slow(np.random.default_rng(seed), len(quiet), 25.0, 2.0)

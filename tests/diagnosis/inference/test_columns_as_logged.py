@@ -49,12 +49,14 @@ def test_a_quick_current_that_was_held_is_drawn_straight_where_the_field_follows
     assert said in notes_at_the_richest_model(track)
 
 
+@pytest.mark.slow
 def test_a_current_that_was_logged_in_every_row_stays_as_it_is(driven):
     current = driven.track.covariates["motor_current_a"]
     track = driven.track.with_columns({"motor_current_a": current})
     assert not any("motor_current_a" in said for said in notes_at_the_richest_model(track))
 
 
+@pytest.mark.slow
 def test_a_column_that_the_field_does_not_follow_stays_as_it_was_held(driven):
     """A speed of another trip, and the readings without the motor's field."""
     speed = 1.2 + 0.25 * gaussian_filter1d(np.random.default_rng(3).normal(size=4_000), 40.0)

@@ -126,6 +126,7 @@ def test_a_gyro_bias_that_walks_is_a_drift_whatever_its_course():
     assert np.linalg.norm(told - truth) < 0.6 * np.linalg.norm(truth)
 
 
+@pytest.mark.slow
 def test_pulses_that_averaging_loses_are_named_at_the_recorded_rate():
     track = track_of(experiment("wam", seed=9, samples=2000))
     since_s = track.time_s - track.time_s[0]
@@ -164,6 +165,7 @@ def test_a_recording_with_facts_that_stop_is_told_them_and_nothing_else():
     assert found.mismatch
 
 
+@pytest.mark.slow
 def test_half_a_step_of_delay_is_told_with_what_would_tell_it_from_a_lag():
     size = {"samples": 1400, "rate_hz": 12.5}
     made_one = made(Trial(seed=31, effects=(("gyro_integration", 1.0),), **size))
@@ -256,6 +258,7 @@ def test_a_name_whose_coefficient_varies_by_as_much_as_itself_is_not_told(varies
     assert abs(np.corrcoef(source, put)[0, 1]) > 0.9
 
 
+@pytest.mark.slow
 def test_a_line_that_wanders_in_frequency_is_no_alternating_field_but_unknown():
     track = track_of(experiment("wam", seed=9, samples=2000))
     since_s = track.time_s - track.time_s[0]

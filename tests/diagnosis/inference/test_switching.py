@@ -79,6 +79,7 @@ def test_a_spell_s_slopes_are_those_of_differences():
     np.testing.assert_array_equal(law.log_prior(psi)[1], [0.0, 0.0])
 
 
+@pytest.mark.slow
 def test_spells_are_found_to_a_second_and_what_was_tried_is_not_kept():
     track = replace(track_of(experiment("wam", seed=22, samples=3000)), accel_b_m_s2=None)
     since_s = track.time_s - track.time_s[0]
@@ -129,6 +130,7 @@ def test_what_runs_for_seven_seconds_once_is_unknown_where_it_does():
     np.testing.assert_allclose([told_s.min(), told_s.max()], [56.0, 63.0], atol=1.0)
 
 
+@pytest.mark.slow
 def test_a_short_spell_has_the_size_and_direction_that_it_has():
     """It is drawn within itself: moments of the whole recording would lie beside it."""
     track, added = runs_once(60.0, 62.0, 0.01)
