@@ -66,7 +66,9 @@ def search_until_stable(
         source = _find_directed_source(all_sets, answer.best)
         if members.effects_of(all_sets, answer.best) == before and not (intervals or other_noise):
             break
-    return _search_without_movement(ModelSearchResult(answer, all_sets, space, source), library)
+    result = _search_without_movement(ModelSearchResult(answer, all_sets, space, source), library)
+    result.all_sets.made.release_candidates()
+    return result
 
 
 def _find_directed_source(all_sets: Hypotheses, best: Hypothesis) -> DirectedNoise | None:

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ahrsd.diagnosis.model import Columns, Context
+from ahrsd.diagnosis.model import Context
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
@@ -68,16 +68,6 @@ def segments_between(time_s: Array, edges_s: Array) -> Segments:
     index[time_s == edges_s[-1]] = len(edges_s) - 2
     index[index >= len(edges_s) - 1] = -1
     return Segments(np.asarray(edges_s, float), index)
-
-
-def frame_columns(context: Context, frame: Frame, cut: Segments) -> Columns:
-    """3 columns per segment, segment-major."""
-    basis = unit_columns(context, frame)
-    out = np.zeros((len(cut.index), 3, len(cut), 3))
-    inside = np.flatnonzero(cut.index >= 0)
-    out[inside, :, cut.index[inside], :] = basis[inside]
-    flat = out.reshape(len(cut.index), 3, -1)
-    return Columns(gyro=flat) if frame == "gyro" else Columns(mag=flat)
 
 
 def unit_columns(context: Context, frame: Frame) -> Array:

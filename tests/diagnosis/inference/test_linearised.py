@@ -212,3 +212,28 @@ def test_what_is_made_of_the_field_row_by_row_does_not_follow_that_rows_reading(
     mag[row] += off_gauss
     moved = columns(replace(problem.track, mag_b_gauss=mag)) - columns(problem.track)
     assert np.max(np.abs(moved)) < 0.01 * off_gauss
+
+
+def test_tentative_components_are_forgotten_beyond_a_limit_and_can_be_added_again(bare):
+    """The rows of 4,000 columns are more numbers than the limit, those of 2,000 are not."""
+    made, rng = bare.base.made.copy(), np.random.default_rng(1)
+    width, samples = 2000, len(made.context.track)
+    law = FixedLaw(np.ones(width))
+    first, second, third = (
+        Component(key, "sensor", Columns(mag=rng.normal(size=(samples, 3, width))), law)
+        for key in ("first", "second", "third")
+    )
+    made.add_tentatively([first])
+    product = made.component_products(CALIBRATION, "first").copy()
+    made.keep([])
+    assert "first" in made.seen  # there is room
+    made.add_tentatively([second, third])
+    made.keep(["second"])
+    assert "second" in made.seen
+    assert made.seen.keys().isdisjoint({"first", "third"})
+    assert np.isfinite(made.component_products(CALIBRATION, "second")).all()
+    made.add([first])
+    np.testing.assert_array_equal(made.component_products(CALIBRATION, "first"), product)
+    made.add_tentatively([third])
+    made.keep([])
+    assert {"first", "second"} <= made.seen.keys()  # one was added for good, the other is kept

@@ -174,6 +174,16 @@ class Linearised:
             pair: found for pair, found in self.blocks.items() if numbers.isdisjoint(pair)
         }
 
+    def release_candidates(self) -> None:
+        """Forget what only a search needs: products of components that are in no model.
+
+        They are computed again where one is tested after all.
+        """
+        members = {_Y, *(self.seen[key].batch for key in self.apart)}
+        self.blocks = {
+            pair: found for pair, found in self.blocks.items() if members.issuperset(pair)
+        }
+
     def _store_batch(self, rows: Array) -> int:
         """The index of rows that are stored."""
         number = max(self.batches, default=-1) + 1

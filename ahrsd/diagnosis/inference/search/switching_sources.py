@@ -34,11 +34,7 @@ from ahrsd.diagnosis.inference.likelihood.candidates import candidate_scan
 from ahrsd.diagnosis.inference.likelihood.evidence import ModelFit
 from ahrsd.diagnosis.inference.search.model_search import Hypotheses, Hypothesis
 from ahrsd.diagnosis.model import Context
-from ahrsd.diagnosis.where_and_when.locate import (
-    Frame,
-    frame_columns,
-    segments_between,
-)
+from ahrsd.diagnosis.where_and_when.locate import Frame, segments_between
 from ahrsd.samples import Array
 
 #: frames of such sources
@@ -217,7 +213,12 @@ def _level_component(context: Context, frame: Frame, change_rows: Sequence[int])
     """A constant field between consecutive change points (rows), along each axis of a frame."""
     time_s = context.track.time_s
     edges = np.array([time_s[0], *time_s[list(change_rows)], time_s[-1]])
-    columns = frame_columns(context, frame, segments_between(time_s, edges))
+    segments = segments_between(time_s, edges)
+
+    def indicators() -> Array:
+        return (segments.index[:, None] == np.arange(len(segments))).astype(float)
+
+    columns = columns_in_frame(context, frame, indicators, len(segments))
     low, high = (np.array([np.log(one)]) for one in priors.COURSE_SIZES)
     unit = priors.COURSE_UNIT[frame]
     law = ScaledLaw(np.full(columns.width, unit), low, high)
