@@ -58,14 +58,16 @@ class Address:
     def check(self, key: str, *, other_hosts: bool) -> None:
         """Raise ValueError where this cannot be meant, or needs a word that was not given."""
         if key == "udp" and self.ip.is_unspecified:
-            raise ValueError(f"{key} = {self.text!r}: nobody is there; name whom to send to")
+            raise ValueError(
+                f"{key} = {self.text!r}: no host has this address; give the one to send to"
+            )
         if key == "tcp" and self.ip.is_multicast:
-            raise ValueError(f"{key} = {self.text!r}: a group of hosts, for udp only")
+            raise ValueError(f"{key} = {self.text!r}: a multicast address is for udp only")
         if not self.ip.is_loopback and not other_hosts:
             what = "would leave this machine" if key == "udp" else "could be read by other machines"
             raise ValueError(
                 f"{key} = {self.text!r}: what is sent {what}; write other_hosts = true if that is "
-                "meant, or choose an address of this machine alone, such as 127.0.0.1"
+                "intended, or choose an address of this machine alone, such as 127.0.0.1"
             )
 
     @property
@@ -302,9 +304,9 @@ class GatesSection(Section):
     """What must hold before anything is written, one limit per gate (docs/reference/gates.md)."""
 
     max_error_rate: float = Field(default=_LIMITS.max_error_rate, ge=0.0, le=1.0)
-    """Messages with a wrong checksum, over all. [1]"""
+    """Share of messages with a wrong checksum. [1]"""
     max_drop_rate: float = Field(default=_LIMITS.max_drop_rate, ge=0.0, le=1.0)
-    """Samples missing, over all. [1]"""
+    """Share of samples that are missing. [1]"""
     min_rate_hz: float = Field(default=_LIMITS.min_rate_hz, ge=1.0, le=800.0)
     """Sample rate. [Hz]"""
     min_heading_excursion_deg: float = Field(
@@ -338,8 +340,8 @@ class GatesSection(Section):
     )
     """Dip of the corrected field against the world model. [deg]"""
     max_place_deg: float = Field(default=_LIMITS.max_place_deg, ge=0.0, le=180.0)
-    """What a field that differs from place to place, and all else that is left over, may make of
-    the heading, 1 sigma. [deg]"""
+    """Heading error (1 sigma) by a field that differs from place to place, and by all else that
+    the model does not explain. [deg]"""
     holdout_segments: float = Field(default=_LIMITS.holdout_segments, ge=0.0, le=100.0)
     """Held-out segments that turned by 60 deg and more. [segments]"""
     min_holdout_excursion_deg: float = Field(
@@ -355,7 +357,7 @@ class GatesSection(Section):
     min_improvement_percent: float = Field(
         default=_LIMITS.min_improvement_percent, ge=0.0, le=100.0
     )
-    """Held-out rms below that of the calibration in force. [%]"""
+    """Reduction of the held-out rms against the calibration in force. [%]"""
     min_improvement_deg: float = Field(default=_LIMITS.min_improvement_deg, ge=0.0, le=180.0)
     """The same in degrees. [deg]"""
     min_improvement_lower_deg: float = Field(
@@ -363,9 +365,10 @@ class GatesSection(Section):
     )
     """Lower end of the 95 % interval of that improvement. [deg]"""
     repeat_hard_iron_gauss: float = Field(default=_LIMITS.repeat_hard_iron_gauss, ge=0.0, le=2.5)
-    """Level hard iron of the earlier against the later half. [gauss]"""
+    """Level hard iron of the earlier half of the data against the later half. [gauss]"""
     repeat_heading_deg: float = Field(default=_LIMITS.repeat_heading_deg, ge=0.0, le=180.0)
-    """Heading by the earlier against the later half, worst heading and tilt. [deg]"""
+    """Heading by the earlier half of the data against the later one, worst heading and tilt.
+    [deg]"""
     second_opinion_deg: float = Field(default=_LIMITS.second_opinion_deg, ge=0.0, le=180.0)
     """Heading by an independent fit without gyro, worst heading and tilt. [deg]"""
     min_eigenvalue: float = Field(default=_LIMITS.min_eigenvalue, ge=0.0, le=100.0)

@@ -249,7 +249,7 @@ def test_the_command_line_names_the_state_directory_as_the_other_commands_do(tmp
         ('tcp = "0.0.0.0:2101"', "could be read by other machines; write other_hosts = true"),
         ('udp = "192.168.1.255:10110"', "would leave this machine; write other_hosts = true"),
         ('udp = "0.0.0.0:1"\nother_hosts = true', "nobody is there"),
-        ('tcp = "224.0.0.1:1"\nother_hosts = true', "a group of hosts, for udp only"),
+        ('tcp = "224.0.0.1:1"\nother_hosts = true', "a multicast address is for udp only"),
         ('tcp = "127.0.0.1:2101"\nowner = true', "owner is for pty; this share is tcp"),
         ('udp = "127.0.0.1:2101"\ngroup = "x"', "group is for pty; this share is udp"),
         ('pty = "/x"\nsend = "nmea"', "send is for tcp and udp; this share is pty"),
