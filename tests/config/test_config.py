@@ -248,7 +248,7 @@ def test_the_command_line_names_the_state_directory_as_the_other_commands_do(tmp
         ('udp = "127.0.0.1:70000"', "a port is 1 to 65535"),
         ('tcp = "0.0.0.0:2101"', "could be read by other machines; write other_hosts = true"),
         ('udp = "192.168.1.255:10110"', "would leave this machine; write other_hosts = true"),
-        ('udp = "0.0.0.0:1"\nother_hosts = true', "nobody is there"),
+        ('udp = "0.0.0.0:1"\nother_hosts = true', "no host has this address"),
         ('tcp = "224.0.0.1:1"\nother_hosts = true', "a multicast address is for udp only"),
         ('tcp = "127.0.0.1:2101"\nowner = true', "owner is for pty; this share is tcp"),
         ('udp = "127.0.0.1:2101"\ngroup = "x"', "group is for pty; this share is udp"),
