@@ -247,7 +247,7 @@ def test_no_save_takes_a_killed_sessions_outputs_along(configure):
     run.run(20.0)
     assert run.saves == (1 if configure else 0)
     assert outputs(run.emulator.memory.flash) == users
-    told = [text for _, text in run.notes if "session that was killed" in text]
+    told = [text for _, text in run.notes if "outputs of a killed session" in text]
     assert len(told) == 1
     assert ("$VNWRG,75," in told[0]) and ("nothing is saved" in told[0]) is not configure
 

@@ -351,5 +351,5 @@ def test_a_name_that_gains_no_more_than_its_copies_or_owes_itself_to_a_prior_is_
     (note,) = doubts((replace(told, priors=owed),))
     assert note == (
         "hysteresis depends on a prior: with the noise steps between octaves doubled its evidence "
-        "is 1 nats, 3 are required"
+        "is 1 nats, and 3 are required"
     )
