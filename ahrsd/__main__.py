@@ -28,7 +28,7 @@ _INTERRUPTED = 130  # 128 + SIGINT, as every shell reports it
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="ahrsd")
-@click.option("-v", "--verbose", count=True, help="Say more: -v what happens, -vv the traffic.")
+@click.option("-v", "--verbose", count=True, help="Log more: -v events, -vv also the traffic.")
 def group(verbose: int) -> None:
     """Keep the magnetometer and gyroscope of a VN-100 calibrated from its own stream."""
     logs.configure(verbose)

@@ -155,7 +155,7 @@ STREAM = (
         "",
         "max_error_rate",
         Level.CANDIDATE,
-        meaning="messages with a wrong checksum, over all",
+        meaning="share of messages with a wrong checksum",
         advice="{v:.2g} of the messages are damaged (limit {l:.2g}): check cable and baud rate",
     ),
     most(
@@ -165,7 +165,7 @@ STREAM = (
         "",
         "max_drop_rate",
         Level.CANDIDATE,
-        meaning="samples missing, over all",
+        meaning="share of samples that are missing",
         advice="{v:.2g} of the samples are missing (limit {l:.2g}): raise the baud rate, lower "
         "the output rate, or set the USB latency timer to 1 ms",
     ),
@@ -214,7 +214,7 @@ STREAM = (
         "basis.changed",
         Level.CANDIDATE,
         meaning="a compensation register changed while the data were taken",
-        advice="a compensation register was changed meanwhile: start again, and let no other "
+        advice="a compensation register was changed during this run: start again, and let no other "
         "program write to the device",
     ),
     no(
@@ -249,7 +249,7 @@ MOTION = (
         "G2",
         "motion_known",
         Level.CANDIDATE,
-        meaning="there was motion (3D, planar or between) and gravity to see it by",
+        meaning="there was motion (3D, planar or between), and gravity is measured",
         advice=f"motion: {{e.motion.regime}}; {_MOVE} ({{e.motion.turn}})",
     ),
     least(
@@ -259,7 +259,7 @@ MOTION = (
         "deg",
         "min_heading_excursion_deg",
         Level.CANDIDATE,
-        meaning="headings shown, in sectors of 10 deg",
+        meaning="headings covered, in sectors of 10 deg",
         advice="{v:.0f} of {l:.0f} deg of heading are covered: {e.motion.turn}",
         missing=_NO_TILT,
     ),
@@ -312,7 +312,7 @@ MOTION = (
         "gauss",
         "max_moved_unseen_gauss",
         Level.CANDIDATE,
-        meaning="move of the vertical hard iron although the motion was too flat to see it",
+        meaning="change of the vertical hard iron although the motion was too flat to determine it",
         advice=f"the vertical hard iron moved by {{v:.3f}} gauss on flat motion: {_TILT}",
         missing=_NO_TILT,
     ),
@@ -338,7 +338,7 @@ FIELD = (
         "%",
         "field_spread_flash_percent",
         Level.FLASH,
-        meaning="the same, to save for good",
+        meaning="the same, for a save to flash",
         advice="the corrected field varies by {v:.1f} % (limit {l:.1f} to save): repeat it in "
         "the open, away from steel and cables",
         missing="no segment is complete yet",
@@ -408,13 +408,13 @@ FIELD = (
         "deg",
         "max_place_deg",
         Level.FLASH,
-        meaning="what a field that differs from place to place, and all else that the model leaves "
-        "over, may make of the heading, 1 sigma",
-        advice="what the field does beside iron may make {v:.2f} deg of heading (limit {l:.2f}): "
-        "it differs from place to place, or the iron changes, and what is alike of that on all "
-        "headings is taken for iron; repeat it in the open; `ahrsd diagnose` of the recording says "
-        "what it is",
-        missing="gravity is needed to tell where the vehicle heads",
+        meaning="heading error (1 sigma) by a field that differs from place to place, and by all "
+        "else that the model does not explain",
+        advice="what the model does not explain may cause {v:.2f} deg of heading error (limit "
+        "{l:.2f}): the field differs from place to place, or the iron changes, and what is equal "
+        "on all headings is taken for iron; repeat it in the open; run `ahrsd diagnose` on the "
+        "recording to find the cause",
+        missing="gravity is needed to know the heading",
     ),
 )
 
@@ -446,7 +446,7 @@ PROOF = (
         "deg",
         "min_holdout_excursion_deg",
         Level.RAM,
-        meaning="headings shown in the held-out segments",
+        meaning="headings covered in the held-out segments",
         advice=f"held-out data show {{v:.0f}} of {{l:.0f}} deg of heading: {_HELD}",
     ),
     most(
@@ -481,8 +481,8 @@ PROOF = (
         "closure_deg",
         Level.RAM,
         meaning="change of the heading error over a full turn",
-        advice="after a full turn {v:.1f} deg are left over (limit {l:.1f}): turn slowly, and "
-        "let the sensor warm up",
+        advice="the heading error changes by {v:.1f} deg over a full turn (limit {l:.1f}): turn "
+        "slowly, and let the sensor warm up",
         missing=f"no full turn was held out: {_HELD}",
     ),
     least(
@@ -492,8 +492,10 @@ PROOF = (
         "%",
         "min_improvement_percent",
         Level.RAM,
-        meaning="held-out rms below that of the calibration in force",
-        advice="held-out error falls by {v:.0f} % (needed {l:.0f}): leave what is in force",
+        meaning="reduction of the held-out rms against the calibration in force",
+        advice=(
+            "the held-out error falls by {v:.0f} % (needed {l:.0f}): keep the registers as they are"
+        ),
         missing=_HELD,
     ),
     least(
@@ -504,7 +506,7 @@ PROOF = (
         "min_improvement_deg",
         Level.RAM,
         meaning="the same in degrees",
-        advice="held-out error falls by {v:.2f} deg (needed {l:.2f}): leave what is in force",
+        advice="the held-out error falls by {v:.2f} deg (needed {l:.2f}): keep the registers",
         missing=_HELD,
     ),
     least(
@@ -525,9 +527,9 @@ PROOF = (
         "gauss",
         "repeat_hard_iron_gauss",
         Level.RAM,
-        meaning="level hard iron of the earlier against the later half",
+        meaning="level hard iron of the earlier half of the data against the later half",
         advice="two halves of the data differ by {v:.3f} gauss (limit {l:.3f}): the vehicle's "
-        "iron changed, or each half lacks a circle; drive two more circles",
+        "iron changed, or one half lacks a circle; drive two more circles",
         missing="each half of the data needs motion of its own: drive two more circles",
     ),
     most(
@@ -537,9 +539,11 @@ PROOF = (
         "deg",
         "repeat_heading_deg",
         Level.RAM,
-        meaning="heading by the earlier against the later half, worst heading and tilt",
+        meaning=(
+            "heading by the earlier half of the data against the later one, worst heading and tilt"
+        ),
         advice="two halves of the data differ by {v:.1f} deg (limit {l:.1f}): the vehicle's "
-        "iron changed, or each half lacks a circle; drive two more circles",
+        "iron changed, or one half lacks a circle; drive two more circles",
         missing="each half of the data needs motion of its own: drive two more circles",
     ),
     most(
@@ -683,8 +687,8 @@ STEADY = (
         "max_field_change_gauss",
         Level.RAM,
         meaning="corrected field of a segment against the median segment",
-        advice="the field changed by {v:.3f} gauss meanwhile (limit {l:.3f}): switch nothing, "
-        "carry nothing past the sensor, and stay in one place",
+        advice="the field changed by {v:.3f} gauss while the data were taken (limit {l:.3f}): "
+        "switch nothing, carry nothing past the sensor, and stay in one place",
         missing="no segment is complete yet",
     ),
     most(
@@ -695,8 +699,8 @@ STEADY = (
         "max_inclination_change_deg",
         Level.RAM,
         meaning="dip of a calm segment against the median segment",
-        advice="the dip changed by {v:.1f} deg meanwhile (limit {l:.1f}): drive more gently, "
-        "away from steel",
+        advice="the dip changed by {v:.1f} deg while the data were taken (limit {l:.1f}): drive "
+        "more gently, away from steel",
         missing="the dip is not known: drive some time without hard manoeuvres",
     ),
     most(

@@ -396,7 +396,7 @@ class BaudNotFound(PortError):
             advice = (
                 "the device does not answer: check power, cable and which of its ports this is"
                 if asked
-                else "the device may be quiet: let it be asked, or give the rate"
+                else "the device may be silent: allow ahrsd to ask it, or give the rate"
             )
         elif any(heard.unchecked for heard in tried):
             advice = NO_CHECKSUM

@@ -39,7 +39,7 @@ def columns_option(command: _Command) -> _Command:
         callback=_parsed,
         metavar="NAME=COLUMN:UNIT,...",
         help="Names and units of a foreign table: mag_x=MagX:uT,gyro_x=GyrX:deg/s,time=t:ms; a "
-        "minus before COLUMN turns its sign (docs/guide/recordings.md).",
+        "minus before COLUMN negates it (docs/guide/recordings.md).",
     )(command)
 
 

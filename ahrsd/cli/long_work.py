@@ -121,11 +121,11 @@ def limit_options(
     """Both for each of `what`, as `limit_s` and `memory_bytes`; 0 where there is no limit."""
     limited = click.option(
         "--limit", "limit_s", default=limit, show_default=limit or "none", callback=_seconds,
-        help=f"Time for {what}: s, min, h.",
+        help=f"Longest time for {what}: s, min, h.",
     )  # fmt: skip
     bounded = click.option(
         "--memory", "memory_bytes", default=memory, show_default=memory or "none", callback=_bytes,
-        help=f"Memory for {what}: M, G.",
+        help=f"Most memory for {what}: M, G.",
     )  # fmt: skip
     return lambda command: limited(bounded(command))
 

@@ -516,10 +516,17 @@ class Reloader:
             if change.changed:
                 self.config = change.config
                 apply(change)
-            text = ", ".join(change.changed) or "nothing that may change now has changed"
+            text = (
+                ", ".join(change.changed) or "no setting that may change during a run has changed"
+            )
             said.append((True, f"configuration read again: {text}"))
             if change.waits:
-                said.append((False, f"not before the next start: {', '.join(change.waits)}"))
+                said.append(
+                    (
+                        False,
+                        f"these settings change at the next start only: {', '.join(change.waits)}",
+                    )
+                )
         return said
 
 

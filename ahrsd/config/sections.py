@@ -58,14 +58,16 @@ class Address:
     def check(self, key: str, *, other_hosts: bool) -> None:
         """Raise ValueError where this cannot be meant, or needs a word that was not given."""
         if key == "udp" and self.ip.is_unspecified:
-            raise ValueError(f"{key} = {self.text!r}: nobody is there; name whom to send to")
+            raise ValueError(
+                f"{key} = {self.text!r}: no host has this address; give the one to send to"
+            )
         if key == "tcp" and self.ip.is_multicast:
-            raise ValueError(f"{key} = {self.text!r}: a group of hosts, for udp only")
+            raise ValueError(f"{key} = {self.text!r}: a multicast address is for udp only")
         if not self.ip.is_loopback and not other_hosts:
             what = "would leave this machine" if key == "udp" else "could be read by other machines"
             raise ValueError(
                 f"{key} = {self.text!r}: what is sent {what}; write other_hosts = true if that is "
-                "meant, or choose an address of this machine alone, such as 127.0.0.1"
+                "intended, or choose an address of this machine alone, such as 127.0.0.1"
             )
 
     @property
@@ -119,14 +121,14 @@ class DeviceSection(Section):
     serial_number: int | None = Field(default=None, ge=0, le=2**32 - 1)
     """Accept only the device with this serial number (register 3)."""
     baud: Baud = "auto"
-    """Rate of the port; auto listens at each rate and never changes the device's. [Bd]"""
+    """Rate of the port; auto tries each rate and never changes the device's. [Bd]"""
     configure_stream: bool = False
     """Allow changing the async and binary outputs in RAM for the session, in any mode but passive;
     they are put back at exit."""
     rate_hz: float = Field(default=100.0, ge=1.0, le=800.0)
-    """Binary output to ask for with configure_stream. [Hz]"""
+    """Rate of the binary output that configure_stream sets up. [Hz]"""
     reply_timeout_s: float = Field(default=0.4, ge=0.05, le=60.0)
-    """How long a reply may take before the question is asked again. [s]"""
+    """How long a reply may take before the request is repeated. [s]"""
 
 
 class ShareSection(Section):
@@ -135,7 +137,8 @@ class ShareSection(Section):
     pty: Path | None = None
     """Path of a port; the other program opens it in place of the device's own."""
     tcp: str | None = None
-    """Address to listen at, such as 127.0.0.1:2101 or [::1]:2101; whoever connects only reads."""
+    """Address to listen at, such as 127.0.0.1:2101 or [::1]:2101; a connected program can only
+    read."""
     udp: str | None = None
     """Address to send to, such as 127.0.0.1:5005: a datagram for each message."""
     send: Literal["raw", "corrected", "nmea"] = "raw"
@@ -146,21 +149,22 @@ class ShareSection(Section):
     calibration: Literal["registers", "qualified"] = "registers"
     """What corrected and nmea are calibrated by; registers: only what is in the device; qualified:
     a candidate that passed every gate is applied here, before and without a write or an approval,
-    so a heading moves by it while the vehicle is under way."""
+    so the heading changes while the vehicle is under way."""
     max_heading_sigma_deg: float = Field(default=5.0, gt=0.0, le=180.0)
-    """Magnetic heading by that calibration that is known less well than this (1 sigma) is left out
-    of corrected and nmea. [deg]"""
+    """A magnetic heading that is less certain than this (1 sigma) is left out of corrected and
+    nmea. [deg]"""
     owner: bool = False
     """The program on the pty may set outputs and other settings of the device, in RAM; at most one
-    may. The others read and listen. Nobody writes what calibrates (but see calibration_writes)."""
+    may. The others read and listen. Nobody may write calibration registers (but see
+    calibration_writes)."""
     save: Literal["refuse", "clean"] = "clean"
-    """What becomes of VNWNV of the owner; clean: sent once nothing unproven is in the device's RAM
-    (a calibration on trial is undone first and written again behind it)."""
+    """What is done with the owner's VNWNV; clean: it is sent once the device's RAM holds nothing
+    unproven (a calibration on trial is undone first and written again afterwards)."""
     reset: Literal["refuse", "announce"] = "announce"
-    """What becomes of VNRST of the owner; announce: sent and known of (a calibration on trial is
-    undone first and written again behind it)."""
+    """What is done with the owner's VNRST; announce: it is sent, and ahrsd expects the restart (a
+    calibration on trial is undone first and written again afterwards)."""
     calibration_writes: Literal["guard", "pass"] = "guard"
-    """What becomes of the owner's writes of registers 23, 25, 26, 43, 44, 74 and 84; guard: VNERR
+    """What is done with the owner's writes of registers 23, 25, 26, 43, 44, 74 and 84; guard: VNERR
     09; pass: journaled and sent, in mode stage and commit, while no calibration of ahrsd's is under
     way."""
     group: str | None = None
@@ -199,7 +203,7 @@ class ShareSection(Section):
 
 
 class CaptureSection(Section):
-    """The record of everything that came and went, raw."""
+    """The record of everything received and sent, raw."""
 
     enabled: bool = True
     """Record; a session without a capture cannot be replayed."""
@@ -212,7 +216,7 @@ class CaptureSection(Section):
 
 
 class RerunSection(Section):
-    """The log for the rerun viewer, written by a process of its own."""
+    """The log for the rerun viewer, written by a separate process."""
 
     file: Path | None = None
     """Write an .rrd file here."""
@@ -221,7 +225,7 @@ class RerunSection(Section):
     port: int = Field(default=9876, ge=1024, le=65535)
     """TCP port of the live view, on 127.0.0.1 only."""
     memory_megabytes: int = Field(default=256, ge=16, le=10**5)
-    """What the live view keeps for viewers that connect late. [MB]"""
+    """Memory of the live view for viewers that connect later. [MB]"""
 
 
 class SocketSection(Section):
@@ -249,11 +253,13 @@ class EstimatorSection(Section):
     """The estimate of iron and gyro bias."""
 
     step_rate_hz: float = Field(default=_ESTIMATOR.step_rate_hz, ge=1.0, le=800.0)
-    """Faster streams are averaged down to this; higher follows faster motion, costs more. [Hz]"""
+    """Faster streams are averaged down to this; a higher rate follows faster motion and costs more.
+    [Hz]"""
     epoch_steps: int = Field(default=_ESTIMATOR.epoch_steps, ge=MIN_EPOCH_STEPS, le=65536)
-    """Steps per epoch; larger loses less at the borders and answers later. [steps]"""
+    """Steps per epoch; a larger number loses less at the borders and gives results later.
+    [steps]"""
     window_steps: int = Field(default=_ESTIMATOR.window_steps, ge=64, le=10**6)
-    """Steps that are linearised again; larger is nearer to the batch answer. [steps]"""
+    """Steps that are linearised again; a larger number is nearer to the batch result. [steps]"""
     bias_walk_rad_s_sqrt_s: float = Field(
         default=_ESTIMATOR.bias_walk_rad_s_sqrt_s, ge=0.0, le=0.01
     )
@@ -266,15 +272,16 @@ class EstimatorSection(Section):
     prior_gyro_bias_rad_s: float = Field(default=_ESTIMATOR.prior_gyro_bias_rad_s, gt=0.0, le=1.0)
     """The same for the gyro bias. [rad/s]"""
     outlier_sigma: float = Field(default=_ESTIMATOR.outlier_sigma, ge=2.0, le=100.0)
-    """Field residuals beyond this lose weight; smaller ignores more. [sigma]"""
+    """Field residuals beyond this lose weight; a smaller number ignores more. [sigma]"""
     mag_noise_floor_gauss: float = Field(default=_ESTIMATOR.mag_noise_floor_gauss, gt=0.0, le=1.0)
-    """Never believe less field noise than this. [gauss]"""
+    """The field noise is assumed to be at least this. [gauss]"""
     gyro_noise_floor_rad_s: float = Field(default=_ESTIMATOR.gyro_noise_floor_rad_s, gt=0.0, le=1.0)
-    """Never believe less rate noise than this. [rad/s]"""
+    """The rate noise is assumed to be at least this. [rad/s]"""
 
     warm_start_s: float = Field(default=1800.0, ge=0.0, le=7200.0)
-    """At its start `ahrsd run` goes on with the samples of the newest captures of the same device
-    with the same registers that are not older than this; 0: every run begins with nothing. [s]"""
+    """At its start `ahrsd run` continues with the samples of the newest captures of the same
+    device, with the same registers and not older than this; 0: every run begins without samples.
+    [s]"""
 
     @model_validator(mode="after")
     def _window_of_epochs(self) -> EstimatorSection:
@@ -302,15 +309,15 @@ class GatesSection(Section):
     """What must hold before anything is written, one limit per gate (docs/reference/gates.md)."""
 
     max_error_rate: float = Field(default=_LIMITS.max_error_rate, ge=0.0, le=1.0)
-    """Messages with a wrong checksum, over all. [1]"""
+    """Share of messages with a wrong checksum. [1]"""
     max_drop_rate: float = Field(default=_LIMITS.max_drop_rate, ge=0.0, le=1.0)
-    """Samples missing, over all. [1]"""
+    """Share of samples that are missing. [1]"""
     min_rate_hz: float = Field(default=_LIMITS.min_rate_hz, ge=1.0, le=800.0)
     """Sample rate. [Hz]"""
     min_heading_excursion_deg: float = Field(
         default=_LIMITS.min_heading_excursion_deg, ge=0.0, le=360.0
     )
-    """Headings shown, in sectors of 10 deg. [deg]"""
+    """Headings covered, in sectors of 10 deg. [deg]"""
     min_planar_circle_deg: float = Field(default=_LIMITS.min_planar_circle_deg, ge=0.0, le=360.0)
     """The same where the motion is planar: a whole circle is needed. [deg]"""
     min_observability: float = Field(default=_LIMITS.min_observability, ge=0.0, le=100.0)
@@ -318,7 +325,7 @@ class GatesSection(Section):
     max_heading_sigma_deg: float = Field(default=_LIMITS.max_heading_sigma_deg, ge=0.0, le=180.0)
     """Expected heading error (1 sigma) at the worst attitude driven. [deg]"""
     max_moved_unseen_gauss: float = Field(default=_LIMITS.max_moved_unseen_gauss, ge=0.0, le=2.5)
-    """Move of the vertical hard iron although the motion was too flat to see it. [gauss]"""
+    """Change of the vertical hard iron although the motion was too flat to determine it. [gauss]"""
     field_min_gauss: float = Field(default=_LIMITS.field_min_gauss, ge=0.0, le=2.5)
     """Smallest corrected field; nowhere on Earth is it weaker than the limit. [gauss]"""
     field_max_gauss: float = Field(default=_LIMITS.field_max_gauss, ge=0.0, le=2.5)
@@ -332,20 +339,20 @@ class GatesSection(Section):
     field_spread_flash_percent: float = Field(
         default=_LIMITS.field_spread_flash_percent, ge=0.0, le=100.0
     )
-    """The same, to save for good. [%]"""
+    """The same, for a save to flash. [%]"""
     max_inclination_error_deg: float = Field(
         default=_LIMITS.max_inclination_error_deg, ge=0.0, le=180.0
     )
     """Dip of the corrected field against the world model. [deg]"""
     max_place_deg: float = Field(default=_LIMITS.max_place_deg, ge=0.0, le=180.0)
-    """What a field that differs from place to place, and all else that is left over, may make of
-    the heading, 1 sigma. [deg]"""
+    """Heading error (1 sigma) by a field that differs from place to place, and by all else that
+    the model does not explain. [deg]"""
     holdout_segments: float = Field(default=_LIMITS.holdout_segments, ge=0.0, le=100.0)
     """Held-out segments that turned by 60 deg and more. [segments]"""
     min_holdout_excursion_deg: float = Field(
         default=_LIMITS.min_holdout_excursion_deg, ge=0.0, le=360.0
     )
-    """Headings shown in the held-out segments. [deg]"""
+    """Headings covered in the held-out segments. [deg]"""
     holdout_rms_deg: float = Field(default=_LIMITS.holdout_rms_deg, ge=0.0, le=180.0)
     """Magnetic against gyro heading on held-out data, rms. [deg]"""
     holdout_max_deg: float = Field(default=_LIMITS.holdout_max_deg, ge=0.0, le=180.0)
@@ -355,7 +362,7 @@ class GatesSection(Section):
     min_improvement_percent: float = Field(
         default=_LIMITS.min_improvement_percent, ge=0.0, le=100.0
     )
-    """Held-out rms below that of the calibration in force. [%]"""
+    """Reduction of the held-out rms against the calibration in force. [%]"""
     min_improvement_deg: float = Field(default=_LIMITS.min_improvement_deg, ge=0.0, le=180.0)
     """The same in degrees. [deg]"""
     min_improvement_lower_deg: float = Field(
@@ -363,9 +370,10 @@ class GatesSection(Section):
     )
     """Lower end of the 95 % interval of that improvement. [deg]"""
     repeat_hard_iron_gauss: float = Field(default=_LIMITS.repeat_hard_iron_gauss, ge=0.0, le=2.5)
-    """Level hard iron of the earlier against the later half. [gauss]"""
+    """Level hard iron of the earlier half of the data against the later half. [gauss]"""
     repeat_heading_deg: float = Field(default=_LIMITS.repeat_heading_deg, ge=0.0, le=180.0)
-    """Heading by the earlier against the later half, worst heading and tilt. [deg]"""
+    """Heading by the earlier half of the data against the later one, worst heading and tilt.
+    [deg]"""
     second_opinion_deg: float = Field(default=_LIMITS.second_opinion_deg, ge=0.0, le=180.0)
     """Heading by an independent fit without gyro, worst heading and tilt. [deg]"""
     min_eigenvalue: float = Field(default=_LIMITS.min_eigenvalue, ge=0.0, le=100.0)
@@ -426,28 +434,28 @@ class GatesSection(Section):
 
 
 class InterlockSection(Section):
-    """The vehicle's word that a write is safe now."""
+    """The vehicle's report that a write is safe now."""
 
     file: Path | None = None
     """File that the vehicle keeps rewriting while it is safe, its content the word safe; without
-    one, or with anything else in it, nothing is ever written. A regular file of 64 bytes at most;
-    what lay there at the start counts once it is written again."""
+    one, or with any other content, nothing is ever written. A regular file of 64 bytes at most; a
+    file from before the start counts once it is written again."""
     max_age_s: float = Field(default=WriteBackPolicy().interlock_max_age_s, gt=0.0, le=60.0)
-    """Not seen to be written again for longer than this counts as no, whatever its time stamp and
-    the host's clock say. [s]"""
+    """If the file is not rewritten for longer than this, a write is not safe, whatever its time
+    stamp and the host's clock say. [s]"""
 
 
 class TermsSection(Section):
-    """What a repaired model of `ahrsd diagnose --report` names, taken out before calibrating."""
+    """Effects of a repaired model (`ahrsd diagnose --report`), removed before the calibration."""
 
     model: Path | None = None
-    """The model.json; its terms that follow a column from sample to sample are taken out, what is
-    left holds where those columns are at the model's zero."""
+    """The model.json; its terms that are functions of a column at each sample are removed; the
+    calibration then holds where those columns are at the model's zero."""
     file: Path | None = None
     """File that the vehicle keeps rewriting, a JSON object such as {"motor_current_a": 3.2}, a
     regular file of 4096 bytes at most; temperature comes with the stream."""
     max_age_s: float = Field(default=0.5, gt=0.0, le=60.0)
-    """Samples further from the last word than this are not calibrated. [s]"""
+    """Samples further than this from the last values are not calibrated. [s]"""
 
 
 class LocationSection(Section):
@@ -475,26 +483,26 @@ _STILL = _POLICY.still
 
 
 class WriteBackSection(Section):
-    """Who says yes to a write, and what is worth one."""
+    """Who approves a write, and which changes are worth one."""
 
     approval: Literal["operator", "auto"] = _POLICY.approval
     """operator: a person approves each candidate by its id; auto: a change within
     `gates.max_step_auto_deg` needs nobody."""
     armed_at_start: bool = _POLICY.armed_at_start
-    """Begin every run as if a person had said `ahrsd operator arm`; only approval auto asks."""
+    """Begin every run as if a person had sent `ahrsd operator arm`; only approval auto needs it."""
     commit_unattended: bool = _POLICY.commit_unattended
-    """Save to flash without an operator's yes (mode commit, approval auto)."""
+    """Save to flash without an operator's approval (mode commit, approval auto)."""
     keep_on_stop: bool = _POLICY.keep_on_stop
     """Leave values that were not saved in RAM when the daemon stops; otherwise they are undone."""
     min_change_deg: float = Field(default=_POLICY.min_change_deg, ge=0.0, le=180.0)
     """A change of heading below this is not worth a write. [deg]"""
     min_gyro_change_rad_s: float = Field(default=_POLICY.min_gyro_change_rad_s, ge=0.0, le=1.0)
-    """And a change of the gyro bias below this neither. [rad/s]"""
+    """A change of the gyro bias below this is not worth a write. [rad/s]"""
     margin_after_rollback: float = Field(default=_POLICY.margin_after_rollback, ge=1.0, le=100.0)
-    """After a rollback only changes so many times as large are worth a write. [1]"""
+    """After a rollback, only changes larger by this factor are worth a write. [1]"""
     recheck_s: float = Field(default=_POLICY.recheck_s, ge=5.0, le=600.0)
-    """How often the device is asked again who it is and what registers 23, 25, 26, 44 and 84 hold,
-    in every mode but passive. [s]"""
+    """Interval at which the identity and registers 23, 25, 26, 44 and 84 are read again, in every
+    mode but passive. [s]"""
 
 
 class TrialSection(Section):
@@ -505,21 +513,21 @@ class TrialSection(Section):
     turns: float = Field(default=_TRIAL.turns, gt=0.0, le=100.0)
     """Full turns that end the trial. [turns]"""
     worse_percent: float = Field(default=_TRIAL.worse_percent, gt=0.0, le=100.0)
-    """Roll back where the live figure is worse than with the old registers by this ... [%]"""
+    """Roll back if the live figure is worse than with the old registers by this ... [%]"""
     worse_for_s: float = Field(default=_TRIAL.worse_for_s, ge=0.0, le=86400.0)
     """... for this long. [s]"""
     max_wrong_percent: float = Field(default=_TRIAL.max_wrong_percent, gt=0.0, le=100.0)
-    """Roll back where an error of the calibration explains more of the corrected field than this,
-    ... [%]"""
+    """Roll back if an error of the calibration explains more of the corrected field than this, ...
+    [%]"""
     wrong_sigmas: float = Field(default=_TRIAL.wrong_sigmas, ge=1.0, le=100.0)
     """... by so many of the figure's own standard deviations. [1]"""
     max_spread_percent: float = Field(default=_TRIAL.max_spread_percent, gt=0.0, le=100.0)
-    """Roll back where the corrected field scatters by more than this. [%]"""
+    """Roll back if the corrected field scatters by more than this. [%]"""
     max_jump_deg: float = Field(default=_TRIAL.max_jump_deg, gt=0.0, le=180.0)
-    """Roll back where the heading jumps by so much more than predicted. [deg]"""
+    """Roll back if the heading jumps by this much more than predicted. [deg]"""
     interlock: bool = _TRIAL.interlock
-    """Roll back where the vehicle withdraws its word; false where the word is only about the moment
-    of writing."""
+    """Roll back if the vehicle reports that it is no longer safe; false if its report is only about
+    the moment of writing."""
 
     def policy(self) -> TrialPolicy:
         """What the write-back takes."""
@@ -527,12 +535,12 @@ class TrialSection(Section):
 
 
 class StillSection(Section):
-    """Our own proof that the vehicle rests before the flash is written."""
+    """Test that the vehicle is at rest before the flash is written."""
 
     gyro_rad_s: float = Field(default=_STILL.gyro_rad_s, gt=0.0, le=1.0)
-    """Rate less bias below which it rests. [rad/s]"""
+    """Rate minus bias below which it is at rest. [rad/s]"""
     accel_m_s2: float = Field(default=_STILL.accel_m_s2, gt=0.0, le=10.0)
-    """Standard deviation of the specific force below which it rests. [m/s^2]"""
+    """Standard deviation of the specific force below which it is at rest. [m/s^2]"""
     duration_s: float = Field(default=_STILL.duration_s, gt=0.0, le=3600.0)
     """For how long. [s]"""
     max_age_s: float = Field(default=_STILL.max_age_s, gt=0.0, le=60.0)
@@ -557,4 +565,4 @@ class BudgetSection(Section):
     cooldown_s: float = Field(default=_POLICY.cooldown_s, ge=0.0, le=10**7)
     """No write for this long after a rollback. [s]"""
     rollbacks_to_lock: int = Field(default=_POLICY.rollbacks_to_lock, ge=1, le=100)
-    """So many rollbacks in a row lock the write-back until a person unlocks it."""
+    """This number of rollbacks in a row locks the write-back until a person unlocks it."""

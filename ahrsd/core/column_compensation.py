@@ -64,8 +64,8 @@ class VehicleTerms:
         for term in terms:
             if term not in self.terms:
                 self._warn(
-                    f"{term.identifier} is in the model and does not follow a column from sample "
-                    "to sample: it stays in the readings"
+                    f"{term.identifier} is in the model but is no function of a column, "
+                    "sample by sample: it stays in the readings"
                 )
         if self.terms:
             names = ", ".join(f"{t.identifier} ({t.setting['covariate']})" for t in self.terms)

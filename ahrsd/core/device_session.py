@@ -148,10 +148,10 @@ class KeptOutputs:
     def describe_left(self, *, put_back: bool) -> str:
         """Text for the log: what a killed session left, and what a person can do."""
         lines = " ".join(register_lines({n: self.users[n] for n in self.left}))
-        text = f"outputs of a session that was killed are in the device; the user's are {lines}"
+        text = f"the device still has the outputs of a killed session; the user's were {lines}"
         if put_back:
             return text
-        return f"{text}; type that or set device.configure_stream, until then nothing is saved"
+        return f"{text}; send that or set device.configure_stream; until then nothing is saved"
 
     def _record_facts(self) -> dict[str, Any]:
         """Facts of the record; `old`: the values that a person can restore by hand."""
@@ -232,10 +232,10 @@ class Phase(Enum):
     SETTING_UP = "setting up the stream"
     READY = "ready"
     RUNNING = "running a procedure"
-    LOOKING = "asking who answers and what it holds"
-    SERVING = "asking for a client"
+    LOOKING = "reading identity and registers again"
+    SERVING = "working for a client"
     RESTORING = "restoring"
-    CLOSING = "noting that all is put back"
+    CLOSING = "journalling that all is put back"
     DONE = "done"
 
 
@@ -673,7 +673,7 @@ class DeviceSession:
         if not self.watchdog.expired(now_s):
             return []
         if self.watchdog.times_asked == 1:
-            self._warn("the device is silent: it is asked for its output, again and again")
+            self._warn("the device is silent: asking for its output again and again")
         if self.watchdog.times_asked > 1 and self.change_stream:
             return self.identify_again(now_s)
         self._resume_blindly()  # harmless if the device is only slow
@@ -771,7 +771,7 @@ class DeviceSession:
 
     def _on_set_up_failed(self, error: Exception, now_s: float) -> list[Event]:
         waits = retry_waits(error)
-        own = "" if waits is PUT_BACK_AGAIN_S else ", the device's own stays"
+        own = "" if waits is PUT_BACK_AGAIN_S else ", its own output stays"
         if not self.watchdog.retrying:
             self._warn(f"the session's output cannot be set up{own}: {error}")
         else:

@@ -138,8 +138,8 @@ class SensorChecks:
         if share > self.limits.share:
             found["readings"] = (
                 f"{100 * share:.0f} % of the newest {bad + good} readings are of no use: not a "
-                "number, marked as saturated, larger than the sensor can read, or one that came "
-                "twice; look for a magnet beside it, a damaged cable, or another program that "
+                "number, marked as saturated, larger than the sensor can measure, or received "
+                "twice; look for a magnet near it, a damaged cable, or another program that "
                 "changes the stream"
             )
         before_findings, self._by_count = self._by_count, found
@@ -190,9 +190,9 @@ class SensorChecks:
                 abs(group[k].value) >= p.saturated_gauss for k in stuck
             )
             cause = (
-                "it is saturated: move it away from the magnet beside it"
+                "it is saturated: move it away from the magnet near it"
                 if saturated
-                else "not even noise moves it: it is stuck, held by another program, or simulated "
+                else "it shows not even noise: it is stuck, held by another program, or simulated "
                 "without noise; nothing can be calibrated from it"
             )
             yield (

@@ -33,18 +33,20 @@ AGREES = 0.05  # largest relative error of the corrected field's magnitude, mean
 MOST_ROWS = 72_000  # of earlier samples that are kept until they are used
 _MOST_LIVE_BLOCKS = 2400  # blocks of this run
 OFF = "off: estimator.warm_start_s is 0"
-PASSIVE = "off: mode passive asks no device who it is, so nobody knows whose the samples are"
+PASSIVE = (
+    "off: mode passive does not ask which device it is, so it is not known whose samples they are"
+)
 
 
 def too_old(then: Stamp, now: Stamp, limit_s: float) -> str:
     """Why samples of `then` are too old; empty if they may be used."""
     if not then.boot_id or not now.boot_id or then.boot_s is None or now.boot_s is None:
-        return "nobody knows how old they are: the computer does not tell its boot"
+        return "their age is not known: the computer does not say when it was started"
     if then.boot_id != now.boot_id:
-        return "they are of before the computer started: nobody knows how old they are"
+        return "they are from before the computer was started: their age is not known"
     age_s = age_by_boottime_s(then, now)
     if age_s is None:
-        return "they claim to be of the future"
+        return "their time stamps are in the future"
     if age_s > limit_s:
         return f"they are {age_s / 60:.0f} min old, more than {limit_s / 60:.0f} min"
     if plausible(then.wall_s) and plausible(now.wall_s):
@@ -157,7 +159,7 @@ class WarmStart:
         if present.open:
             return "a write is under way or on trial: this run alone judges it"
         if present.terms:
-            return "terms.model is set, and what the vehicle measured then is not known"
+            return "terms.model is set, and the columns that it needs are not known for that time"
         return "this run has a candidate of its own already" if present.candidate else ""
 
     def _stamp_at(self, host_s: float) -> Stamp:

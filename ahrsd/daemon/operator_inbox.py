@@ -145,7 +145,7 @@ class OperatorBox:
                 _removed(answer)
                 return OperatorAnswer(bool(body["accepted"]), str(body["text"]))
             time.sleep(_ASK_S)
-        raise NoAnswerInTime(f"took the word and did not answer within {wait_s:.0f} s")
+        raise NoAnswerInTime(f"took the command and did not answer within {wait_s:.0f} s")
 
 
 class OperatorInbox:
@@ -212,9 +212,11 @@ class OperatorInbox:
         with os.scandir(folder) as entries:
             names = sorted(entry.name for entry in islice(entries, _MOST_ENTRIES))
         first = self._looked_s is None
-        late = "it lay there before this run of the daemon began to look" if first else ""
+        late = (
+            "it was there before this run of the daemon started to read commands" if first else ""
+        )
         if not first and now_s - (self._looked_s or now_s) > LONGEST_S:
-            late = f"nobody looked for more than {LONGEST_S:.0f} s"
+            late = f"the daemon read no commands for more than {LONGEST_S:.0f} s"
         self._looked_s = now_s
         for name in names:
             if name.endswith(".json") and not name.startswith("."):
@@ -238,14 +240,16 @@ class OperatorInbox:
             word = _word_of(stem, data)
         except (OSError, ForeignFileError) as error:
             if name not in self._odd and not isinstance(error, FileNotFoundError):
-                text = f"{name} is not a word: {getattr(error, 'strerror', None) or error}"
+                text = f"{name} is not a command: {getattr(error, 'strerror', None) or error}"
                 log.warning("operator: %s; use `ahrsd operator`", text)
                 self._tell(folder, stem, OperatorAnswer(False, text), now_s)
             self._odd.add(name)
             return
         if late:
             log.warning("operator: %s was dropped: %s", word.verb, late)
-            self._tell(folder, stem, OperatorAnswer(False, f"dropped: {late}; say it again"), now_s)
+            self._tell(
+                folder, stem, OperatorAnswer(False, f"dropped: {late}; send it again"), now_s
+            )
             return
         self._words.put(word)
         self.woken()

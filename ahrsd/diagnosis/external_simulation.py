@@ -43,12 +43,14 @@ def align(real: Track, simulated: Track) -> Overlap:
         )
     if correlation < priors.SAME_MOTION:
         raise ValueError(
-            f"is another motion: its rates correlate with the recording's by {correlation:.2f} "
-            f"at best, {priors.SAME_MOTION} is needed"
+            f"is of another motion: its rates correlate with the recording's by only "
+            f"{correlation:.2f}, {priors.SAME_MOTION} is needed"
         )
     notes = [f"compared over {end - begin:.1f} s, from {begin:.1f} to {end:.1f} s"]
     if abs(shift_s) > 0.5 * _step_s(real):
-        notes.append(f"the simulation was moved by {shift_s:+.3f} s to match the recording's rates")
+        notes.append(
+            f"the simulation was shifted by {shift_s:+.3f} s to match the recording's rates"
+        )
     moved = replace(simulated, time_s=simulated.time_s - shift_s)
     return Overlap(cut_track(real, begin, end), cut_track(moved, begin, end), tuple(notes))
 

@@ -213,7 +213,7 @@ class ResidualComponent:
         if not self.nats > _REPORT_NATS:
             return ""
         return (
-            f"what is left follows {_FOLLOWS[self.key]}: {1e3 * self.size_gauss:.2g} mG; run "
+            f"the residual follows {_FOLLOWS[self.key]}: {1e3 * self.size_gauss:.2g} mG; run "
             "`ahrsd diagnose` on the recording"
         )
 
@@ -221,8 +221,8 @@ class ResidualComponent:
     def cause(self) -> str:
         """The same as the main cause of a large sigma."""
         return (
-            f"what the model leaves over follows {_FOLLOWS[self.key]}: `ahrsd diagnose` of the "
-            "recording says what it is"
+            f"the residual follows {_FOLLOWS[self.key]}: run `ahrsd diagnose` on the recording to "
+            "find the cause"
         )
 
 

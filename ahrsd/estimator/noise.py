@@ -333,18 +333,18 @@ class SlowResidual:
         if self.repeats is None or self.repeats > _NOT_REPEATING or self.goes_on is False:
             return ""
         slow = (
-            f"what is left over is slow ({1e3 * self.size_gauss:.1f} mG, another after "
-            f"{self.forgets_s:.2g} s) and not the same when an attitude comes back"
+            f"the residual varies slowly ({1e3 * self.size_gauss:.1f} mG, correlation time "
+            f"{self.forgets_s:.2g} s) and differs when an attitude is repeated"
         )
         if self.goes_on:
             return (
-                f"the magnetometer's noise is not white: {slow}, and at rest it goes on: record "
-                "for longer, another place changes nothing"
+                f"the magnetometer's noise is not white: {slow}, and it continues at rest: record "
+                "longer; another place does not help"
             )
         return (
-            f"{slow}: noise of the magnetometer that is not white, which a longer recording "
-            "averages, or places that were passed by; which of the two, a minute at rest tells: "
-            "there noise goes on"
+            f"{slow}: either the magnetometer's noise is not white, which a longer recording "
+            "averages, or the field differs along the way; a minute at rest shows which, because "
+            "noise continues there"
         )
 
 

@@ -126,15 +126,15 @@ def _headings_at_tilts(down_b: Array, dip_rad: float) -> tuple[Array, Array]:
 
 
 _KNOWN_DEG = 0.5  # a better known heading needs no advice
-_MOTION = "the motion so far tells too little: {}"
+_MOTION = "the motion so far does not determine enough: {}"
 _WIDENED = {
-    "misfit": "the field differs with place or attitude, or the iron changes meanwhile: repeat the "
-    "motion at another place, away from steel and currents, once it is warm; `ahrsd diagnose` of "
-    "the recording says what it is",
+    "misfit": "the field differs with place or attitude, or the iron changes with time: repeat "
+    "the motion at another place, away from steel and currents, once it is warm; run `ahrsd "
+    "diagnose` on the recording to find the cause",
     "axes": "the magnetometer's axes may be turned against the gyro's: roll and pitch as well",
     "turned": "the magnetometer's axes are turned against the gyro's: mount them alike, or take "
-    "the correction that `ahrsd calibrate` of a recording gives for it",
-    "lag": "the field's readings may be late: turn fast and slow, both ways",
+    "the correction that `ahrsd calibrate` gives for a recording",
+    "lag": "the field's readings may be delayed: turn fast and slow, both ways",
     "scales": "the gyro's scales may be off by a percent: turn about every axis, and back again",
     "place": "the field may differ with place: repeat the motion at another place, away from steel",
     "bias": "the gyro's bias may still follow its temperature: go on until it is warm",

@@ -217,12 +217,12 @@ def _dead_reckoning(
     velocity = velocity_of(track, fixes)
     way_m = distance_travelled(track, velocity, inside)
     if way_m is None:
-        warnings.append("hardly any way was travelled: no dead reckoning")
+        warnings.append("the distance travelled is too short: no dead reckoning")
         return None
     gaps = track.time_s[list(track.starts[1:])] - track.time_s[[k - 1 for k in track.starts[1:]]]
     if np.any(gaps > _LONG_GAP_S):
         warnings.append(
-            f"in the dead reckoning, as straight lines: "
+            f"straight lines in the dead reckoning: "
             f"{counted(int(np.count_nonzero(gaps > _LONG_GAP_S)), 'gap')} of more than "
             f"{_LONG_GAP_S:g} s"
         )

@@ -98,7 +98,7 @@ class Coverage:
         shown = {"pitch": self.pitch_deg, "roll": self.roll_deg}
         missing = [name for name, half_range in shown.items() if not half_range >= FREE_DEG]
         if not missing:
-            return f"lean so on other headings too, slowly and fast: tilt was shown ({self.tilts})"
+            return f"repeat this tilt on other headings, slowly and fast ({self.tilts})"
         lean = " and ".join(missing)
         return f"{lean} by {FREE_DEG:.0f} deg if the vehicle can ({self.tilts})"
 

@@ -339,7 +339,7 @@ def recurring_lines(found: AnswerTable) -> list[str]:
     """Findings that come again; what is no more than chance is left to --json."""
     rows = [row for row in found.rows if row[-1] < _LIKELY]
     if not rows:
-        return ["no finding is more frequent anywhere than everywhere"]
+        return ["no finding is more frequent in one group than in all recordings"]
     return table_lines(
         ("finding", "by", "which", "recordings", "share", "everywhere", "chance"),
         [
@@ -355,7 +355,7 @@ def failure_lines(found: AnswerTable) -> list[str]:
         return ["every recording gave an answer"]
     lines = []
     for outcome, error, number, remedy, example in found.rows[:_MOST]:
-        lines.append(f"{number:,} {outcome}: {printable(error or 'no words', 400)}")
+        lines.append(f"{number:,} {outcome}: {printable(error or 'no message', 400)}")
         if remedy:
             lines.append(f"  {printable(remedy, 400)}")
         lines.append(f"  for example {printable(example, 400)}")
@@ -386,7 +386,7 @@ def status_lines(name: str, body: dict[str, Any]) -> list[str]:
     elif run and run["done"] < run["total"]:
         lines.append(
             f"  the last run stopped at {run['done']:,} of {run['total']:,} or soon after: "
-            "the same command goes on"
+            "repeat the command to continue"
         )
     return lines
 

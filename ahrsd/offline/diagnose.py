@@ -187,7 +187,7 @@ def _diagnose_track(path: Path, track: Track, spec: Spec) -> Diagnosis:
     except np.linalg.LinAlgError:
         raise RecordingError(
             path,
-            "the fit found no end: no calibration comes near these readings",
+            "the fit did not converge: no calibration comes near these readings",
             "diagnose parts of it, and look at gyro and magnetometer where a part cannot be",
         ) from None
     except ValueError as error:

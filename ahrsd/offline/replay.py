@@ -71,7 +71,7 @@ def replay(
     RecordingError if nothing in the recording can be calibrated.
     """
     if rate_hz is not None and not math.isfinite(rate_hz):
-        raise RecordingError(path, f"a rate of {rate_hz} Hz is none", "give --rate in Hz")
+        raise RecordingError(path, f"a rate of {rate_hz} Hz is impossible", "give --rate in Hz")
     recording = opened or open_recording(path, rate_hz, columns=columns)
     core = Core(settings or _settings(recording, config, rate_hz, held_out))
     shell = Shell(core, viewer=viewer, listeners=listeners or [])

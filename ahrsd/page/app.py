@@ -67,7 +67,7 @@ class Heard:
         if self.fault:
             return self.fault
         if self.status is None:
-            return "the daemon has not told its status yet"
+            return "the daemon has not sent its status yet"
         if now_s - self.at_s > _STALE_S:
             return "the daemon is silent"
         return ""
@@ -112,7 +112,7 @@ class DaemonFeed:
 
     def _take(self, status: dict[str, Any]) -> None:
         if status.get("schema") != STATUS_SCHEMA:
-            raise ValueError(f"the daemon tells {status.get('schema')}, not {STATUS_SCHEMA}")
+            raise ValueError(f"the daemon sends {status.get('schema')}, not {STATUS_SCHEMA}")
         self.heard = Heard(status, time.monotonic())
 
 

@@ -141,7 +141,7 @@ def countdown(status: Status, pace: Pace) -> str:
     still = pace.standing(shut)
     if not still:
         return ""
-    return f"nobody can say how long: {counted(len(still), 'gate')} did not come nearer lately"
+    return f"time not known: {counted(len(still), 'gate')} made no progress lately"
 
 
 # -- What was shown --------------------------------------------------------------------------------
@@ -170,10 +170,12 @@ def drive(status: Status) -> str:
     if words := drive_next(status):
         return sentence(words)
     if status["motion"]["regime"] == "unknown":
-        return "Nobody knows which: the stream has no acceleration, so down is not known."
+        return "Not known: the stream has no acceleration, so the direction of down is not known."
     if any(gate["gate"].startswith("heldout") for gate in holding(status)[0]):
-        return "Keep turning: enough directions were shown, and are to be proven on new data."
-    return "Nothing more: all directions that the gates ask for are shown."
+        return (
+            "Keep turning: enough directions are covered; now the estimate is tested on new data."
+        )
+    return "Nothing more: all directions that the gates require are covered."
 
 
 # -- Heading, estimate, readings -------------------------------------------------------------------

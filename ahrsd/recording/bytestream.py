@@ -191,16 +191,16 @@ def read_stream(
         stream = _recoded(stream, encoding)
         start = start.decode(encoding, "ignore").encode("utf-8")
     if any(mark in start for mark in (b"b'$VN", b'b"$VN', b"b'\\xfa")):
-        told.append("the lines are bytes as Python prints them (b'...'): taken out of that")
+        told.append("the lines are bytes as Python prints them (b'...'): decoded")
         stream = _literals(stream)
     elif _is_translated(start):
-        told.append("a text mode made CR LF of each LF of the packets: undone")
+        told.append("a text mode turned each LF of the packets into CR LF: undone")
         stream = _untranslated(stream)
     elif b"\r\r\n" in start and start.isascii():
         told.append("the lines end in CR CR LF: read as CR LF")
         stream = _single_returns(stream)
     elif _QUOTED_END.search(start):
-        told.append("the lines stand in quotes: taken out of them")
+        told.append("the lines are in quotes: the quotes were removed")
         stream = (line.replace(b'"', b"") for line in _lines(stream))
     elif b"\\r\\n" in start and start.isascii():
         told.append("the lines end in the written characters \\r\\n: read as line ends")
@@ -222,7 +222,7 @@ def read_received(path: Path, notes: list[str] | None = None) -> Iterator[Receiv
         for chunk in _chained(first, chunks):
             yield Received(0, chunk)
         return
-    told.append("each line begins with a time of the host: taken for its arrival")
+    told.append("each line begins with a time of the host: used as its time of arrival")
     yield from _arrivals(path, unit_s)
 
 

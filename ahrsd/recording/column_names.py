@@ -112,7 +112,7 @@ def _source(entry: str, name: str, value: str) -> Source:
         units = ", ".join(_one_of_each({**_EXACT.get(kind, {}), **UNITS[kind]}))
         raise AhrsdError(
             f"--columns {printable(entry)}: {printable(unit)!r} is no unit of {name}; it may be "
-            f"{units}, or a number: how much of ours is one of theirs"
+            f"{units}, or a number: one unit of the file, in our unit"
         )
     if kind is None:  # a covariate keeps its unit, and its name may hold a colon
         return Source(value)
@@ -359,7 +359,7 @@ def _remedy(missing: Sequence[str], names: Sequence[str], used: set[str]) -> str
     meant = next((column for _, column in alike if column is not None), None)
     hint = f" (is {printable(meant)} meant? --columns {','.join(guessed)})" if meant else ""
     if any(one.endswith(f":{_NUMBER}") for one in guessed):
-        hint += f"; {_NUMBER}: how many gauss, rad/s, m/s^2 or s one of theirs is"
+        hint += f"; {_NUMBER}: one unit of the file, in gauss, rad/s, m/s^2 or s"
     return f"a table needs {', '.join(REQUIRED)}{hint or '; other names and units: --columns'}"
 
 

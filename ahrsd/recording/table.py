@@ -245,7 +245,7 @@ class _TableRows:
         _check_length(self.path, count)
         self.notes.append(
             f"the magnetometer has a reading in {count} of {len(known)} rows: the rows between "
-            "hold the last one"
+            "repeat the last one"
         )
         rows = np.arange(len(known))
         last = np.maximum.accumulate(np.where(known, rows, 0))
@@ -261,7 +261,7 @@ class _TableRows:
         _check_length(self.path, count)
         self.notes.append(
             f"the gyro has a reading in {count} of {len(known)} rows: between them its rates are "
-            "drawn straight"
+            "interpolated linearly"
         )
         self._draw(np.flatnonzero(known))
 
@@ -277,15 +277,15 @@ class _TableRows:
             return
         if np.mean(gyro == _fresh(np.hstack([self.vectors(MAG), self.vectors(GYRO)]))) > _TOGETHER:
             self.notes.append(
-                f"every reading is in {counted(usual, 'row')}, one after the other: each counts "
-                f"once, {int(np.count_nonzero(gyro))} of {len(gyro)} rows"
+                f"every reading is repeated in {counted(usual, 'row')}: each is used once, "
+                f"{int(np.count_nonzero(gyro))} of {len(gyro)} rows"
             )
             self._keep(gyro)
             _check_length(self.path, len(self.numbers))
             return
         self.notes.append(
-            f"the gyro has a new reading only every {usual} rows: between them its rates are drawn "
-            "straight"
+            f"the gyro has a new reading only every {usual} rows: between them its rates are "
+            "interpolated linearly"
         )
         self._draw(np.flatnonzero(gyro))
 
@@ -355,7 +355,7 @@ class _TableRows:
             if abs(self.values[name][row]) > limits.impossible
         ]
         self.notes.append(
-            f"left out for a reading that no such sensor has: {counted(count, 'row')}, first row "
+            f"left out because of an impossible reading: {counted(count, 'row')}, first row "
             f"{self.numbers[row]} ({values[0]})"
         )
         self._keep(~wrong)
@@ -387,7 +387,9 @@ class _TableRows:
         if ties := int(np.count_nonzero(np.diff(time_s) == 0.0)):
             spread = ties_spread(time_s)
             if spread is not None:
-                self.notes.append(f"put behind the row of the same time: {counted(ties, 'row')}")
+                self.notes.append(
+                    f"time moved on after a row of the same time: {counted(ties, 'row')}"
+                )
                 time_s = spread
         _check_time(self.path, time_s, self.numbers)
         refuse_beyond(
@@ -475,8 +477,8 @@ class _TableRows:
         filled = self._carried(accel, known, far)
         if filling := count - int(np.count_nonzero(far)):
             self.notes.append(
-                f"no acceleration in {counted(filling, 'row')}: the gyro carried it over from "
-                "those beside"
+                f"no acceleration in {counted(filling, 'row')}: filled from the rows next to it, "
+                "turned by the gyro"
             )
         if far.any():
             self.notes.append(

@@ -105,7 +105,7 @@ def _way(axes: Axes, reckoned: Reckoned) -> None:
     axes.set_xlabel("east [m]")
     axes.set_ylabel("north [m]")
     axes.set_title(
-        f"Way, grey {drawn(reckoned.reference)}: RMS error {pair.before.rms_percent:.1f} %, "
+        f"Track, grey {drawn(reckoned.reference)}: RMS error {pair.before.rms_percent:.1f} %, "
         f"{pair.after.rms_percent:.1f} %"
     )
 
@@ -179,7 +179,7 @@ def _spread(axes: Axes, rows: Sequence[ComparisonRow]) -> None:
     for k, row in enumerate(rows):
         if row.hard_iron_gauss is not None and row.held_out is None:
             axes.text(0.02 * reach, k, "no answer on half of the data", fontsize=8, va="center")
-    axes.set_xlabel("spread of |h| on readings that it has not seen [%]")
+    axes.set_xlabel("spread of |h| on held-out readings [%]")
 
 
 def _reach(lengths: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:

@@ -66,8 +66,8 @@ def _binned(time_s: Array, values: Array) -> tuple[Array, Array]:
 
 
 def _both(before: Array, after: Array) -> tuple[tuple[Array, str, str], ...]:
-    if np.array_equal(before, after):  # nothing was named: one would hide the other
-        return ((before, BEFORE, "nothing named"),)
+    if np.array_equal(before, after):  # no finding: one would hide the other
+        return ((before, BEFORE, "no finding"),)
     return (before, BEFORE, "before"), (after, AFTER, "after")
 
 
@@ -92,7 +92,7 @@ def residual(found: Diagnosis, drawn: Drawn) -> Figure:
 
 
 def evidence(found: Diagnosis, drawn: Drawn) -> Figure:
-    """Nats of every candidate in the first round, the strongest on top; named ones in blue."""
+    """Nats of every candidate in the first round, the strongest on top; findings in blue."""
     named = {finding.effect for finding in found.findings}
     ranked = sorted(drawn.evidence.items(), key=lambda item: -item[1])[:14]
     figure = _figure(0.5 + 0.24 * max(len(ranked), 2))
@@ -109,7 +109,7 @@ def evidence(found: Diagnosis, drawn: Drawn) -> Figure:
 
 
 def contribution(one: Contribution) -> Figure:
-    """What a named effect adds to the readings over time."""
+    """What a finding adds to the readings over time."""
     figure = _figure(2.0)
     axes = figure.axes[0]
     for k in range(3):
@@ -126,8 +126,8 @@ def validation(found: Validation) -> Figure:
     bars = {
         "calibration alone": (0.0, GREY),
         "time-shifted copies": (found.placebo, BEFORE),
-        "named": (found.named, AFTER),
-        "named, rest drawn freely": (found.named + found.free, SERIES[1]),
+        "with the findings": (found.named, AFTER),
+        "with a free time series as well": (found.named + found.free, SERIES[1]),
     }
     figure = _figure(1.7)
     axes = figure.axes[0]
@@ -143,7 +143,7 @@ def validation(found: Validation) -> Figure:
 
 
 def regime_map(maps: tuple[RegimeMap, ...]) -> Figure:
-    """What is left by condition: a row a quantity, low values left, before and after."""
+    """The residual by condition: a row a quantity, low values left, before and after."""
     rows = maps[:_REGIMES]
     highest = max(max(one.before + one.after) for one in rows)
     colours = LogNorm(1.0, max(highest, 10.0), clip=True)
@@ -164,7 +164,7 @@ def regime_map(maps: tuple[RegimeMap, ...]) -> Figure:
         axes.set_title(side)
         axes.grid(visible=False)
         figure.colorbar(drawn, ax=axes, label="nats")
-    figure.axes[1].set_xlabel("low to high, as many samples in every bin")
+    figure.axes[1].set_xlabel("low to high, equally many samples in every bin")
     return figure
 
 
@@ -174,7 +174,7 @@ def _plain(name: str) -> str:
 
 
 def courses(drawn: Drawn) -> Figure:
-    """What is left after the named effects, in the three frames, by segments of time."""
+    """What remains with the findings in the model, in the three frames, by segments of time."""
     shown = [one for one in drawn.courses if len(one.course)]
     figure = _figure(0.4 + 1.5 * max(len(shown), 1), max(len(shown), 1))
     for axes, one in zip(figure.axes, shown, strict=False):
@@ -193,7 +193,7 @@ def courses(drawn: Drawn) -> Figure:
 
 
 def spectrum(drawn: Drawn) -> Figure:
-    """Power of the whitened innovations by frequency, all axes: 1 where nothing is left."""
+    """Power of the whitened innovations by frequency, all axes: 1 where nothing remains."""
     figure = _figure(2.4)
     axes = figure.axes[0]
     for values, color, name in _both(drawn.before, drawn.after):
@@ -210,7 +210,7 @@ def spectrum(drawn: Drawn) -> Figure:
 
 
 def spectrum_is_worse(drawn: Drawn) -> bool:
-    """Whether the innovations after the named effects are farther from 1 than those before."""
+    """Whether the innovations with the findings are farther from 1 than those without."""
     if np.array_equal(drawn.before, drawn.after):
         return False
     before, after = (
@@ -230,7 +230,7 @@ def stands_out(drawn: Drawn) -> bool:
 
 
 def grey_ones_are_longer(found: Diagnosis, drawn: Drawn) -> bool:
-    """Whether an effect that was not named explains more alone than one that was."""
+    """Whether an effect that is no finding explains more alone than one that is."""
     named = {finding.effect for finding in found.findings}
     blue = [nats for name, nats in drawn.evidence.items() if name in named]
     grey = [nats for name, nats in drawn.evidence.items() if name not in named]
@@ -260,35 +260,36 @@ def _log_log(axes: Axes) -> None:
 
 
 _MG = 1e3
-#: what each picture is called, and what is said below it
+#: the title of each picture, and its caption
 _OVER_TIME = (
     "innovations over time, before and after",
-    "Readings less what the model expected of them a moment before, before (orange) and after "
-    "(blue) the effects above; the places that were found are shaded.",
+    "Readings minus the filter's prediction, without (orange) and with (blue) the effects above; "
+    "the intervals of the findings are shaded.",
 )
 _BY_FREQUENCY = (
     "spectrum of the innovations",
-    "The same by frequency: 1 everywhere where nothing is left.",
+    "The same by frequency: 1 everywhere if nothing remains.",
 )
 _BY_NAME = (
     "evidence of every effect",
-    "How much every effect alone would explain; named ones in blue. The line is what a name needs.",
+    "How much every effect alone would explain; findings in blue. The line is the evidence that a "
+    "finding needs.",
 )
-#: said below the spectrum where the blue curve is the worse one
+#: added below the spectrum where the blue curve is the worse one
 _WORSE_SPECTRUM = (
-    "Here it is farther from 1 after than before: the named effects explain the readings where "
-    "they are located, not how the innovations spread over the frequencies."
+    "Here it is farther from 1 after than before: the findings explain the readings in their "
+    "intervals, not the distribution of the innovations over frequency."
 )
-#: said below the bars where an effect that was not named has the longer bar
+#: added below the bars where an effect that is no finding has the longer bar
 _LOST = (
     "A longer grey bar is no contradiction: each bar is of one effect without any other. What a "
-    "grey one explains, the named ones explain as well; beside them it adds less than a name "
+    "grey effect explains, the findings explain as well. Next to them it adds less than a finding "
     "needs, or it fails on parts of the recording that were not fitted."
 )
 #: the statistics of the checks, in words
 _STATISTICS = {
-    "normalised_innovation": "mean square of the innovations, 1: as the noise says",
-    "autocorrelation": "how much innovations remember of those before them",
+    "normalised_innovation": "mean square of the innovations (1: as the noise level predicts)",
+    "autocorrelation": "autocorrelation of the innovations",
     "shift_sensor": "longest shift of their mean, axes of the sensor",
     "shift_world": "longest shift of their mean, axes of the world",
     "shift_turn": "longest shift of their mean, across the field",
@@ -300,18 +301,19 @@ _STATISTICS = {
 }
 _BY_CONDITION = (
     "residual by condition",
-    "Under which conditions readings and model differ, before and after: a row a quantity, low "
-    "values left, high ones right. Dark is much; noise alone has 1 to 3.",
+    "Under which conditions readings and model differ, without and with the effects above. Each "
+    "row is one quantity, from low values (left) to high ones (right). Dark is much; noise alone "
+    "gives 1 to 3.",
 )
 _NOT_FITTED = (
     "gain on parts that were not fitted",
     "What the models gain over the calibration alone on parts of the recording that they were not "
-    "fitted to. Moved in time: the same effects where they cannot be.",
+    "fitted to. Time-shifted copies are the same effects at times where they cannot be.",
 )
 _BY_FRAME = (
     "residual by frame",
-    "What is left after the named effects, drawn freely in three frames; grey: two standard "
-    "deviations.",
+    "What remains with the findings in the model, as a free time series in three frames; grey: "
+    "two standard deviations.",
 )
 
 
@@ -410,8 +412,8 @@ def _how_real(found: Diagnosis) -> str:
 
     if found.drawn is not None and found.drawn.courses and not stands_out(found.drawn):
         return (
-            "All of it together is more than chance, but at no moment does it leave its own "
-            "uncertainty band: that it exists is known, its time series is not."
+            "As a whole it is more than chance, but at no moment does it exceed its own "
+            "uncertainty band: it exists, but its time series is not known."
         )
     return "It is real: it has a place and a size."
 

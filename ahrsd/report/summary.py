@@ -28,8 +28,8 @@ from ahrsd.stream.decompensation import Compensation
 
 
 _TABLE_IS_RAW = (
-    "a table says nothing of registers: it was taken as raw, so the result holds on top of "
-    "whatever registers 23, 26 and 84 did to it"
+    "a table does not say what the registers held: it was taken as raw, so the result comes on "
+    "top of what registers 23, 26 and 84 did to it"
 )
 _NAMES = (*(f"hard iron {a}" for a in "xyz"), *(f"gyro bias {a}" for a in "xyz"))
 _DIGITS = 6  # of times in the summary: microseconds

@@ -417,7 +417,7 @@ class Stream:
             self.facts.layout, self._steps, self._attitude = layout.name, None, None
             field, rates = layout.name.split(" + ")
             self.warnings[
-                f"the field comes in {field} and the rates in {rates}: put together by their time"
+                f"the field comes in {field} and the rates in {rates}: matched by their time"
             ] = None
             self.warnings.update(dict.fromkeys(old.warnings))
         return old if old.layout is layout else None
@@ -544,9 +544,9 @@ class Stream:
         self.warnings.pop(self._turns_said, None)
         share = 100.0 * turns.missing / (turns.missing + self.by_layout[self.facts.layout])
         self._turns_said = (
-            f"messages are missing without a trace in the bytes: at "
+            f"messages are missing although the bytes show no gap: at "
             f"{counted(turns.places, 'place')} the device turned further than its rate explains "
-            f"(about {share:.0f} % of all are missing); the steps there are left out; was the "
+            f"(about {share:.0f} % of all are missing); these steps are not used; was the "
             "recording computer too slow?"
         )
         self.warnings[self._turns_said] = None

@@ -276,7 +276,7 @@ class Extractor:
         if self.gyro_compensated:
             texts.append(
                 f"{name} carries the compensated rate: the device's filter has already removed its "
-                "own bias estimate, so the gyro bias found here is only the rest of it"
+                "own bias estimate, so the gyro bias found here is only what remains of it"
             )
         return tuple(texts)
 

@@ -94,7 +94,7 @@ def _capture(status: Status) -> Samples:
 
 
 METRICS: Final = (
-    MetricRow("ahrsd_link_up", "gauge", "The port is open", (), _number("link", "open")),
+    MetricRow("ahrsd_link_up", "gauge", "1 if the port is open", (), _number("link", "open")),
     MetricRow("ahrsd_bytes", "counter", "Bytes from the device", (), _number("link", "bytes")),
     MetricRow("ahrsd_messages", "counter", "Valid messages", (), _number("stream", "messages")),
     MetricRow("ahrsd_rejected", "counter", "Messages refused", (), _number("stream", "rejected")),
@@ -119,14 +119,14 @@ METRICS: Final = (
     MetricRow(
         "ahrsd_heading_sigma_degrees",
         "gauge",
-        "Heading, worst 1 sigma",
+        "Heading error (1 sigma), worst attitude",
         (),
         _number("estimate", "heading_sigma_deg"),
     ),
     MetricRow(
         "ahrsd_converged",
         "gauge",
-        "The estimate has converged",
+        "1 if the estimate has converged",
         (),
         _number("estimate", "converged"),
     ),
@@ -144,9 +144,11 @@ METRICS: Final = (
         ("axis",),
         _axes("estimate", "gyro_bias_rad_s"),
     ),
-    MetricRow("ahrsd_gate_open", "gauge", "1 where the gate holds nothing back", ("gate",), _gates),
-    MetricRow("ahrsd_state", "gauge", "1 for the write-back's state", ("state",), _states),
-    MetricRow("ahrsd_locked", "gauge", "A person locked the write-back", (), _locked),
+    MetricRow("ahrsd_gate_open", "gauge", "1 if the gate is open", ("gate",), _gates),
+    MetricRow(
+        "ahrsd_state", "gauge", "1 for the present state of the write-back", ("state",), _states
+    ),
+    MetricRow("ahrsd_locked", "gauge", "1 if a person locked the write-back", (), _locked),
     MetricRow(
         "ahrsd_flash_writes",
         "counter",
@@ -154,20 +156,26 @@ METRICS: Final = (
         (),
         _number("write_back", "flashes"),
     ),
-    MetricRow("ahrsd_capture_failing", "gauge", "Records are being lost", (), _capture),
+    MetricRow("ahrsd_capture_failing", "gauge", "1 if records are being lost", (), _capture),
     MetricRow(
         "ahrsd_viewer_dropped",
         "counter",
-        "Batches that the viewer did not take",
+        "Batches that the viewer did not accept",
         (),
         _number("viewer", "dropped"),
     ),
-    MetricRow("ahrsd_share_open", "gauge", "Somebody reads it", ("share",), _shares("open")),
+    MetricRow(
+        "ahrsd_share_open",
+        "gauge",
+        "1 if the shared port has a reader",
+        ("share",),
+        _shares("open"),
+    ),
     MetricRow("ahrsd_share_readers", "gauge", "Readers over TCP", ("share",), _shares("readers")),
     MetricRow(
         "ahrsd_share_lost_bytes",
         "counter",
-        "Bytes that readers lost who were too slow",
+        "Bytes lost by readers that were too slow",
         ("share",),
         _shares("lost_bytes"),
     ),
@@ -181,14 +189,14 @@ METRICS: Final = (
     MetricRow(
         "ahrsd_share_ignored_bytes",
         "counter",
-        "Bytes that readers sent, who can write nothing",
+        "Bytes sent by readers, which may not write",
         ("share",),
         _shares("ignored_bytes"),
     ),
     MetricRow(
         "ahrsd_share_commands",
         "counter",
-        "Commands of clients, by what became of them",
+        "Commands of clients, by outcome",
         ("share", "outcome"),
         _commands,
     ),

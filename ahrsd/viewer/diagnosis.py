@@ -74,7 +74,7 @@ def _spans(stream: rr.RecordingStream, found: Diagnosis, drawn: Drawn) -> None:
     left = found.unexplained.where
     told = rr.TextLog("unknown, here", level=rr.TextLogLevel.WARN)
     if ordinary_residual(found) is not None:
-        told = rr.TextLog("left here, and ordinary", level=rr.TextLogLevel.INFO)
+        told = rr.TextLog("ordinary residual, here", level=rr.TextLogLevel.INFO)
     for begin, _ in () if left is None else left.intervals_s:
         stream.set_time(_TIME, duration=float(max(begin, drawn.time_s[0])))
         stream.log("log", told)

@@ -217,8 +217,8 @@ def _describe_worsening(metrics: TrialMetrics, factor: float) -> str | None:
         )
     if metrics.new_swing > metrics.old_swing * factor:
         return (
-            f"carried by the gyroscope the field moves by {metrics.new_swing:.2%}, with a register "
-            f"put back by {metrics.old_swing:.2%}"
+            f"propagated by the gyroscope, the field changes by {metrics.new_swing:.2%}, with a "
+            f"register put back by {metrics.old_swing:.2%}"
         )
     return None
 

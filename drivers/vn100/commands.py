@@ -69,7 +69,7 @@ class LinkGone(SessionError):
     """The port went away; nothing more can be sent, not even to tidy up."""
 
     def __init__(self) -> None:
-        super().__init__("the port went away in the middle of a command sequence")
+        super().__init__("the port disappeared during a command sequence")
 
 
 class Cancelled(SessionError):
@@ -617,7 +617,7 @@ def asked_of(known: Seen, command: Speech) -> Procedure[Reply]:
         except TooLate:
             if not left:
                 raise
-    raise AssertionError("no try is left")
+    raise AssertionError("no attempt is left")
 
 
 def identify_in(seconds: float) -> Procedure[Identity]:

@@ -143,8 +143,8 @@ class LineEchoes:
 
 
 ECHOES = (
-    "the line sends back what is sent (an adapter or terminal that echoes): echoes are told from "
-    "answers and left out"
+    "the line sends back what is sent (an adapter or terminal that echoes): echoes are "
+    "distinguished from answers and left out"
 )
 
 

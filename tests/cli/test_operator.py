@@ -92,7 +92,7 @@ def test_a_word_that_lay_there_at_the_start_is_dropped_and_answered(box, caplog)
     inbox = OperatorInbox(box)
     found = answer_of(box, name)
     assert found["accepted"] is False
-    assert "before this run of the daemon began" in found["text"]
+    assert "before this run of the daemon started" in found["text"]
     assert inbox.take() == []
     inbox.close(10.0)
 
@@ -105,7 +105,7 @@ def test_a_word_is_of_now_where_somebody_looked_in_time(box, inbox, monkeypatch)
     with box.open() as folder:
         inbox._looked_s -= 2 * LONGEST_S
         inbox._look(folder, inbox._looked_s + 2 * LONGEST_S)
-    assert "nobody looked for more than 30 s" in answer_of(box, name)["text"]
+    assert "the daemon read no commands for more than 30 s" in answer_of(box, name)["text"]
     assert inbox.take() == []
 
 
@@ -117,10 +117,10 @@ def test_a_word_is_of_now_where_somebody_looked_in_time(box, inbox, monkeypatch)
 def test_what_is_not_a_word_does_nothing_and_goes(box, inbox, body, caplog):
     (box.folder / ".1").write_bytes(body)
     (box.folder / ".1").rename(box.folder / "1.json")
-    assert "is not a word" in answer_of(box, "1")["text"]
+    assert "is not a command" in answer_of(box, "1")["text"]
     assert inbox.take() == []
     assert not (box.folder / "1.json").exists()
-    assert "is not a word" in caplog.text
+    assert "is not a command" in caplog.text
 
 
 @pytest.mark.parametrize("kind", ["folder", "FIFO", "link"])
@@ -133,11 +133,11 @@ def test_an_odd_entry_is_complained_about_once_and_left_alone(box, inbox, tmp_pa
     else:
         (tmp_path / "secret").write_text('{"verb": "arm", "argument": ""}')
         path.symlink_to(tmp_path / "secret")
-    until(lambda: "x.json is not a word" in caplog.text)
+    until(lambda: "x.json is not a command" in caplog.text)
     for _ in range(3):  # turns later
         before = inbox._looked_s
         until(lambda before=before: inbox._looked_s > before)
-    assert caplog.text.count("x.json is not a word") == 1
+    assert caplog.text.count("x.json is not a command") == 1
     assert inbox.take() == []
     assert path.is_symlink() or path.exists()
     box.put("lock", "it goes on")
@@ -197,7 +197,7 @@ def test_a_folder_that_becomes_writable_for_others_in_the_run_is_refused_too(box
         time.sleep(0.1)
         assert "others than its owner may write there" in inbox.fault
     box.folder.chmod(0o700)
-    assert "before this run of the daemon began to look" in answer_of(box, "1")["text"]
+    assert "before this run of the daemon started to read commands" in answer_of(box, "1")["text"]
     assert inbox.take() == []
 
 
@@ -306,7 +306,7 @@ def test_a_lock_that_the_journal_did_not_take_is_refused(core):
 def test_the_command_says_that_nobody_listens(run, tmp_path, box, capsys, monkeypatch):
     monkeypatch.setattr("ahrsd.cli.running.daemon._WAIT_S", 0.1)
     assert run("operator", "lock", "--state-directory", tmp_path) == 75
-    assert capsys.readouterr().err == "ahrsd: no daemon took the word within 0 s\n"
+    assert capsys.readouterr().err == "ahrsd: no daemon took the command within 0 s\n"
     assert list(box.folder.iterdir()) == []  # nothing is left that a later daemon might take
     assert run("operator", "lock", "--state-directory", tmp_path / "other") == 75
 

@@ -108,7 +108,7 @@ def test_where_a_daemon_runs_it_is_told_and_its_journal_is_left_alone(here, tmp_
     assert words == [("lock", "crew aboard"), ("unlock", "gone"), ("lock", "again")]
     assert list(tmp_path.glob("*.jsonl")) == []
     said = capsys.readouterr()
-    assert "the daemon heard it" in said.out
+    assert "the daemon accepted it" in said.out
     assert "the daemon refused: said" in said.err
 
 
@@ -137,7 +137,7 @@ def test_a_daemon_with_another_device_is_not_told(here, tmp_path, monkeypatch, c
     assert kinds(tmp_path) == ["LOCKED"]
     monkeypatch.setattr("ahrsd.cli.device.registers.DaemonConnection", answers(SERIAL))
     assert here("registers", "unlock", "gone", "--serial", SERIAL) == 0
-    assert "the daemon heard it" in capsys.readouterr().out
+    assert "the daemon accepted it" in capsys.readouterr().out
     assert kinds(tmp_path) == ["LOCKED"]
 
 

@@ -104,11 +104,11 @@ def test_a_right_file_is_taken_once(file):
     file.write_text('mode = "stage"\n[gates]\nmax_heading_sigma_deg = 0.5\n')
     assert taken(reloader, applied) == [
         (True, "configuration read again: gates.max_heading_sigma_deg = 0.5"),
-        (False, "not before the next start: mode"),
+        (False, "these settings change at the next start only: mode"),
     ]
     assert len(applied) == 1
     assert taken(reloader, applied)[0] == (
-        True, "configuration read again: nothing that may change now has changed"
+        True, "configuration read again: no setting that may change during a run has changed"
     )  # fmt: skip
     assert len(applied) == 1
 
@@ -178,7 +178,7 @@ def test_a_running_daemon_takes_it_on_sighup(emulated, tmp_path):
         finally:
             process.terminate()
             assert process.wait(PATIENCE_S) == 0, log.read_text()
-    assert "not before the next start" not in log.read_text()
+    assert "change at the next start only" not in log.read_text()
     (capture,) = (tmp_path / "captures").glob("*.mcap")
     (item,) = [i for i in CaptureReader(capture) if isinstance(i, LimitsChanged)]
     assert item.limits["max_heading_sigma_deg"] == 0.5

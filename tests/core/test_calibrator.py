@@ -180,7 +180,7 @@ def test_what_is_left_over_is_told_once_and_judged():
         places[size_gauss] = gates["field.place"]
     assert told[0.0] == []
     (text,) = told[5e-4]
-    assert text.startswith("what is left follows the attitude: 0.")
+    assert text.startswith("the residual follows the attitude: 0.")
     assert text.endswith(" mG; run `ahrsd diagnose` on the recording")
     assert places[0.0].ok
     assert not places[5e-4].ok

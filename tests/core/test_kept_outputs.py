@@ -247,7 +247,7 @@ def test_no_save_takes_a_killed_sessions_outputs_along(configure):
     run.run(20.0)
     assert run.saves == (1 if configure else 0)
     assert outputs(run.emulator.memory.flash) == users
-    told = [text for _, text in run.notes if "session that was killed" in text]
+    told = [text for _, text in run.notes if "outputs of a killed session" in text]
     assert len(told) == 1
     assert ("$VNWRG,75," in told[0]) and ("nothing is saved" in told[0]) is not configure
 
@@ -302,12 +302,12 @@ def test_a_program_that_is_killed_and_the_next_one(emulated, tmp_path):
             restored = emulator.memory.ram == users
             assert restored is (number is signal.SIGTERM)
         assert running.returncode == 0
-        assert b"outputs of a session that was killed" in err
+        assert b"still has the outputs of a killed session" in err
     (journal,) = tmp_path.glob("journal-*.jsonl")
     written = [json.loads(line)["kind"] for line in journal.read_text().splitlines()]
     assert written == ["OUTPUTS_KEPT", "OUTPUTS_BACK"]
     capture = max(tmp_path.glob("captures/*.mcap"), key=lambda path: path.stat().st_mtime_ns)
     sent, texts = sent_in(capture)
-    assert any("outputs of a session that was killed" in text for text in texts)
+    assert any("still has the outputs of a killed session" in text for text in texts)
     assert b"$VNWRG,06,14" in sent
     assert bytes(heard).endswith(sent)

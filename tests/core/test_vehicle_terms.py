@@ -90,7 +90,7 @@ def test_the_term_is_subtracted_and_a_missing_column_is_a_gap():
     assert free.without_terms(block(host_s)) is None
     assert free.waits_for == ("motor_current_a",)
     assert said == [
-        "mag_time_lag is in the model and does not follow a column from sample to sample: it stays "
+        "mag_time_lag is in the model but is no function of a column, sample by sample: it stays "
         "in the readings",
         "calibrated without motor_current_field (motor_current_a)",
         "samples without motor_current_a are not calibrated",

@@ -137,7 +137,7 @@ def test_a_message_of_no_use_keeps_running_and_says_what_to_configure(live, capl
 def test_a_device_that_refuses_every_write_keeps_its_output(live):
     stream = {"configure_stream": True, "rate_hz": 50.0}
     with live({"output": "imu", "faults": ("refused_write",)}, device=stream) as daemon:
-        daemon.until(lambda: daemon.noted("output cannot be set up, the device's own stays"))
+        daemon.until(lambda: daemon.noted("output cannot be set up, its own output stays"))
         daemon.flowing()
         assert daemon.core.registers[23][0] == 1.0
         assert daemon.stop() < LIMIT_S

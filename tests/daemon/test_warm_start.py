@@ -174,9 +174,9 @@ def warmed(run=None, clock=NOW, limit_s=LIMIT_S):
         ({"registers": {**FACTORY, 44: (1, 3, 5)}}, {}, {}, "register 44 held other values then"),
         ({"registers": {44: (0, 1, 5)}}, {}, {}, "register 23 held other values then"),
         ({"boot_s": 3100.0}, {}, {}, "32 min old, more than 30 min"),
-        ({"boot_s": 5001.0}, {}, {}, "of the future"),
-        ({"boot_id": "another"}, {}, {}, "of before the computer started"),
-        ({"boot_id": ""}, {}, {}, "nobody knows how old"),
+        ({"boot_s": 5001.0}, {}, {}, "in the future"),
+        ({"boot_id": "another"}, {}, {}, "from before the computer was started"),
+        ({"boot_id": ""}, {}, {}, "their age is not known"),
         ({}, {}, {"wall_s": 1.8e9 + 86400.0}, "by the wall clock"),
         ({}, {"open": True}, {}, "a write is under way or on trial"),
         ({}, {"terms": True}, {}, "terms.model is set"),
@@ -345,7 +345,7 @@ def test_a_damaged_capture_is_not_used(short, tmp_path):
 
 def test_nor_one_of_another_boot_or_an_old_one(short, tmp_path):
     (run,) = read_again(short, tmp_path, boot_id="another")
-    assert "of before the computer started" in run.why
+    assert "from before the computer was started" in run.why
     (run,) = read_again(short, tmp_path, later_s=LIMIT_S + 60.0)
     assert "min old, more than 30 min" in run.why or "no reading" in run.why
 

@@ -281,5 +281,5 @@ def test_a_row_without_acceleration_is_filled(saved, clean):
     accel[100] = math.nan
     more = {f"accel_{a}_m_s2": v for a, v in zip("xyz", accel.T, strict=True)}
     track, notes = load_track(saved({**clean, **more}))
-    assert "no acceleration in 1 row: the gyro carried it over from those beside" in notes
+    assert "no acceleration in 1 row: filled from the rows next to it, turned by the gyro" in notes
     assert track.accel_b_m_s2 is not None

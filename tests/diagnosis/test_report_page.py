@@ -120,7 +120,7 @@ def test_the_words_of_a_diagnosis():
         "   or else    vibration_rectification 2.0%",
         "   to be sure pulse the motor at rest on one heading",
         "",
-        "unknown, here (nothing in the library explains it):",
+        "unknown, here (no effect of the library explains it):",
     ]
 
 
@@ -135,7 +135,7 @@ def test_one_line_where_before_and_after_are_the_same():
 
     assert labels(drawn) == ["before", "after"]
     alike = replace(drawn, after_gauss=drawn.before_gauss)
-    assert labels(alike) == ["nothing named"]
+    assert labels(alike) == ["no finding"]
 
 
 def page_of(found, folder):
@@ -203,13 +203,13 @@ def test_what_stays_in_its_own_band_is_not_called_real(tmp_path, size, real):
     found = replace(found, drawn=replace(found.drawn, courses=(drawn_course,)))
     text = page_of(found, tmp_path)
     assert ("It is real" in text) is real
-    assert ("at no moment does it leave its own" in text) is not real
+    assert ("at no moment does it exceed its own" in text) is not real
 
 
 def test_statistics_are_named_in_words(usual):
     text = usual.read_text()
-    assert "how much innovations remember of those before them" in text
-    assert "mean square of the innovations, 1: as the noise says" in text
+    assert "autocorrelation of the innovations" in text
+    assert "mean square of the innovations (1: as the noise level predicts)" in text
     assert ">autocorrelation<" not in text
 
 

@@ -213,7 +213,7 @@ def test_what_makes_the_most_of_the_sigma_is_named_with_what_would_shrink_it():
     field = rich.block.raw_b_gauss + 0.02 * np.sin(3.0 * rich.block.raw_b_gauss / 0.1)
     place = answer(replace(rich, block=replace(rich.block, raw_b_gauss=field)))
     assert "the field differs with place or attitude" in place.widened_by
-    assert "`ahrsd diagnose` of the recording says what it is" in place.widened_by
+    assert "run `ahrsd diagnose` on the recording to find the cause" in place.widened_by
 
 
 def test_axes_that_are_turned_count_as_what_they_make_of_the_heading():
@@ -248,9 +248,9 @@ def test_what_no_motion_has_told_is_not_blamed_on_the_field():
         found = answer(wandering(pieces.drive(((motion, 160.0),), 3), 0.01))
         assert found.misfit > 5.0
         names[name] = found.widened_by
-    assert "the motion so far tells too little: roll by 30 deg" in names["level"]
-    assert "the motion so far tells too little: " in names["straight"]
-    assert "or places that were passed by" in names["rolling"]
+    assert "the motion so far does not determine enough: roll by 30 deg" in names["level"]
+    assert "the motion so far does not determine enough: " in names["straight"]
+    assert "or the field differs along the way" in names["rolling"]
 
 
 def slowly_noisy(made, size_gauss, forgets_s, *, at_rest):
@@ -272,11 +272,11 @@ def test_noise_that_is_not_white_is_no_place():
     noisy = answer(slowly_noisy(pieces.drive(PAUSED, 1), 0.006, 1.0, at_rest=True))
     assert noisy.heading_sigma_deg > 0.5
     assert "the magnetometer's noise is not white" in noisy.widened_by
-    assert "another place changes nothing" in noisy.widened_by
+    assert "another place does not help" in noisy.widened_by
     placed = answer(slowly_noisy(pieces.drive(PAUSED, 1), 0.006, 1.0, at_rest=False))
     assert "the field differs with place or attitude" in placed.widened_by
     moving = answer(slowly_noisy(pieces.drive(RICH, 1), 0.006, 1.0, at_rest=True))
-    assert "a minute at rest tells" in moving.widened_by
+    assert "a minute at rest shows which" in moving.widened_by
 
 
 def test_shares_of_motion_and_misfit_by_hand():

@@ -76,7 +76,7 @@ def test_what_is_left_is_named_and_within_the_sigmas(motion, trouble, follows):
         made = pieces.drive(motion, seed)
         found = answer(made, trouble(made, seed, 1e-3))
         what, size_mg = named_mg(found)
-        assert what == f"what is left follows {follows}"
+        assert what == f"the residual follows {follows}"
         assert 0.15 < size_mg < 2.0
         assert beyond(made, found) < 3.5
 
@@ -124,7 +124,7 @@ def test_a_stream_names_it_as_a_recording_does():
             said.append(bool(found.warnings))
     assert said[-1]
     assert not any(said[:2])  # of directions that were seen once nobody can tell
-    assert named_mg(estimator.finish())[0] == "what is left follows the attitude"
+    assert named_mg(estimator.finish())[0] == "the residual follows the attitude"
 
 
 def test_an_answer_is_no_less_wide_than_what_is_left_makes_it():
@@ -136,7 +136,7 @@ def test_an_answer_is_no_less_wide_than_what_is_left_makes_it():
     np.testing.assert_allclose(wider, np.diag([*[3.0] * 6, *[8.0] * 6]), atol=1e-12)
     assert widen_covariance(tempered, plain, None) is tempered
     assert left.words == (
-        "what is left follows the attitude: 1 mG; run `ahrsd diagnose` on the recording"
+        "the residual follows the attitude: 1 mG; run `ahrsd diagnose` on the recording"
     )
     assert replace(left, nats=11.0).words == ""
 

@@ -172,13 +172,13 @@ def test_a_room_is_never_saved_for_good(good) -> None:
     told = red(put(good, "estimate.place_deg", 0.3))
     assert set(told) == {"field.place"}
     assert (
-        "what the field does beside iron may make 0.30 deg of heading (limit 0.03)"
+        "what the model does not explain may cause 0.30 deg of heading error (limit 0.03)"
         in (told["field.place"])
     )
     assert "gravity is needed" in red(put(good, "estimate.place_deg", math.nan))["field.place"]
 
 
-LEVEL_TOO_FEW = "the motion so far tells too little: turn through all headings"
+LEVEL_TOO_FEW = "the motion so far does not determine enough: turn through all headings"
 
 
 @pytest.mark.parametrize("gate", ["observability.converged", "observability.heading_sigma"])
@@ -195,7 +195,12 @@ def test_advice_is_what_makes_the_most_of_the_doubt(good, gate) -> None:
         (3.0, 4.0, "pitch and roll by 30 deg if the vehicle can (so far roll +-3, pitch +-4 deg)"),
         (3.0, 41.0, "roll by 30 deg if the vehicle can (so far roll +-3, pitch +-41 deg)"),
         (31.0, 4.0, "pitch by 30 deg if the vehicle can (so far roll +-31, pitch +-4 deg)"),
-        (31.0, 41.0, "tilt was shown (so far roll +-31, pitch +-41 deg)"),
+        (
+            31.0,
+            41.0,
+            "repeat this tilt on other headings, slowly and fast (so far roll +-31, pitch +-41 "
+            "deg)",
+        ),
         (math.nan, math.nan, "pitch and roll by 30 deg if the vehicle can (tilt not known yet)"),
     ],
 )
@@ -204,7 +209,7 @@ def test_tilt_that_was_shown_is_not_asked_for_again(good, roll_deg, pitch_deg, a
     stopped = red(put(put(seen, "estimate.score", 0.1), "world.inclination_error_deg", 9.0))
     for gate in ("observability.score", "field.inclination"):
         assert stopped[gate].endswith(asked)
-    assert ("if the vehicle can" in stopped["observability.score"]) == ("shown" not in asked)
+    assert ("if the vehicle can" in stopped["observability.score"]) == ("repeat" not in asked)
 
 
 def test_what_is_in_force_and_good_is_left_alone(world) -> None:
@@ -233,7 +238,7 @@ def test_a_stream_without_gravity_never_passes(world) -> None:
     ("field", "value", "gate", "words"),
     [
         ("registers_read", False, "input_basis.registers_read", "registers are not known"),
-        ("changed", True, "input_basis.changed", "was changed meanwhile"),
+        ("changed", True, "input_basis.changed", "was changed during this run"),
         ("hsi_applied", True, "input_basis.hsi_applied", "set register 44 to 0,1,5"),
         ("compensated_only", True, "input_basis.compensated_only", "use VNIMU"),
         ("firmware_known", False, "input_basis.firmware_known", "firmware is unknown"),

@@ -146,7 +146,8 @@ def test_the_page_in_a_browser(said, out, tmp_path, width_px):
     assert [complete and width > 0 for _, width, complete in seen["pictures"]] == [True, True]
     assert seen["width"] <= seen["window"]
     assert seen["headings"] == [
-        "Fleet out", "Devices, worst first", "Drift", "Findings by vehicle", "What gave no answer",
+        "Fleet out", "Devices, worst first", "Drift", "Findings by vehicle",
+        "Recordings without an answer",
     ]  # fmt: skip
 
 

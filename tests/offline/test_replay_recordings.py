@@ -155,7 +155,7 @@ def test_what_a_reader_must_know_is_said_once(replayed):
     found = replayed("walk_square_2024_sazgar.vnraw.gz")
     said = warnings_of(found.done.core, found.done.warnings)
     assert len(said) == len(set(said))
-    assert sum("missing without a trace" in text for text in said) == 1
+    assert sum("missing although the bytes show no gap" in text for text in said) == 1
 
 
 def test_a_message_without_a_magnetometer_is_one_line_and_exit_2(run, recordings, capsys):
@@ -187,7 +187,10 @@ def test_tables_replay(recordings, name):
     assert summary["samples"] > 500
     assert summary["bytes"] == 0
     assert summary["rate_source"] == "time_s"
-    assert any("a table says nothing of registers" in w for w in summary["calibration"]["warnings"])
+    assert any(
+        "a table does not say what the registers held" in w
+        for w in summary["calibration"]["warnings"]
+    )
 
 
 @pytest.mark.slow

@@ -101,11 +101,9 @@ def test_next_countdown_and_drive(gathering, qualified):
     pace.take(gathering)
     assert view.countdown(gathering, pace) == ""  # it looks for a moment only
     pace.take(gathering | {"at_s": gathering["at_s"] + 25.0})
-    assert view.countdown(gathering, pace) == (
-        "nobody can say how long: 2 gates did not come nearer lately"
-    )
+    assert view.countdown(gathering, pace) == ("time not known: 2 gates made no progress lately")
     assert view.drive(gathering) == (
-        "Keep turning: enough directions were shown, and are to be proven on new data."
+        "Keep turning: enough directions are covered; now the estimate is tested on new data."
     )
     for at_s in (200.0, 230.0):
         gathering["at_s"] = at_s
@@ -236,7 +234,7 @@ def test_when_the_daemon_is_away_nothing_old_is_left(qualified, now_s, fault, wo
 
 def test_it_says_since_when(qualified):
     assert ", for 2 min." in sections(qualified, now_s=130.0)["alarms"]
-    assert "it was not heard before" in sections(None, now_s=3.0)["alarms"]
+    assert "nothing was received before" in sections(None, now_s=3.0)["alarms"]
 
 
 def test_a_daemon_of_another_version_is_told_not_guessed(qualified):

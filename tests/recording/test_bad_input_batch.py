@@ -204,7 +204,7 @@ def test_time_going_backwards(tmp_path, seed, row, back):
         assert f"row {row + 2}, column time_s: time goes back" in result
         return
     said = " ".join(result.all_warnings())
-    assert f"at row {row + 2} (" in said or "put behind the row of the same time" in said
+    assert f"at row {row + 2} (" in said or "time moved on after a row of the same time" in said
 
 
 @FEW

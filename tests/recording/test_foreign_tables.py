@@ -60,7 +60,7 @@ def sensor(count: int = COUNT, rate_hz: float = RATE_HZ, seed: int = 1) -> dict[
         pytest.param(
             (1, 0, 2),
             (1, 1, 1),
-            "the magnetometer is left-handed: its right x y z are its y x z",
+            "the magnetometer is left-handed: its correct x y z are its y x z",
             marks=pytest.mark.slow,
         ),
         pytest.param(
@@ -495,7 +495,7 @@ def test_holes_of_the_acceleration_are_carried_over(tmp_path, rows):
     true = np.column_stack([sensor()[name] for name in ACCEL])
     assert len(table.rows) == COUNT
     np.testing.assert_allclose(table.rows.accel_b_m_s2, true, atol=0.15)
-    assert ": the gyro carried it over from those beside" in table.notes[0]
+    assert ": filled from the rows next to it, turned by the gyro" in table.notes[0]
 
 
 def test_a_long_hole_is_left_out_and_too_many_leave_the_acceleration_out(tmp_path):

@@ -150,7 +150,7 @@ def test_a_text_mode_is_undone(tmp_path):
     path = tmp_path / "a.vnbin"
     path.write_bytes(b"".join(map(whole, range(COUNT))).replace(b"\n", b"\r\n"))
     warnings = is_right(path)
-    assert any("a text mode made CR LF of each LF" in text for text in warnings)
+    assert any("a text mode turned each LF of the packets into CR LF" in text for text in warnings)
 
 
 def test_a_true_stream_with_cr_lf_is_left_alone(tmp_path):
@@ -179,7 +179,7 @@ def test_field_and_rates_of_two_outputs_are_put_together(tmp_path, first, every)
     path = tmp_path / "a.vnbin"
     path.write_bytes(b"".join(parts))
     warnings = is_right(path, count=pytest.approx(COUNT, abs=6))
-    assert any("put together by their time" in text for text in warnings)
+    assert any("matched by their time" in text for text in warnings)
     assert abs(calibrate(path, Config()).estimate.mag_lag_s) < 0.5 / RATE_HZ
 
 

@@ -252,7 +252,9 @@ def test_counts_of_a_converter_have_a_number_for_a_unit(tmp_path):
     names = {MAG[k]: f"mag_{axis} (counts)" for k, axis in enumerate("xyz")}
     data = {**DATA, "mag": DATA["mag"] * 1090.0}
     columns = {names.get(name, name): values for name, values in cells(data).items()}
-    with pytest.raises(RecordingError, match=r"mag_x=mag_x \(counts\):NUMBER.*how many gauss"):
+    with pytest.raises(
+        RecordingError, match=r"mag_x=mag_x \(counts\):NUMBER.*one unit of the file, in gauss"
+    ):
         read(tmp_path, text(columns))
     said = ",".join(f"mag_{axis}=mag_{axis} (counts):{1 / 1090:.9g}" for axis in "xyz")
     table = read(tmp_path, text(columns), said)
@@ -304,7 +306,7 @@ def test_rows_that_repeat_all_readings_count_once(tmp_path):
     data = {key: values if key == "time_s" else held(values, 3) for key, values in DATA.items()}
     table = read(tmp_path, text(cells(data)))
     assert len(table.rows) == 267
-    assert "every reading is in 3 rows" in table.notes[0]
+    assert "every reading is repeated in 3 rows" in table.notes[0]
     np.testing.assert_allclose(table.rows.raw_b_gauss, DATA["mag"][::3], atol=1e-6)
     np.testing.assert_allclose(np.diff(table.rows.time_s), 0.15, atol=1e-6)
 
@@ -349,7 +351,7 @@ def test_readings_that_no_sensor_has_are_left_out(tmp_path, mark):
     table = read(tmp_path, text(columns))
     assert len(table.rows) == COUNT - 3
     assert table.starts == (0, 100)
-    assert "no such sensor has: 3 rows, first row 102" in table.notes[0]
+    assert "because of an impossible reading: 3 rows, first row 102" in table.notes[0]
 
 
 # -- other files -----------------------------------------------------------------------------------

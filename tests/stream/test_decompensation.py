@@ -153,7 +153,7 @@ def test_compensated_stream_is_used_and_said() -> None:
     assert extracted.gyro_rad_s.tolist() == [[9.0, 10.0, 11.0]]
     about_mag, about_gyro = extractor.warnings
     assert "compensated field" in about_mag
-    assert "only the rest" in about_gyro
+    assert "only what remains of it" in about_gyro
 
 
 def test_no_messages_make_empty_arrays() -> None:

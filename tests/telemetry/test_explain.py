@@ -215,7 +215,7 @@ def test_the_status_says_how_the_estimator_broke_off():
 
 
 def test_what_is_left_over_is_shown_with_the_estimate():
-    text = "what is left follows the attitude: 0.4 mG; run `ahrsd diagnose` on the recording"
+    text = "the residual follows the attitude: 0.4 mG; run `ahrsd diagnose` on the recording"
     explained = explain_json(status(estimate={"warnings": [text]}))
     assert explained["warnings"] == [text]
     assert f"estimate: {text}" in explain_lines(explained)

@@ -72,7 +72,7 @@ class _Session:
               help="File to write, *.mcap; it must not exist.")  # fmt: skip
 @click.option("--passive", is_flag=True, help="Send no byte; the registers stay unknown.")
 @click.option("--seconds", type=click.FloatRange(0.0, min_open=True), help="Stop after this long.")
-@click.option("--baud", type=int, help="The port's rate; without it each rate is listened at.")
+@click.option("--baud", type=int, help="The port's rate; without it, each rate is tried.")
 @click.option("--json", "json_path", help="Summary as JSON into this file, - for stdout.")
 def command(
     *,
@@ -86,7 +86,7 @@ def command(
     """Record what the device on PORT sends, until Ctrl-C.
 
     Nothing on the device is changed. Without --passive its identity and registers are read first
-    and go into the file, so that a replay knows which calibration the data already passed through.
+    and go into the file, so that a replay knows which calibration was already applied to the data.
     """
     if path.suffix != ".mcap":
         raise click.BadParameter(f"{path}: a capture's name ends in .mcap", param_hint="-o")

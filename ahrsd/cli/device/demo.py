@@ -29,17 +29,17 @@ def _program(name: str) -> str:
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("ahrsd-demo"),
     show_default=True,
-    help="Folder for what it leaves.",
+    help="Folder for its output.",
 )
 @click.option(
     "--seconds",
     type=click.FloatRange(60.0),
     default=2400.0,
     show_default=True,
-    help="Device time at most.",
+    help="Longest device time.",
 )
 @click.option(
-    "--seed", type=int, default=0, show_default=True, help="Which hidden truth, motion and noise."
+    "--seed", type=int, default=0, show_default=True, help="Chooses hidden truth, motion and noise."
 )
 @click.option(
     "--speed",
@@ -52,7 +52,7 @@ def command(directory: Path, seconds: float, seed: int, speed: float) -> None:
     """Calibrate an emulated VN-100 with hidden iron and gyro bias, and write its registers.
 
     The real daemon on one end of a pseudo-terminal, the emulated device on the other, both many
-    times faster than real time. Exit 1 where the result is not what is promised. Files of an
+    times faster than real time. Exit 1 if the demo misses its goal. Files of an
     earlier demo in the folder are replaced.
     """
     from ahrsd.demo import FILES, lines, run_demo

@@ -48,8 +48,10 @@ def _device(setup: Setup, effects: Sequence[str]) -> Emulator:
 
 @click.command()
 @click.option("--link", type=click.Path(path_type=Path), help="Symbolic link to the pty.")
-@click.option("--scenario", default="rov", show_default=True, help="What it is and how it moves.")
-@click.option("--motion", default="", help="Another motion than the scenario's.")
+@click.option(
+    "--scenario", default="rov", show_default=True, help="Which device, and how it moves."
+)
+@click.option("--motion", default="", help="Motion, instead of the scenario's.")
 @click.option("--seed", default=0, show_default=True, help="Chooses truth, motion and noise.")
 @click.option("--fault", "faults", multiple=True, help="name[=parameter][@start[+duration]].")
 @click.option(
@@ -73,7 +75,12 @@ def _device(setup: Setup, effects: Sequence[str]) -> Emulator:
 @click.option("--lossless", is_flag=True, help="Device time waits for a slow reader.")
 @click.option("--any-baud", is_flag=True, help="Do not garble bytes when the host's rate differs.")
 @click.option(
-    "--list", is_flag=True, is_eager=True, expose_value=False, callback=_list, help="What there is."
+    "--list",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_list,
+    help="List scenarios and faults.",
 )
 def emulate(
     link: Path | None,

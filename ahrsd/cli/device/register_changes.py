@@ -228,7 +228,7 @@ class Sources:
     def _record(self, name: str, serial: int | None) -> Changes:
         number, _, which = name.partition(":")
         if which not in ("", "old", "new"):
-            raise AhrsdError(f"{name}: behind the colon is old or new")
+            raise AhrsdError(f"{name}: after the colon write old or new")
         paths = journals(self.state, self.journal_file, serial)
         if len(paths) > 1:
             names = ", ".join(path.name for path in paths)
@@ -291,10 +291,10 @@ def _calibration(path: Path) -> dict[str, object]:
     if body.get("converged") is not True or not body.get("registers"):
         warnings = body.get("warnings")
         why = "; ".join(map(str, warnings)) if isinstance(warnings, list) else ""
-        raise AhrsdError(f"{path}: nothing that may be written: {why or 'it has not converged'}")
+        raise AhrsdError(f"{path}: it must not be written: {why or 'it has not converged'}")
     if not body.get("registers_in_force"):
         raise AhrsdError(
-            f"{path}: nobody knows which registers were in force when it was recorded; record with "
+            f"{path}: it is not known which registers were in force at the recording; record with "
             "`ahrsd capture` or `ahrsd run`, which read them"
         )
     return body

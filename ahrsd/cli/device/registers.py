@@ -77,7 +77,9 @@ from drivers.vn100.registers import (
 _WAIT_S = 5.0
 _OPTIONS = (
     click.argument("reason"),
-    click.option("--serial", type=int, help="The device, where several have a journal."),
+    click.option(
+        "--serial", type=int, help="Serial number of the device, if several have a journal."
+    ),
     click.option(
         "--state-directory", type=click.Path(path_type=Path), default=None,
         help="Where the journals are; default: that of the daemon.",
@@ -91,17 +93,17 @@ def _with_options(function: Callable[..., None]) -> Callable[..., Any]:
     return function
 
 
-@click.command(short_help="Forbid every write, but for going back to old values.")
+@click.command(short_help="Forbid every write except a return to old values.")
 @_with_options
 def lock(reason: str, serial: int | None, state_directory: Path | None) -> None:
-    """Forbid every write, but for going back to old values; REASON is for those who come later."""
+    """Forbid every write except a return to old values; REASON is stored in the journal."""
     _say(RecordKind.LOCKED, reason, serial, state_directory or default_state_directory())
 
 
 @click.command()
 @_with_options
 def unlock(reason: str, serial: int | None, state_directory: Path | None) -> None:
-    """Allow writes again: REASON says what was found. Also ends FAULT and FLASH_TORN."""
+    """Allow writes again; REASON is stored in the journal. Also ends FAULT and FLASH_TORN."""
     _say(RecordKind.UNLOCKED, reason, serial, state_directory or default_state_directory())
 
 
@@ -120,7 +122,7 @@ def _say(kind: RecordKind, reason: str, serial: int | None, state: Path) -> None
     if not elsewhere and _daemon_heard(
         "lock" if kind is RecordKind.LOCKED else "unlock", reason, state
     ):
-        click.echo(f"the daemon heard it; {state} has its journal")
+        click.echo(f"the daemon accepted it; its journal is in {state}")
         return
     journal = Journal.open(_journal_of(kind, serial, state))
     history = JournalHistory.of(journal.records())
@@ -182,9 +184,13 @@ _JOURNAL = click.option(
     "--journal", "journal_file", type=click.Path(path_type=Path, exists=True), default=None,
     help="A journal file instead of the one of the device's serial number.",
 )  # fmt: skip
-_BAUD = click.option("--baud", type=int, help="The port's rate; without it, it is found.")
-_YES = click.option("--yes", is_flag=True, help="Do it; without, only say what would be done.")
-_SAVE = click.option("--save", is_flag=True, help="Also save all of RAM to flash. Keep it still.")
+_BAUD = click.option("--baud", type=int, help="The port's rate; without it, the rate is detected.")
+_YES = click.option(
+    "--yes", is_flag=True, help="Do it; without this option, only print what would be done."
+)
+_SAVE = click.option(
+    "--save", is_flag=True, help="Also save all of RAM to flash. Keep the vehicle still."
+)
 
 
 Ids = TypeVar("Ids", int, int | None, tuple[int, ...])
@@ -290,7 +296,7 @@ def diff(
     type=click.Path(path_type=Path),
     help="Registers 23 and 84 of a calibration.json instead of ID and VALUES.",
 )
-@click.option("--serial", type=int, help="The device of --from, where the file does not say.")
+@click.option("--serial", type=int, help="Serial number for --from, if the file does not state it.")
 @_YES
 @_SAVE
 @_STATE
@@ -349,8 +355,12 @@ def history(state_directory: Path | None, journal_file: Path | None, serial: int
 @command.command(short_help="Print registers as $VNWRG lines, to type or send by hand.")
 @click.argument("source")
 @click.argument("ids", nargs=-1, type=int, callback=_known)
-@click.option("--json", "as_json", is_flag=True, help="JSON, which `diff` reads, not lines.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="A file, not stdout.")
+@click.option(
+    "--json", "as_json", is_flag=True, help="Print JSON, which `diff` reads, instead of lines."
+)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="Write to this file instead of stdout."
+)
 @_STATE
 @_JOURNAL
 @_BAUD
@@ -381,7 +391,7 @@ def export(
         write_text(output, text)
 
 
-@command.command(short_help="Write back what was there before a record of the journal.")
+@command.command(short_help="Write back the values from before a record of the journal.")
 @click.argument("port", type=PORT)
 @click.argument("number", metavar="[ID]", type=int, required=False)
 @_YES
@@ -399,7 +409,7 @@ def rollback(
     journal_file: Path | None,
     baud: int | None,
 ) -> None:
-    """Write the values back that were there before record ID of the journal.
+    """Write back the values that the registers had before record ID of the journal.
 
     Without ID: before the newest change whose values the device holds now.
     """

@@ -21,11 +21,15 @@ _PORT = click.Path(path_type=Path, readable=False)
     "--state-directory",
     "directory",
     type=click.Path(path_type=Path),
-    help="Where journal, captures, socket and an operator's words lie.",
+    help="Folder of journal, captures, socket and operator commands.",
 )
-@click.option("--mode", type=click.Choice(get_args(Mode)), help="How far the daemon may go.")
-@click.option("--wait", is_flag=True, help="Wait for a device that is not there (for a service).")
-@click.option("--print-config", "print_only", is_flag=True, help="Print the configuration, stop.")
+@click.option(
+    "--mode", type=click.Choice(get_args(Mode)), help="What the daemon may write (see above)."
+)
+@click.option("--wait", is_flag=True, help="Wait if the device is not there (for a service).")
+@click.option(
+    "--print-config", "print_only", is_flag=True, help="Print the configuration and exit."
+)
 def command(
     path: Path | None,
     port: Path | None,

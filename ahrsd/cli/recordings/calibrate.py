@@ -29,13 +29,17 @@ _METHODS = (  # ours first; a test holds this list against `ahrsd.baselines`, sl
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--method", type=click.Choice(_METHODS), default=_METHODS[0], show_default=True)
 @click.option("--config", "path", type=click.Path(path_type=Path), help="Configuration, TOML.")
-@click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@click.option(
+    "--rate", "rate_hz", type=float, help="Messages per second, if messages have no time."
+)
 @columns_option
 @click.option(
     "--model",
     "model_path",
     type=click.Path(path_type=Path),
-    help="A repaired model of `diagnose --report`: what it names is taken out first.",
+    help=(
+        "A repaired model of `diagnose --report`: its effects are removed from the readings first."
+    ),
 )
 @click.option("--json", "json_path", help="calibration.json into this file, - for stdout.")
 @click.option("--position", help="LAT,LON[,ALT] in deg and m: the world model gives the field.")

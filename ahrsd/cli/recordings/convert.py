@@ -19,12 +19,14 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("recording", metavar="FILE", type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="The table, OUT.parquet.")
-@click.option("--list", "only_list", is_flag=True, help="Say what FILE holds only.")
+@click.option("--list", "only_list", is_flag=True, help="Only list what FILE contains.")
 @click.option("--topic", "topics", multiple=True, metavar="T",
-              help="Topic to use where FILE holds several sensors; may be repeated.")  # fmt: skip
+              help="Topic to use if FILE has several sensors; may be repeated.")  # fmt: skip
 @click.option("--compass", type=click.IntRange(min=0), metavar="N",
               help="Number of the magnetometer, from 0, in an autopilot's log.")  # fmt: skip
-@click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@click.option(
+    "--rate", "rate_hz", type=float, help="Messages per second, if messages have no time."
+)
 @columns_option
 def command(
     recording: Path,
@@ -35,7 +37,7 @@ def command(
     rate_hz: float | None,
     columns: ColumnMap,
 ) -> None:
-    """Keep FILE as a Parquet table with unit, frame, clock, source and what was undone inside.
+    """Convert FILE into a Parquet table that states unit, frame, clock, source and corrections.
 
     FILE may be any recording: a ROS 1 bag, a ROS 2 recording, the log of an autopilot, a foreign
     CSV (with --columns), or one of ours. Every other command opens these files directly, too.

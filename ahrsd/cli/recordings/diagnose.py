@@ -23,10 +23,12 @@ _PATH = click.Path(path_type=Path)
 @click.argument("real", type=_PATH)
 @click.option("--simulation", type=_PATH, help="A simulation of this motion, as a recording.")
 @click.option("--spec", type=_PATH, help="Known noise, rate and field of the sensor, JSON.")
-@click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@click.option(
+    "--rate", "rate_hz", type=float, help="Messages per second, if messages have no time."
+)
 @columns_option
 @click.option("--json", "json_path", help="The answer as JSON into this file, - for stdout.")
-@click.option("--report", "folder", type=_PATH, help="A page with pictures, and more, in here.")
+@click.option("--report", "folder", type=_PATH, help="Folder for a page with pictures, and more.")
 def command(
     real: Path,
     simulation: Path | None,

@@ -22,11 +22,11 @@ _MODELS = ("wmm", "igrf")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--calibration", "calibration_path", type=click.Path(path_type=Path), required=True,
               help="calibration.json of `ahrsd calibrate --json`.")  # fmt: skip
-@click.option("--method", help="Which one, where that file holds several; all: each, in one "
+@click.option("--method", help="Which one, if that file has several; all: each one, in one "
               "table.")  # fmt: skip
 @click.option("--reference", "reference_path", type=click.Path(path_type=Path),
-              help="GPS fixes, or a table with attitude or heading; else NAME.gps.csv.gz beside "
-              "RECORDING, and what its columns hold.")  # fmt: skip
+              help="GPS fixes, or a table with attitude or heading; default: NAME.gps.csv.gz next "
+              "to RECORDING, and the columns of RECORDING.")  # fmt: skip
 @click.option("--heading-column", help="A column of RECORDING or of --reference to compare with.")
 @click.option("--position", help="LAT,LON[,ALT] in deg and m, for the world's field.")
 @click.option("--date", help="YYYY-MM-DD of the recording, for the world's field.")
@@ -36,8 +36,10 @@ _MODELS = ("wmm", "igrf")
               help="Which way is up: gravity steadied by the gyro, each sample's accelerometer, or "
               "the device's own roll and pitch.")  # fmt: skip
 @click.option("--min-speed", "least_speed_m_s", type=click.FloatRange(0.1), default=4.0,
-              show_default=True, help="Course counts above this speed. [m/s]")  # fmt: skip
-@click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+              show_default=True, help="The course is used above this speed. [m/s]")  # fmt: skip
+@click.option(
+    "--rate", "rate_hz", type=float, help="Messages per second, if messages have no time."
+)
 @columns_option
 @click.option("--json", "json_path", help="All figures into this file, - for stdout.")
 @click.option("--figure", "figure_path", type=click.Path(path_type=Path), help="Picture, PNG.")
@@ -51,7 +53,7 @@ def command(
     folder: Path | None,
     **options: object,
 ) -> None:
-    """Judge a calibration on RECORDING, best one that it was not made from.
+    """Judge a calibration on RECORDING, preferably one that it was not made from.
 
     Heading against GPS course, an optical attitude or another heading; the spread of the corrected
     field; dead reckoning. "Before" is what the device has in its registers. Exit 1 where the

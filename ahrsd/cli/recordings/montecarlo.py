@@ -41,7 +41,7 @@ def _list(_context: click.Context, _option: click.Parameter, text: str) -> tuple
     multiple=True,
     default=("magyc", "magyc-stream"),
     show_default=True,
-    help="A method's id, or all; may be repeated. +savgol behind it smooths the readings first.",
+    help="A method's id, or all; may be repeated. The suffix +savgol smooths the readings first.",
 )
 @click.option("--motion", type=click.Choice(["slow", "rov", _ALL]), default="slow")
 @click.option("--at", "at_s", default="50,100,200,400", show_default=True, callback=_list)
@@ -60,7 +60,7 @@ def _list(_context: click.Context, _option: click.Parameter, text: str) -> tuple
     default="1",
     show_default=True,
     callback=_list,
-    help="Times the hard iron; several are a sweep.",
+    help="Factor on the hard iron; several are a sweep.",
 )
 @click.option(
     "--noise-gyro", "gyro_mrad", default=5.0, show_default=True, help="mrad/s per sample."
@@ -68,7 +68,11 @@ def _list(_context: click.Context, _option: click.Parameter, text: str) -> tuple
 @click.option("--hard-iron-as-read", is_flag=True, help="b = m_b as in [R]'s tables, not A m_b.")
 @click.option("--jobs", type=click.IntRange(1), default=os.cpu_count() or 1, show_default=True)
 @limit_options("a seed")
-@click.option("--resume", type=click.Path(path_type=Path), help="Folder of runs already done.")
+@click.option(
+    "--resume",
+    type=click.Path(path_type=Path),
+    help="Folder of finished runs; runs in it are not repeated.",
+)
 @click.option("--json", "json_path", help="Figures into this file, - for stdout.")
 @click.option("--figure", "figure_path", type=click.Path(path_type=Path), help="A picture, PNG.")
 def command(

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--config", "path", type=click.Path(path_type=Path), help="Configuration, TOML.")
-@click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@click.option(
+    "--rate", "rate_hz", type=float, help="Messages per second, if messages have no time."
+)
 @columns_option
 @click.option("--speed", type=click.FloatRange(0.0), default=0.0,
               help="0: as fast as it goes (default); 1: real time.")  # fmt: skip

@@ -24,7 +24,9 @@ _MOST_SAMPLES = 1e7
 
 @click.command()
 @click.argument("scenario", required=False, type=click.Choice(["wam", "mam", "lam", _RECORDED]))
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="The file.")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), required=True, help="File to write."
+)
 @click.option("--motion", type=click.Choice(["slow", "rov"]), default="slow", show_default=True)
 @click.option("--seed", default=0, show_default=True, help="Chooses motion and noise.")
 @click.option("--seconds", default=400.0, show_default=True, help="Length.")
@@ -34,7 +36,12 @@ _MOST_SAMPLES = 1e7
     "--noise-gyro", "gyro_mrad", default=5.0, show_default=True, help="mrad/s per sample."
 )
 @click.option("--hard-iron-as-read", is_flag=True, help="b = m_b as in [R]'s tables, not A m_b.")
-@click.option("--gyro", "gyro_path", type=click.Path(path_type=Path), help="Table for recorded.")
+@click.option(
+    "--gyro",
+    "gyro_path",
+    type=click.Path(path_type=Path),
+    help="Gyro table, for SCENARIO recorded.",
+)
 @click.option("--outliers", default=0.0, help="Fraction of samples that are 100 mG off.")
 @click.option("--magnet", "magnet_at_s", type=float, help="A magnet passes at this second.")
 @click.option("--step", "step_at_s", type=float, help="The hard iron steps by 30 mG here.")
@@ -46,7 +53,12 @@ _MOST_SAMPLES = 1e7
     help="ID, ID=STRENGTH (times its typical size) or ID=name=value,...: reference/effects.md.",
 )
 @click.option("--model", type=click.Path(path_type=Path), help="A repaired model, with --along.")
-@click.option("--along", "along_path", type=click.Path(path_type=Path), help="Its motion's source.")
+@click.option(
+    "--along",
+    "along_path",
+    type=click.Path(path_type=Path),
+    help="Recording whose motion --model follows.",
+)
 @columns_option
 def command(**options: object) -> None:
     """Simulate SCENARIO: wam, mam or lam (wide, medium, low angular movement) of the MAGYC thesis,
@@ -55,7 +67,7 @@ def command(**options: object) -> None:
 
     FILE is a table (.csv, .csv.gz, .parquet) with the true attitude in ref_q{w,x,y,z}, or a byte
     stream of VNYMR sentences (.vnraw, .vnraw.gz). The truth goes into FILE.truth.json; columns
-    that an effect needs (a motor's current, a temperature, ...) are made up and written as well.
+    that an effect needs (a motor's current, a temperature, ...) are invented and written as well.
     """
     wanted = _Options(**cast("dict[str, Any]", options))
     refuse_unwritable(wanted.output)
@@ -106,7 +118,7 @@ def _simulate_scenario(wanted: _Options) -> None:
     write_experiment(wanted.output, experiment)
     write_json(f"{wanted.output}.truth.json", {**truth_json(experiment, made_from), **truth})
     count, name = len(experiment), experiment.name
-    click.echo(f"{wanted.output}: {counted(count, 'sample')} of {name}; truth beside it")
+    click.echo(f"{wanted.output}: {counted(count, 'sample')} of {name}; truth next to it")
 
 
 def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
@@ -192,5 +204,6 @@ def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None
     }
     write_json(f"{output}.truth.json", truth)
     click.echo(
-        f"{output}: {counted(len(columns['time_s']), 'sample')} of {truth['name']}; truth beside it"
+        f"{output}: {counted(len(columns['time_s']), 'sample')} of {truth['name']}; truth next to "
+        "it"
     )

@@ -165,7 +165,7 @@ def status(place: DaemonPlace, json_path: str | None) -> None:
 @place_options
 @click.option("--json", "json_path", help="As JSON into this file, - for stdout.")
 def explain(place: DaemonPlace, json_path: str | None) -> None:
-    """Say which gate holds a write back, since when, and what to do about it.
+    """Show which gates hold a write back, since when, and what to do about it.
 
     Exit 75 where no daemon answers.
     """
@@ -182,16 +182,16 @@ _WAIT_S = 5.0
 @click.argument("text", default="")
 @state_options
 def operator(verb: str, text: str, directory: Path | None) -> None:
-    """Tell the running daemon what a person decided.
+    """Send an operator's command to the running daemon.
 
     \b
     approve ID     write candidate ID, which the daemon's log names
     arm            let this run write by itself (approval auto); disarm takes it back
     rollback       undo what was written and is not saved
-    lock REASON    write nothing any more;  unlock REASON: it was looked at
+    lock REASON    write nothing any more;  unlock REASON: allow it again
 
-    The daemon's answer is printed. Exit 0 where it accepted the word, 1 where it refused it or
-    does not trust the folder, 75 where no daemon listens or none answers. The daemon's user and
+    The daemon's answer is printed. Exit 0 if it accepted the command, 1 if it refused it or
+    does not trust the folder, 75 if no daemon listens or none answers. The daemon's user and
     root may do this, and nobody else: STATE/operator must belong to one of them.
     """
     from ahrsd.config.config import default_state_directory
@@ -211,7 +211,7 @@ def operator(verb: str, text: str, directory: Path | None) -> None:
     except OSError as error:
         raise DeviceError(f"{box.folder}: {error.strerror}", EXIT_USAGE) from None
     if answer is None:
-        raise DeviceError(f"no daemon took the word within {_WAIT_S:.0f} s", EXIT_BUSY)
+        raise DeviceError(f"no daemon took the command within {_WAIT_S:.0f} s", EXIT_BUSY)
     if not answer.accepted:
         raise DeviceError(f"refused: {line(answer.text)}", EXIT_NO)
     click.echo(f"accepted: {line(answer.text)}")
@@ -224,9 +224,9 @@ def operator(verb: str, text: str, directory: Path | None) -> None:
 def bundle(output: Path, place: DaemonPlace) -> None:
     """Collect journal, newest capture, configuration, status and versions into one archive.
 
-    It works beside a running daemon and without one. Links, FIFOs and devices are never opened, of
-    large files only a part is taken, and what was left out is printed. The capture holds where the
-    sensor was turned to, and the location if one is configured: look before you pass it on.
+    It works with and without a running daemon. Links, FIFOs and devices are never opened, of
+    large files only a part is taken, and what was left out is printed. The capture shows how
+    the sensor was turned, and the location if one is configured: check it before you pass it on.
     """
     from ahrsd.config.config import print_config
     from ahrsd.daemon.support_bundle import collect, format_of, write_bundle

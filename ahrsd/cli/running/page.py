@@ -38,7 +38,7 @@ _WAITING = 32
     "names",
     multiple=True,
     metavar="NAME",
-    help="A name under which the page is opened, beside this machine's addresses.",
+    help="A name under which the page is opened, in addition to this machine's addresses.",
 )
 @click.option(
     "--token-file",
@@ -148,5 +148,5 @@ def _approve(box: OperatorBox, candidate: str) -> tuple[bool, str]:
         why = str(error) if error.strerror is None else f"{box.folder}: {error.strerror}"
         return False, f"this page may not speak to the daemon: {why}"
     if answer is None:
-        return False, f"no daemon took the word within {_ANSWER_S:.0f} s"
+        return False, f"no daemon took the command within {_ANSWER_S:.0f} s"
     return answer.accepted, line(answer.text)

@@ -64,9 +64,9 @@ from ahrsd.diagnosis.repaired_model import forward
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
-LOUD = "the gyro's noise is louder than the magnetometer's"
-NOT_DIAGNOSED = "a simulation of the model alone with this noise cannot be diagnosed"
-BENT = "the gyro's noise bends the calibration, which this motion hardly shows"
+LOUD = "the gyro is noisier than the magnetometer"
+NOT_DIAGNOSED = "a simulation of the calibration model alone, with this noise, cannot be diagnosed"
+BENT = "the gyro's noise biases the calibration, which this motion hardly determines"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,8 +108,8 @@ class RefitComparison:
         if self.checks:
             return None
         return (
-            f"of {self.copies} simulations of the model alone with this noise only {self.fitted} "
-            "can be fitted"
+            f"of {self.copies} simulations of the calibration model alone, with this noise, only "
+            f"{self.fitted} can be fitted"
         )
 
     @property
@@ -164,7 +164,7 @@ def diagnose_beyond_chance(track: Track, diagnose: Callable[[Track], FittedDiagn
         undecided = None if np.isfinite(bound) else NOT_DIAGNOSED
         return _null_answer(first, problem, start, comparison, note, undecided)
     weak = [one.effect for one in found.findings if _is_fitted(one) and one.evidence_nats <= bound]
-    note = f"{note}, so that this is doubted: {', '.join(weak)}" if weak else note
+    note = f"{note}; doubtful for this reason: {', '.join(weak)}" if weak else note
     return replace(found, notes=(*found.notes, note))
 
 
@@ -262,9 +262,9 @@ def _agreement_note(
     if (undecided := comparison.undecided) is not None:
         return f"{seen}; {undecided}"
     return (
-        f"{seen}; {comparison.fitted} simulations of the model alone with this noise (seeds 0 to "
-        f"{comparison.copies - 1}), fitted as the recording was, look like it, so that nothing is "
-        "told"
+        f"{seen}; {comparison.fitted} simulations of the calibration model alone, with this noise "
+        f"(seeds 0 to {comparison.copies - 1}) and fitted in the same way, look like the "
+        "recording, so nothing is reported"
     )
 
 
@@ -327,14 +327,15 @@ def _comparison_note(
     seeds = "seed 0" if count == 1 else f"seeds 0 to {count - 1}"
     made = "a simulation" if count == 1 else f"{count} simulations"
     shows = "shows" if count == 1 else "show"
-    by_chance = f"up to {largest:.0f} nats of such" if largest > 0.0 else "nothing"
+    by_chance = f"an effect of up to {largest:.0f} nats" if largest > 0.0 else "no effect"
     seen = (
         f"{why}: {_reported_effects(found)} is worth {evidence:.0f} nats here; {made} of the "
-        f"model alone with this noise ({seeds}) "
+        f"calibration model alone, with this noise ({seeds}), "
     )
     if not np.isfinite(largest):
-        return f"{seen}were asked, and the last cannot be diagnosed"
-    untold = ", and nothing is told" if evidence <= bound else ""
+        failed = "cannot be diagnosed" if count == 1 else "were tried, the last without a diagnosis"
+        return f"{seen}{failed}"
+    untold = ", so nothing is reported" if evidence <= bound else ""
     return f"{seen}{shows} {by_chance}; up to {bound:.0f} nats may be chance{untold}"
 
 

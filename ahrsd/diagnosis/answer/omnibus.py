@@ -128,7 +128,7 @@ def variance_test(filtered: Filtered, columns: Mapping[str, Array]) -> Test:
             names.append(name)
             kept.append((used - used.mean()) / used.std())
     if not kept:
-        return Test("variance", 0.0, 0.0, 1.0, "no column to follow")
+        return Test("variance", 0.0, 0.0, 1.0, "no column to test")
     X = np.column_stack(kept)
     y = square - square.mean()
     solution, _, rank, _ = np.linalg.lstsq(X, y, rcond=1e-8)
@@ -137,4 +137,4 @@ def variance_test(filtered: Filtered, columns: Mapping[str, Array]) -> Test:
     alone = np.abs(X.T @ y)
     p_value = chi2_above(value, int(rank))
     most = names[int(np.argmax(alone))]
-    return Test("variance", value, float(rank), p_value, f"scatter, most with {most}")
+    return Test("variance", value, float(rank), p_value, f"variance, most with {most}")

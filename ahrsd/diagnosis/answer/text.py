@@ -48,7 +48,9 @@ _DISPLAY_UNITS = {
 }
 _LIMITS_SHOWN = 6
 #: the note on a simulation whose residual would be ordinary for a real recording
-SIMULATED = "a simulated recording, its truth is beside it: nothing that is left there is ordinary"
+SIMULATED = (
+    "the recording is simulated (its truth file lies next to it), so no residual is ordinary"
+)
 
 
 def answer_lines(found: Diagnosis) -> list[str]:
@@ -57,7 +59,7 @@ def answer_lines(found: Diagnosis) -> list[str]:
     for number, finding in enumerate(found.findings, start=1):
         out += ["", f"{number}. {headline(finding)}", *_finding_lines(finding)]
     if found.unexplained.detected:
-        out += ["", "unknown, here (nothing in the library explains it):"]
+        out += ["", "unknown, here (no effect of the library explains it):"]
         out += [*_unexplained_lines(found.unexplained)]
     elif ordinary_residual(found) is not None:
         out += ["", "remaining residual, ordinary:", *_unexplained_lines(found.unexplained)]
@@ -78,10 +80,10 @@ def _whiteness(found: Diagnosis) -> str:
     before = [name for name, test in found.omnibus.items() if test.p_before < priors.TEST_FAILED]
     after = [name for name, test in found.omnibus.items() if test.p_after < priors.TEST_FAILED]
     if not before and not after:
-        return "white, Gaussian and even"
+        return "white, Gaussian and of constant variance"
     return (
-        f"without the findings fail {', '.join(before) or 'nothing'}; "
-        f"the repaired model fails {', '.join(after) or 'nothing'}"
+        f"tests failed without the findings: {', '.join(before) or 'none'}; "
+        f"by the repaired model: {', '.join(after) or 'none'}"
     )
 
 
@@ -296,10 +298,10 @@ REPORTED_SETTINGS: Mapping[str, SettingText] = {
     "covariate": SettingText("by the column {}"),
     "late_s": SettingText("logged {} s late", negative="logged {} s early"),
     "mean_s": SettingText("each value the mean of {} s"),
-    "harmonic": SettingText("{} times a turn of the shaft"),
+    "harmonic": SettingText("{} periods per turn of the shaft"),
     "off_hz": SettingText("{} Hz faster than the column", negative="{} Hz slower than the column"),
     "frequency_hz": SettingText("seen at {} Hz"),
-    "mains_hz": SettingText("as mains of {} Hz would be"),
+    "mains_hz": SettingText("as an alias of mains at {} Hz"),
     "period_s": SettingText("every {} s"),
     "width_s": SettingText("for {} s"),
     "hold_samples": SettingText("each reading held for {} samples"),
@@ -308,7 +310,7 @@ REPORTED_SETTINGS: Mapping[str, SettingText] = {
     "shape": SettingText("shape: {}"),
     "length_s": SettingText("lasts {} s"),
     "length_m": SettingText("falls off within {} m"),
-    "distance_m": SettingText("its size is that of its field {} m away"),
+    "distance_m": SettingText("size stated as its field {} m away"),
 }
 
 #: what is not reported, and why: it is elsewhere in the answer, or nobody can act on it

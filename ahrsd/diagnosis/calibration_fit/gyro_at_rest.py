@@ -33,7 +33,7 @@ from ahrsd.samples import Array
 
 HARDLY_TURNED = (
     "the sensor hardly turned: only the gyro, a logged current, switches and alternating fields "
-    "can be told"
+    "can be found"
 )
 #: sizes of the walk that are averaged over, rad/s per square root of a second
 WALKS = priors.ORDINARY_WALK_RAD_S_SQRT_S * np.array([1.0, 2.0, 4.0])

@@ -112,7 +112,7 @@ def unusable_reason(track: Track) -> str | None:
     steps = np.isfinite(track.dt_s) & np.isfinite(track.mag_b_gauss).all(axis=1)
     count, least = np.count_nonzero(steps), priors.FIT_STEPS
     if count < least:
-        return f"samples that follow another one: {count}, {least} are needed"
+        return f"samples without a gap before them: {count}, {least} are needed"
     return None
 
 

@@ -27,7 +27,7 @@ from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 from ahrsd.samples import Array
 
 MEAN_RATES = (
-    "the gyro's values are means of the rate: how its axis turned within a step (coning) is put in"
+    "the gyro's values are mean rates: the turning of their axis within a step (coning) was added"
 )
 
 
@@ -98,7 +98,7 @@ def build_problem(track: Track, spec: Spec) -> tuple[Problem, NullModel]:
     m = working_factor(track, averaging_model(track, cold))
     work = average_groups(track, m, cold)
     if not _count_readings(work):
-        raise NothingToFit("no whole reading of the magnetometer is left: all are stuck or missing")
+        raise NothingToFit("the magnetometer has no usable reading: all are stuck or missing")
     averaged = _count_readings(track) / _count_readings(work)
     start = replace(
         cold,

@@ -78,7 +78,7 @@ def average_groups(track: Track, m: int, model: NullModel, riding: Array | None 
     ValueError if m is not positive.
     """
     if m < 1:
-        raise ValueError(f"thinning by {m}: one sample of so many cannot be")
+        raise ValueError(f"cannot keep one sample in {m}")
     if m == 1:
         return track
     if riding is not None:

@@ -53,9 +53,12 @@ class ColumnClock:
     def words(self) -> str:
         """Which column, and by how much."""
         way = "late" if self.lag_s > 0 else "early"
-        text = f"column {label(self.column)} runs {abs(self.lag_s):.3g} s {way} against the sensor"
+        text = f"column {label(self.column)} is {abs(self.lag_s):.3g} s {way} against the sensor"
         if self.drift:
-            text += f" halfway, and its clock drifts by {100 * abs(self.drift):.2g} %"
+            text += (
+                " in the middle of the recording, and its clock drifts by "
+                f"{100 * abs(self.drift):.2g} %"
+            )
         return text
 
 

@@ -57,7 +57,9 @@ class Role:
 ROLES: Mapping[str, Role] = {
     "temperature": Role("temperature, degC", r"temp(erature)?(_|$)", "mean", (-80, 200), "kelvin"),
     "pressure": Role("pressure, kPa", r"pressure", "mean", (0.1, 2e5), "another unit"),
-    "latitude": Role("latitude, deg", r"^lat(itude)?(_|$)", "zero", (-90, 90), "no latitude", True),
+    "latitude": Role(
+        "latitude, deg", r"^lat(itude)?(_|$)", "zero", (-90, 90), "another quantity", True
+    ),
     "position": Role(
         "position, m",
         r"^position_(north|east|down)_m$",
@@ -90,14 +92,18 @@ ROLES: Mapping[str, Role] = {
     ),
     "speed": Role("speed, m/s", r"(speed|velocity)\w*_m_s$", "zero", (-1e3, 1e3), "another unit"),
     "ping": Role(
-        "sync or transmit pulses, 0 or 1", r"(ping|sync|pulse|transmit)", "zero", (0, 1), "no 0/1"
+        "sync or transmit pulses, 0 or 1",
+        r"(ping|sync|pulse|transmit)",
+        "zero",
+        (0, 1),
+        "values other than 0 and 1",
     ),
     "switch": Role(
         "a device that is switched, 0 or 1",
         r"(switch|lamp|light|gripper|pump|relay|degauss)|_on$",
         "zero",
         (0, 1),
-        "no 0/1",
+        "values other than 0 and 1",
     ),
     "current": Role("electric current, A", r"current|_a$", "zero", (-2e3, 2e3), "milliampere"),
     "throttle": Role("throttle or duty", r"throttle|pwm|duty", "zero", (-1e4, 1e4), "another unit"),
@@ -152,13 +158,19 @@ def refusal_reason(name: str, values: Array) -> str:
     low, high = float(np.min(values)), float(np.max(values))
     if low < row.limits[0] or high > row.limits[1]:
         return (
-            f"column {label(name)} was left out: {low:g} to {high:g} is no {row.words}; it looks "
-            f"like {row.beyond}"
+            f"column {label(name)} was left out: its range {low:g} to {high:g} is not plausible "
+            f"for a column of this name ({row.words}); it looks like {row.beyond}"
         )
     if role == "angle" and name.endswith("_rad") and high - low > 50.0:
-        return f"column {label(name)} was left out: {low:g} to {high:g} rad looks like degrees"
+        return (
+            f"column {label(name)} was left out: its range {low:g} to {high:g} rad looks like "
+            "degrees"
+        )
     if not row.constant and high - low <= 1e-9 * max(abs(low), abs(high), 1e-9):
-        return f"column {label(name)} was left out: it is {low:g} throughout, so nothing follows it"
+        return (
+            f"column {label(name)} was left out: it is {low:g} throughout, so it can explain "
+            "nothing"
+        )
     return ""
 
 
@@ -182,9 +194,7 @@ def prepare_columns(track: Track) -> tuple[Track, tuple[str, ...]]:
         elif np.isfinite(filled).all():
             kept[name] = filled
         else:
-            notes.append(
-                f"column {label(name)} was left out: its values are no numbers to compute with"
-            )
+            notes.append(f"column {label(name)} was left out: some of its values are not finite")
     return replace(track, covariates=kept), tuple(notes)
 
 
@@ -220,7 +230,7 @@ def find_columns_with_gaps(track: Track) -> dict[str, ColumnWithGaps]:
         words = (
             f"column {label(name)} has no values in "
             f"{np.count_nonzero(missing) * track.step_s:.1f} s, first at "
-            f"{time_s[first]:.1f} s: readings without it were not used"
+            f"{time_s[first]:.1f} s: readings in these gaps were not used"
         )
         out[name] = ColumnWithGaps(filled, missing, words)
     return out
@@ -248,7 +258,7 @@ def _fill_gaps(name: str, values: Array, time_s: Array) -> tuple[Array, str]:
         begin, end = max(gaps, key=lambda one: one[1] - one[0])
         return values, (
             f"column {label(name)} was left out: no values from {begin:.1f} to {end:.1f} s; "
-            f"holes of more than {priors.COLUMN_GAP_S:g} s are not guessed"
+            f"gaps of more than {priors.COLUMN_GAP_S:g} s are not filled"
         )
     nearest = _longest_nonzero_interval(values[good]) and np.isin(values[good], (0.0, 1.0)).all()
     if nearest:  # a switch is on or off, never half

@@ -142,8 +142,8 @@ def _frame_error(track: Track, best: SignedPermutation, equal: int) -> Fact:
     words = _frame_words(track, best) if odd is None else odd.words
     if equal > 1:
         words += (
-            f"; this or one of {equal - 1} other ways of axes and signs, which the motion does not "
-            "tell apart: turn it about all axes to know"
+            f"; or one of {equal - 1} other assignments of axes and signs, which this motion does "
+            "not distinguish: record turns about all axes"
         )
     return Fact(
         "frame_error",
@@ -193,7 +193,8 @@ def _frame_words(track: Track, best: SignedPermutation) -> str:
         return f"{words} and the accelerometer's"
     return (
         f"{words}, or the magnetometer is left-handed ({axis_correction_words(-P.T)}): "
-        "turn none of them before you know which, the wrong one turns every heading by 180 deg"
+        "correct neither before you know which one is wrong; the wrong correction turns every "
+        "heading by 180 deg"
     )
 
 
@@ -216,8 +217,8 @@ def _gyro_unit(track: Track, best: SignedPermutation) -> list[Fact]:
             return []
         usual = 1 / factor if large else factor
         words = (
-            f"the gyro's rates are {off} for the turns of the field: they are in another unit, or "
-            f"the time is ({name} would be {usual:.3g} times)"
+            f"the gyro's rates are {off} for the turns of the field: the rates or the time stamps "
+            f"are in another unit ({name} would be a factor of {usual:.3g})"
         )
         factor, name = best.scale, "another unit"
     else:
@@ -459,8 +460,8 @@ class MagnetometerAxisError:
         what = "is left-handed" if self.mirrored else "is turned against the gyro"
         return (
             f"the magnetometer {what}: {axis_correction_words(self.right)} "
-            f"(where the field points out of the ground, south of the "
-            f"magnetic equator: {axis_correction_words(self.other)})"
+            f"(south of the magnetic equator, where the field points out of the ground: "
+            f"{axis_correction_words(self.other)})"
         )
 
 
@@ -509,14 +510,14 @@ class SensorMisalignment:
         rows = "; ".join(" ".join(f"{value:.3f}" for value in row) for row in self.turn.T)
         words = (
             f"the magnetometer is turned against the gyro by {angle:.1f} deg{about} "
-            f"(rotation vector {numbers} deg): its right x y z are [{rows}] times its readings"
+            f"(rotation vector {numbers} deg): the correct x y z are [{rows}] times its readings"
         )
         if self.of_magnetometer is not True:
-            words += ", or the gyro is the one that is turned: gravity says nothing of it"
+            words += ", or the gyro is the one that is turned: gravity does not show which"
         if self.points_up:
             words += (
-                "; with that the field points out of the ground: north of the magnetic equator its "
-                "readings are negated as well, and turn every heading by 180 deg"
+                "; then the field points out of the ground: north of the magnetic equator its "
+                "readings are negated as well, which turns every heading by 180 deg"
             )
         return words
 
@@ -612,7 +613,7 @@ def axis_correction_words(way: Array) -> str:
     negated = [_AXES[k] for k in range(3) if way[k, k] < 0.0]
     if np.all(np.diag(way) != 0.0) and negated:
         return f"negate its {' and '.join(negated)}"
-    return f"its right x y z are its {' '.join(_axis_words(row) for row in way)} as read"
+    return f"its correct x y z are its {' '.join(_axis_words(row) for row in way)} as read"
 
 
 def _axis_words(row: Sequence[float] | Array) -> str:

@@ -236,10 +236,10 @@ def _lost_samples_fact(track: Track, turns: LostSteps, setting: Mapping[str, flo
     times = tuple((float(track.time_s[k - 1]), float(track.time_s[k])) for k in rows)
     words = (
         f"at {counted(len(rows), 'sample')} the field is ahead by whole steps of the "
-        "turn: samples are missing that the time stamps do not show"
+        "rotation: samples are missing there, and the time stamps do not show it"
     )
     if UNSEEN in setting:
-        words += "; most are known by all jumps together, and not one by one"
+        words += "; most of them show only in all jumps together, not individually"
     where = Where(times, ("x", "y", "z"), "link")
     parameters = (Value("part", share, share / float(np.sqrt(len(rows))), "1"),)
     full_setting = {"hidden": True, **setting}

@@ -133,5 +133,5 @@ def stopped_diagnosis(
         findings=tuple(as_finding(fact, library) for fact in facts),
         unexplained=Unexplained(False),
         posterior_predictive={},
-        notes=(*notes, *(fact.words for fact in facts), "put this right first, then ask again"),
+        notes=(*notes, *(fact.words for fact in facts), "correct this first, then diagnose again"),
     )

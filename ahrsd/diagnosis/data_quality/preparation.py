@@ -164,7 +164,11 @@ def detectable_faults(track: Track) -> tuple[str, ...]:
     if turned:
         faults.append(axes)
     line = f"would also have been seen: {'; '.join(faults)}"
-    return (line,) if turned else (line, f"would not have been seen, it hardly turned: {axes}")
+    return (
+        (line,)
+        if turned
+        else (line, f"would not have been seen, because the sensor hardly turned: {axes}")
+    )
 
 
 def diagnose_with_gaps(track: Track, spec: Spec | None, diagnose: Diagnose) -> Diagnosis:

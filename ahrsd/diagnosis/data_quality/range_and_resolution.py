@@ -54,7 +54,7 @@ def find_clipping(track: Track) -> list[Fact]:
         axes = tuple(name for name, (mine, _) in zip(_AXES, found, strict=True) if mine.any())
         sensor = "magnetometer" if unit == "gauss" else "gyro"
         words = (
-            f"the {sensor} stands at its limit of {limit:.4g} {unit} in "
+            f"the {sensor} is at its limit of {limit:.4g} {unit} in "
             f"{counted(int(np.count_nonzero(rows)), 'sample')} ({', '.join(axes)})"
         )
         out.append(

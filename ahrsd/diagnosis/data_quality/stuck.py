@@ -45,7 +45,7 @@ def dead_sensor_reason(track: Track) -> str | None:
     seen = np.isfinite(mag).all(axis=1)
     size = track.usual_gauss
     if not priors.FIELD_READINGS[0] < size < priors.FIELD_READINGS[1]:
-        return f"the magnetometer reads {size:.3g} in the middle: that is a field in no unit"
+        return f"the median field is {size:.3g}: that is no magnetic field in any unit"
     if _is_constant(gyro) and np.ptp(mag[seen], axis=0).max() > _least_certain_change_gauss(track):
         return (
             f"the gyro reads {_vector_words(gyro[0])} rad/s in every row while the field turns by "
@@ -55,8 +55,8 @@ def dead_sensor_reason(track: Track) -> str | None:
     if _is_constant(mag[seen]) and _is_constant(gyro):
         return (
             f"the magnetometer reads {_vector_words(mag[seen][0])} gauss and the gyro "
-            f"{_vector_words(gyro[0])} rad/s in every row: no sensor is so still, "
-            "even at rest it scatters"
+            f"{_vector_words(gyro[0])} rad/s in every row: both are stuck or were "
+            "not logged, for even at rest readings scatter"
         )
     if _is_constant(mag[seen]) and turned > priors.STUCK_TURNED_RAD:
         return (
@@ -143,7 +143,11 @@ def without_impossible_readings(track: Track) -> tuple[Track, tuple[str, ...]]:
         track = replace(track, mag_b_gauss=np.where(far[:, None], np.nan, track.mag_b_gauss))
         notes.append(
             _left_out_note(
-                "reading", "of the magnetometer ", far, track, f"{priors.IMPOSSIBLE_FIELD:g} fields"
+                "reading",
+                "of the magnetometer ",
+                far,
+                track,
+                f"{priors.IMPOSSIBLE_FIELD:g} times the usual field",
             )
         )
     rate = np.max(np.abs(track.gyro_b_rad_s), axis=1)
@@ -161,7 +165,7 @@ def _left_out_note(what: str, of: str, rows: NDArray[np.bool], track: Track, bey
     """The sentence on readings that were left out."""
     first = float(track.time_s[int(np.argmax(rows))])
     number = counted(int(np.count_nonzero(rows)), what)
-    return f"{number} {of}beyond {beyond}, first at {first:.1f} s: no sensor gives that, left out"
+    return f"{number} {of}beyond {beyond}, first at {first:.1f} s: impossible, left out"
 
 
 def dead_axis_notes(track: Track) -> tuple[str, ...]:
@@ -172,8 +176,8 @@ def dead_axis_notes(track: Track) -> tuple[str, ...]:
         if still.all():
             continue
         out += [
-            f"the {sensor}'s {_AXES[k]} reads {values[0, k] + 0.0:.6g} in every row: a real axis "
-            "scatters, it is dead or was not logged"
+            f"the {sensor}'s {_AXES[k]} reads {values[0, k] + 0.0:.6g} in every row: it is dead or "
+            "was not logged, for a real axis scatters"
             for k in np.flatnonzero(still)
         ]
     return tuple(out)
@@ -206,7 +210,7 @@ def find_stuck_axes(track: Track, bad: NDArray[np.bool]) -> list[Fact]:
     names = ", ".join(rows)
     words = (
         f"the magnetometer's {names} repeats one number while the sensor turns, {total:.1f} s in "
-        "all: those readings are not used"
+        "all: these readings are not used"
     )
     spans_s = _intervals_s(track, row_intervals(whole))
     return [
@@ -240,7 +244,7 @@ def find_stuck_gyro(track: Track) -> list[Fact]:
     first = f"{spans_s[0][0]:.1f} to {spans_s[0][1]:.1f} s"
     words = (
         f"the gyro repeats one reading while the field turns, {total:.1f} s in all, first from "
-        f"{first}: it is stuck there, and nothing is said of that time"
+        f"{first}: it is stuck there, and these intervals are not diagnosed"
     )
     return [
         Fact(
@@ -492,7 +496,7 @@ def _find_doubled(track: Track, repeated: NDArray[np.bool]) -> list[Fact]:
     return [
         Fact(
             "dropped_samples",
-            f"{counted(count, 'sample')} as the one before, gyro and magnetometer: they came twice",
+            f"{counted(count, 'sample')} equal to the one before, gyro and magnetometer: doubled",
             Where(times, _AXES, "link"),
             priors.SURE_OF_DOUBLED,
             (Value("part", share, float(np.sqrt(share / len(track))), "1"),),

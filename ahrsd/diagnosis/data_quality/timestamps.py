@@ -219,8 +219,8 @@ def without_clock_jumps(track: Track) -> tuple[Track, tuple[str, ...]]:
     others = f" (and {np.count_nonzero(jumps) - 1} more)" if np.count_nonzero(jumps) > 1 else ""
     at_s = float(track.time_s[starts[first] - 1])
     words = (
-        f"the clock jumps by {breaks_s[first]:+.6g} s behind {at_s:.13g} s{others}: "
-        f"taken as a break of {priors.BREAK_LEFT_S:g} s; times behind it are told as if no more "
-        "had passed"
+        f"the clock jumps by {breaks_s[first]:+.6g} s after {at_s:.13g} s{others}: "
+        f"taken as a break of {priors.BREAK_LEFT_S:g} s, and later times are reported as if only "
+        "that had passed"
     )
     return replace(track, time_s=track.time_s + np.cumsum(shift_s)), (words,)

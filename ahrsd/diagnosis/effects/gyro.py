@@ -137,7 +137,7 @@ class GyroGSensitivity(Linear):
     identifier = "gyro_g_sensitivity"
     code = "G4"
     family = "gyro"
-    words = "the gyro feels acceleration and tilt"
+    words = "the gyro's bias depends on acceleration and tilt"
     equation = "w += G a, a: specific force in g"
     parameters = design_matrix.matrix("per_g", "rad/s/g", 5e-4, 0.05)
     typical = (6e-4, 2e-4, 0.0, -3e-4, 4e-4, 1e-4, 0.0, 2e-4, -5e-4)
@@ -167,7 +167,7 @@ class EarthRotation(Linear):
     identifier = "earth_rotation"
     code = "G12"
     family = "gyro"
-    words = "the turning of the earth, which the gyro reads and the field does not show"
+    words = "the earth's rotation, which the gyro measures and the field does not show"
     equation = "w += R^T omega_E"
     parameters = tuple(
         Parameter(f"rate_{e}", "rad/s", 5e-5, SIDEREAL_RAD_S) for e in ("north", "east", "down")
@@ -229,11 +229,11 @@ class GyroTimeLag(Effect):
     code = "G15"
     family = "gyro"
     of_whole = True
-    words = "the gyro is late, by its latency or its filter"
+    words = "the gyro is delayed by its latency or its filter"
     equation = "w(t) = true mean rate at t - tau"
     parameters = (Parameter("lag", "s", 0.01, 0.3),)
     typical = (0.01,)
-    signature = "the mirror image of a late magnetometer"
+    signature = "the mirror image of a delayed magnetometer"
     confusers = (
         ("mag_time_lag", "only the difference of the two can be seen"),
         ("gyro_integration", "record at two output rates"),
@@ -320,7 +320,7 @@ class GyroBiasDrift(Linear):
     identifier = "gyro_bias_drift"
     code = "G7"
     family = "gyro"
-    words = "the gyro bias wanders"
+    words = "the gyro bias drifts slowly"
     equation = "w += sum_j k_j sin((j - 1/2) pi t/T), j = 1 to 4: a random walk's largest modes"
     parameters = tuple(
         Parameter(f"mode_{j}_{axis}", "rad/s", 4e-4 / (2 * j - 1), 0.02)
@@ -337,7 +337,7 @@ class GyroBiasDrift(Linear):
         )
         for part in parts
     )
-    signature = "a slow course of the gyro error"
+    signature = "a gyro error that varies slowly"
     confusers = (
         ("gyro_bias_temperature", "log the temperature; heat it a second time"),
         ("gyro_startup", "switch on again and compare the first minutes"),

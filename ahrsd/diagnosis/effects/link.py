@@ -100,7 +100,7 @@ class NoiseBurst(Scatter):
     equation = "variance of m += sigma^2 from t0 for L"
     parameters = (Parameter("burst", "gauss", 5 * _MG, 1.0),)
     typical = (8 * _MG,)
-    signature = "wild readings without direction for a while"
+    signature = "for a while large scatter, in no particular direction"
     confusers = (
         ("field_anomaly", "pass the place again"),
         ("sync_pulses", "log the ping times"),
@@ -128,7 +128,7 @@ class NoiseLevel(Scatter):
     identifier = "noise_level"
     code = "N1"
     family = "link"
-    words = "the sensors are noisier than was said"
+    words = "the sensors are noisier than specified"
     equation = "variance of m += sigma_m^2, of w += sigma_w^2, from t0 on"
     parameters = (
         Parameter("mag", "gauss", 1 * _MG, 0.1),
@@ -169,8 +169,8 @@ class DroppedSamples(Discrete):
     identifier = "dropped_samples"
     code = "C3"
     family = "link"
-    words = "samples are missing, and the turn of their steps with them"
-    equation = "rows left out; the gyro's mean of the last step stands for the longer one"
+    words = "samples are missing, and with them the rotation during their steps"
+    equation = "rows left out; the gyro's mean of the last step is used for the longer one"
     parameters = (Parameter("part", "1", 0.02, 0.9),)
     typical = (0.02,)
     after_noise = True
@@ -203,9 +203,9 @@ class StuckMagnetometer(Discrete):
     typical = (5.0,)
     after_noise = True
     signature = "equal readings, bit by bit"
-    confusers = (("mag_sample_hold", "it repeats for a few samples, and always"),)
+    confusers = (("mag_sample_hold", "a slow update repeats only a few samples, but all the time"),)
     manoeuvre = "switch the sensor off and on"
-    size = "a second to the rest of the recording"
+    size = "from one second to the rest of the recording"
     source = "dossier C3"
 
     def simulate(self, readings: Readings, value: Array, setting: Setting) -> Readings:
@@ -298,7 +298,7 @@ class OnboardCalibrationActive(Effect):
     parameters = (Parameter("part", "1", 1.0, 2.0, least=0.01), Parameter("gain", "1", 0.1, 0.5))
     typical = (0.8, 0.0)
     frame = "sensor"
-    signature = "hard and soft iron creep or jump with no cause outside"
+    signature = "hard and soft iron creep or jump without an external cause"
     confusers = (
         ("hard_iron_drift", "read register 44"),
         ("soft_iron_step", "read register 44"),

@@ -18,9 +18,9 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 _PREFACE = """\
 # Effects
 
-Every way in which a recording may depart from the calibration model that `ahrsd diagnose` knows by
-name, and that `ahrsd simulate --effect` and `ahrsd emulate --effect` can put in. Written by
-`python -m ahrsd.diagnosis.effects.reference_page > docs/reference/effects.md` from the code.
+The library of `ahrsd diagnose`: the effects that may make a recording differ from the calibration
+model. `ahrsd simulate --effect` and `ahrsd emulate --effect` can simulate them. Written from the
+code by `python -m ahrsd.diagnosis.effects.reference_page > docs/reference/effects.md`.
 
 ```
 m = A h + b + D theta + noise      magnetometer, gauss;  A soft iron, b hard iron
@@ -28,13 +28,13 @@ w_read = w + w_b + W theta + noise gyro, rad/s;  w_b bias
 h: field in the sensor frame, dh/dt = h x w;  R: sensor frame to north, east, down
 ```
 
-`--effect ID` puts an effect in at its typical size, `--effect ID=2` at twice that, and
-`--effect ID=name=value,name=value` with the named parameters, all others 0; parts of the setting
-(`onset_s`, `time_constant_s`, ...) are given the same way. Columns that the effect needs are made
-up and written beside the samples.
+`--effect ID` simulates an effect at its typical size, `--effect ID=2` at twice that, and
+`--effect ID=name=value,name=value` with the given parameters, all others 0; parts of the setting
+(`onset_s`, `time_constant_s`, ...) are given the same way. Columns that the effect needs are
+invented and written next to the samples.
 
-"typical" is strength 1 of `simulate`; "prior" is one prior deviation of the parameter, and beyond
-"limit" a fitted value is not believed. Codes and most sizes are those of the project's design
+"typical" is strength 1 of `simulate`; "prior" is one prior standard deviation of the parameter, and
+a fitted value beyond "limit" is rejected. Codes and most sizes are those of the project's design
 dossier, which names the sources given here; they were not all read again for this page.
 """
 _FAMILIES = {
@@ -46,7 +46,7 @@ _FAMILIES = {
 _KINDS = {
     "mean": "",
     "variance": "It changes the scatter of the readings, not their mean: no parameter is fitted.",
-    "discrete": "It is there or not, and is looked for before any physics.",
+    "discrete": "It is present or not, and is tested before any physics.",
 }
 
 
@@ -115,9 +115,9 @@ def _column_lines() -> Iterator[str]:
     yield ""
     yield "A column's name and unit give it its role; the first row that fits decides. Attitude"
     yield "(`ref_q*`, `vn_*`) has none, and a 0/1 column of another name is a switch, or pulses"
-    yield "where it is never on for more than a few samples. Holes of at most 2 s are filled; a"
-    yield "column with longer ones, that never changes, or that cannot be its unit is refused with"
-    yield "a sentence."
+    yield "if it is never on for more than a few samples. Gaps of at most 2 s are filled. A column"
+    yield "with longer gaps, without any change, or with values that its unit excludes is left out,"
+    yield "and a note says why."
     yield ""
     yield "| role | what | name fits | effect counts as zero at | from | to |"
     yield "|---|---|---|---|---|---|"

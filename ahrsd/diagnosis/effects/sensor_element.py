@@ -55,9 +55,12 @@ class AcInterference(Linear):
     signature = "a line in the spectrum of the innovations"
     confusers = (
         ("rotor_field", "it moves with the shaft: change the rpm"),
-        ("hard_iron_drift", "50 Hz at 25 Hz beats slowly: two seconds at an odd rate"),
+        (
+            "hard_iron_drift",
+            "50 Hz sampled at 25 Hz beats slowly: record two seconds at another rate",
+        ),
     )
-    manoeuvre = "two seconds at an output rate that 50 and 60 Hz are no multiples of"
+    manoeuvre = "record two seconds at an output rate of which 50 and 60 Hz are no multiples"
     size = "0.1 to 20 mG near machinery"
     source = "Sonett 1968 on aliases in magnetometers; diydrones (dossier M7, M8)"
     quick = True
@@ -253,12 +256,12 @@ class MagSampleHold(Effect):
     parameters = (Parameter("held_part", "1", 1.0, 3.0),)
     typical = (1.0,)
     after_noise = True
-    signature = "repeated readings; a lag like a saw"
+    signature = "repeated readings; a lag like a sawtooth"
     confusers = (
         ("mag_time_lag", "its mean is a lag: count the repeated readings"),
         ("stuck_magnetometer", "a stuck sensor repeats for seconds"),
     )
-    manoeuvre = "ask for an output rate that the magnetometer reaches"
+    manoeuvre = "choose an output rate that the magnetometer reaches"
     size = "20 to 100 ms"
     source = "driver logs (dossier M21)"
 

@@ -60,7 +60,7 @@ class HardIronDrift(Linear):
     )
     parameters = design_matrix.vector("change", "gauss", 1.0 * _MG, 50.0 * _MG)
     typical = design_matrix.along(2.0 * _MG)
-    signature = "a steady course in the sensor frame"
+    signature = "a steady trend in the sensor frame"
     confusers = (
         ("mag_bias_temperature", "a warm-up is nearly straight in time: heat soak, or run longer"),
         ("geomagnetic_drift", "it stays put in the world: turn through all headings throughout"),
@@ -164,7 +164,7 @@ class ViscousMagnetisation(Linear):
     identifier = "viscous_magnetisation"
     code = "M18"
     family = "sensor"
-    words = "iron that takes its time to follow a turn"
+    words = "iron whose magnetisation follows a turn only slowly"
     equation = "m += dA (LP_tau[h] - h), dA symmetric, LP_tau: first-order low-pass"
     parameters = design_matrix.symmetric("lagging_part", "1", 0.005, 0.1)
     typical = (0.006, 0.004, -0.003, 0.003, 0.002, -0.003)

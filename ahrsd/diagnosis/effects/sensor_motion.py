@@ -34,7 +34,10 @@ class EddyCurrent(Linear):
     typical = (0.01, 0.002, 0.0, -0.003, 0.008, 0.001, 0.0, 0.002, 0.014)
     signature = "proportional to the turn's rate, changes sign with its direction"
     confusers = (
-        ("mag_time_lag", "contains it (E = -tau A): called a lag where it is the same all round"),
+        (
+            "mag_time_lag",
+            "contains it (E = -tau A): reported as a lag if it is the same about all axes",
+        ),
         ("hysteresis", "two rates of turn"),
         ("viscous_magnetisation", "stop after a turn and wait"),
     )
@@ -61,7 +64,7 @@ class MagTimeLag(Effect):
     code = "M19"
     family = "sensor"
     of_whole = True
-    words = "the magnetometer trails the gyro"
+    words = "the magnetometer is delayed against the gyro"
     equation = "m(t) = A h(t - tau) + b"
     parameters = (Parameter("lag", "s", 0.02, 0.3),)
     typical = (0.02,)
@@ -69,7 +72,7 @@ class MagTimeLag(Effect):
     confusers = (
         ("gyro_time_lag", "only the difference of the two can be seen"),
         ("gyro_integration", "half a sample: use the device's delta-theta output"),
-        ("eddy_current", "turn about all axes: a lag is the same all round"),
+        ("eddy_current", "turn about all axes: a lag is the same about all axes"),
         ("mag_low_pass", "two rates of turn"),
         ("gyro_g_sensitivity", "on small motion: brisk reversals in heading"),
     )
@@ -159,7 +162,7 @@ class FlexibleMount(Effect):
     identifier = "flexible_mount"
     code = "M22"
     family = "sensor"
-    words = "the magnetometer's mount gives under its weight and acceleration"
+    words = "the magnetometer's mount bends under its weight and acceleration"
     equation = "m = A Exp(C (a - a0)) h + b, a: specific force in g, a0: where it is straight"
     parameters = design_matrix.matrix("bend", "rad/g", 0.01, 0.2)
     typical = (0.0, 0.008, 0.002, -0.009, 0.0, 0.001, 0.002, -0.003, 0.0)
@@ -222,7 +225,7 @@ class MagGyroMisalignment(Effect):
     equation = "m = A Exp(phi) h + b; the same as a soft iron that is not symmetric"
     parameters = design_matrix.vector("angle", "rad", 0.01, 0.35)
     typical = design_matrix.along(0.02)
-    signature = "an error that depends on the attitude; a symmetric soft iron cannot hold it"
+    signature = "an error that depends on the attitude; a symmetric soft iron cannot represent it"
     confusers = (
         ("flexible_mount", "pitch and roll far, upside down if it can be"),
         ("mag_cross_axis", "pitch to 45 degrees"),

@@ -51,7 +51,10 @@ class MotorCurrentField(Linear):
     signature = "follows the current in the sensor frame, the same on every heading"
     confusers = (
         ("vibration_rectification", "it acts on the gyro: pulse the motor at rest"),
-        ("current_derivative_field", "it lives on the edges: hold the current for some seconds"),
+        (
+            "current_derivative_field",
+            "it occurs only at the edges: hold the current for some seconds",
+        ),
         ("mag_bias_temperature", "heat follows the load slowly: pulse the motor, then pause"),
         ("speed_field", "change the load at the same speed"),
     )
@@ -84,7 +87,10 @@ class CurrentDerivativeField(Linear):
     needs = ("current",)
     signature = "spikes at the edges of the current, of opposite sign at opposite edges"
     confusers = (
-        ("motor_current_field", "a late log of the current looks like it: edges of both signs"),
+        (
+            "motor_current_field",
+            "a current that is logged late looks like it: record edges of both signs",
+        ),
     )
     manoeuvre = "step the motor up and down at rest"
     size = "1 to 10 % of the current's own field"

@@ -277,7 +277,7 @@ class FieldStep(Linear):
     identifier = "field_step"
     code = "W7"
     family = "world"
-    words = "the vehicle left iron behind: calibrated beside it, then moved off"
+    words = "the vehicle was calibrated next to iron and then moved away from it"
     equation = "m += A R^T k from t0 on"
     parameters = design_matrix.vector("step", "gauss", 10 * _MG, 1000 * _MG)
     typical = design_matrix.along(8 * _MG)

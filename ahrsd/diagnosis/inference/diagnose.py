@@ -96,7 +96,7 @@ def _diagnose_once(
         )
         at_sensor_time = realigned.found
         if any(one.setting.get("covariate") == clock.column for one in at_sensor_time.findings):
-            note = f"{clock.words}: its cause is judged at the sensor's time"
+            note = f"{clock.words}: effects of it are judged at the sensor's time"
             return replace(
                 realigned, found=replace(at_sensor_time, notes=(note, *at_sensor_time.notes))
             )

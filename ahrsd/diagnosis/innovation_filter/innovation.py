@@ -161,7 +161,7 @@ def run_filter(
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         root = _inverse_root(filter_gains.innovation_covariance)
     if not np.isfinite(root).all():
-        raise np.linalg.LinAlgError("innovations of no finite size: the model is far off")
+        raise np.linalg.LinAlgError("the innovations are not finite: the model is far off")
     root = root * used[:, None, None]
     whitened = np.einsum("nij,nj->ni", root, innovation)
     recursion_inputs = (layout, state, filter_gains, model.soft_iron, root, motion, predicted)

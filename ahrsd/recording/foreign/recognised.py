@@ -55,8 +55,8 @@ _STARTS: tuple[tuple[bytes, str, str], ...] = (
     (b"Obj\x01", "is an Avro file", _TABLE),
     (b"\x80\x04\x95", "is a Python pickle", _TABLE),
     (b"\x80\x05\x95", "is a Python pickle", _TABLE),
-    (b"FMT, 128", "is an ArduPilot log as text", "give the .bin log that it was made of"),
-    (b"FMT,128", "is an ArduPilot log as text", "give the .bin log that it was made of"),
+    (b"FMT, 128", "is an ArduPilot log as text", "give the .bin log from which it was made"),
+    (b"FMT,128", "is an ArduPilot log as text", "give the .bin log from which it was made"),
     (b"7z\xbc\xaf\x27\x1c", "is a 7z archive", "unpack it"),
     (b"\xd4\xc3\xb2\xa1", "is a network capture (pcap)", "save the payload as .vnraw"),
     (b"\n\r\r\n", "is a network capture (pcapng)", "save the payload as .vnraw"),
@@ -80,17 +80,17 @@ _TEXTS: tuple[tuple[re.Pattern[bytes], str, str], ...] = (
     (
         re.compile(rb"(?i)[0-9a-f]{4,16}(?:: ?|  +)(?:[0-9a-f]{2} ?){8}"),
         "is a hex dump, not the bytes themselves",
-        "make them of it: `xxd -r FILE > FILE.vnraw`",
+        "convert it: `xxd -r FILE > FILE.vnraw`",
     ),
     (
         re.compile(rb"(?i)(?=[^\n]*[a-f])(?:(?:(?:0x)?[0-9a-f]{2}[ ,:\r\n]+){24}|[0-9a-f]{48})"),
         "is a hex dump, not the bytes themselves",
-        "make them of it: `xxd -r -p FILE > FILE.vnraw`",
+        "convert it: `xxd -r -p FILE > FILE.vnraw`",
     ),
     (
         re.compile(rb"(?:[A-Za-z0-9+/]{76}\r?\n){3}"),
         "is base64, not the bytes themselves",
-        "make them of it: `base64 -d FILE > FILE.vnraw`",
+        "convert it: `base64 -d FILE > FILE.vnraw`",
     ),
 )  # fmt: skip
 

@@ -82,8 +82,10 @@ FAULTS: dict[str, FaultKind] = {
     "power_cut_wrg": _once("power fails after the n-th VNWRG from then on", 1.0, "n", 2.0),
     "power_cut_wnv": _once("power fails in the next VNWNV, nothing saved", 0.0, "", 2.0),
     "torn_flash": _once("power fails in the next VNWNV, half saved", 0.0, "", 2.0),
-    "third_party_write": _once("somebody else on this line writes the register", 23.0, "register"),
-    "third_party_change": _once("a register changes without a word", 23.0, "register"),
+    "third_party_write": _once(
+        "another program on this line writes the register", 23.0, "register"
+    ),
+    "third_party_change": _once("a register changes without notice", 23.0, "register"),
 }
 
 _SCHEDULE = re.compile(r"(\w+)(?:=([^@+]+))?(?:@([^+]+)(?:\+(.+))?)?")

@@ -80,7 +80,8 @@ def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> 
     found = diagnose_beyond_chance(track, ask)
     assert not found.unexplained.detected
     assert verdict(found) == (
-        "no verdict: a simulation of the model alone with this noise cannot be diagnosed"
+        "no verdict: a simulation of the calibration model alone, with this noise, cannot be "
+        "diagnosed"
     )
 
 
@@ -112,8 +113,8 @@ def test_what_simulations_show_is_said_beside_what_is_told(
     assert found.unexplained.detected == is_told
     assert len(copies) == asked
     (note,) = found.notes[:1]
-    beside = "" if is_told else ", and nothing is told"
-    assert note.endswith(f" up to 12 nats of such; up to {chance} nats may be chance{beside}")
+    beside = "" if is_told else ", so nothing is reported"
+    assert note.endswith(f" an effect of up to 12 nats; up to {chance} nats may be chance{beside}")
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ def test_what_is_unknown_is_told_with_direction_frequencies_and_size():
     )
     left = Unexplained(True, where, None, 4.19e-4, "gauss", evidence_nats=40.0)
     said = answer_lines(Diagnosis("walk.csv", None, True, 1e-17, (), left, {}))
-    at = said.index("unknown, here (nothing in the library explains it):")
+    at = said.index("unknown, here (no effect of the library explains it):")
     assert said[at + 1 : at + 4] == [
         "   where      0.0-110.0 s; axes x y; turns with the vehicle; 0.26-2.08 Hz",
         "   along      x +0.60, y -0.80, z +0.00 (a unit vector of that frame)",
@@ -175,10 +175,10 @@ def test_each_part_of_a_setting_is_told_or_left_out_for_a_reason(name):
         ({"frequency_hz": 10.0031, "mains_hz": []}, "seen at 10 Hz"),
         (
             {"frequency_hz": 10.0031, "mains_hz": [50.0, 60.0]},
-            "seen at 10 Hz; as mains of 50 or 60 Hz would be",
+            "seen at 10 Hz; as an alias of mains at 50 or 60 Hz",
         ),
         ({"covariate": "rpm", "harmonic": 2, "off_hz": -0.012},
-         "by the column rpm; 2 times a turn of the shaft; 0.012 Hz slower than the column"),
+         "by the column rpm; 2 periods per turn of the shaft; 0.012 Hz slower than the column"),
         ({"hold_samples": 4, "phase": 3}, "each reading held for 4 samples"),
         ({"shape": "wave", "length_s": 40.0}, "shape: wave; lasts 40 s"),
         ({"covariate": "an\nodd name"}, "by the column an\\nodd name"),

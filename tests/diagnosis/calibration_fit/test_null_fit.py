@@ -148,7 +148,7 @@ def test_what_cannot_be_fitted_is_refused_in_one_line() -> None:
     alone = replace(
         track, dt_s=np.full(200, np.nan), runs=tuple(slice(k, k + 1) for k in range(200))
     )
-    with pytest.raises(ValueError, match="samples that follow another one: 0, 15 are needed"):
+    with pytest.raises(ValueError, match="samples without a gap before them: 0, 15 are needed"):
         fit_null(alone)
 
 

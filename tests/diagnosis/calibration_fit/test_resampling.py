@@ -80,7 +80,7 @@ def test_rate_is_kept_above_what_is_wanted():
 
 
 def test_a_factor_below_one_is_refused():
-    with pytest.raises(ValueError, match="thinning by 0"):
+    with pytest.raises(ValueError, match="cannot keep one sample in 0"):
         average_groups(turning()[0], 0, model([0.0, 0.0, 0.0]))
 
 

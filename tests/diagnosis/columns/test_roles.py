@@ -92,11 +92,11 @@ def test_a_slow_logger_is_filled_and_a_switch_holds_its_value():
     [
         ("motor_current_a", np.where(np.arange(200) < 80, RAMP, np.nan), "no values from 7.9 to"),
         ("motor_current_a", np.full(200, np.nan), "100% of its values are missing"),
-        ("motor_current_a", RAMP * 0 + 3, "it is 3 throughout, so nothing follows it"),
+        ("motor_current_a", RAMP * 0 + 3, "it is 3 throughout, so it can explain nothing"),
         ("motor_current_a", RAMP * 1000, "it looks like milliampere"),
         ("temperature_c", RAMP + 295, "it looks like kelvin"),
         ("rudder_angle_rad", RAMP * 40, "looks like degrees"),
-        ("lamp_on", RAMP, "it looks like no 0/1"),
+        ("lamp_on", RAMP, "it looks like values other than 0 and 1"),
     ],
 )
 def test_what_cannot_be_used_is_refused_with_a_sentence(name, values, said):

@@ -67,10 +67,10 @@ def test_left_handed_axes_are_called_so(track: Track) -> None:
 @pytest.mark.parametrize(
     ("read", "words"),
     [
-        (MIRRORED, "is left-handed: negate its y (where"),
-        (TURNED, "is turned against the gyro: negate its x and z (where"),
-        (SWAPPED, "is left-handed: its right x y z are its y x z as read"),
-        (QUARTER, "is turned against the gyro: its right x y z are its -y x z as read"),
+        (MIRRORED, "is left-handed: negate its y (south"),
+        (TURNED, "is turned against the gyro: negate its x and z (south"),
+        (SWAPPED, "is left-handed: its correct x y z are its y x z as read"),
+        (QUARTER, "is turned against the gyro: its correct x y z are its -y x z as read"),
     ],
 )
 def test_a_mirrored_magnetometer_is_no_turned_gyro(read: list[list[int]], words: str) -> None:
@@ -214,7 +214,7 @@ def test_rates_that_are_off_by_the_factor_of_no_unit_may_be_the_time(
     wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s * factor)
     fact = only(tuple(find_facts(wrong)))
     assert fact.effect == "unit_error"
-    assert "in another unit, or the time is" in fact.words
+    assert "the rates or the time stamps are in another unit" in fact.words
     right = correct_track(wrong, [fact]).gyro_b_rad_s
     assert np.abs(right / track.gyro_b_rad_s - 1).max() < 0.1
 
@@ -249,4 +249,4 @@ def test_a_turn_about_one_axis_tells_that_axes_are_wrong_and_not_which() -> None
     assert fact.effect == "frame_error"
     assert fact.confidence == 0.99
     assert fact.words.startswith("the gyro's x y z are the magnetometer's x y -z (left-handed)")
-    assert "other ways of axes and signs" in fact.words
+    assert "other assignments of axes and signs" in fact.words

@@ -85,7 +85,7 @@ def test_turns_of_which_none_stands_out_are_known_by_all_together(motion: str) -
     done, rate, lost = lossy(motion, 0.004, 3e-3)
     (fact,) = find_lost_turns(done, rate)
     assert UNSEEN in fact.setting
-    assert "by all jumps together" in fact.words
+    assert "in all jumps together" in fact.words
     (part,) = fact.parameters
     assert part.value == pytest.approx(float(lost.mean()), abs=2 * part.std)
 

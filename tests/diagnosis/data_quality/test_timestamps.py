@@ -101,10 +101,10 @@ def test_a_jump_is_a_short_break(by_s: float) -> None:
     done, (words,) = without_clock_jumps(track)
     assert done.time_s[500] - done.time_s[499] == pytest.approx(priors.BREAK_LEFT_S)
     assert np.diff(done.time_s).min() > 0.0
-    assert words.startswith(f"the clock jumps by {by_s + 0.04:+.6g} s behind 20 s")
+    assert words.startswith(f"the clock jumps by {by_s + 0.04:+.6g} s after 20 s")
     assert without_clock_jumps(done) == (done, ())
     epoch = replace(track, time_s=track.time_s + 1.7e9 + 0.125)
-    assert "behind 1700000020.125 s" in without_clock_jumps(epoch)[1][0]
+    assert "after 1700000020.125 s" in without_clock_jumps(epoch)[1][0]
 
 
 def test_a_break_that_may_be_one_stays() -> None:

@@ -58,7 +58,8 @@ def test_where_no_simulation_can_be_fitted_neither_yes_nor_no_is_said(monkeypatc
     found = diagnose(stepped)
     assert found.findings == ()
     assert verdict(found) == (
-        "no verdict: of 16 simulations of the model alone with this noise only 0 can be fitted"
+        "no verdict: of 16 simulations of the calibration model alone, with this noise, only 0 can "
+        "be fitted"
     )
     assert "would have shown" not in "\n".join(answer_lines(found))
     assert found.to_json()["undecided"].startswith("of 16 simulations")

@@ -32,7 +32,7 @@ def test_a_current_that_was_logged_five_times_a_second_is_one_name():
     assert [x.effect for x in found.findings] == ["motor_current_field"]
     assert not found.unexplained.detected
     assert (
-        "column motor_current_a comes every 0.2 s: drawn straight between its values" in found.notes
+        "column motor_current_a has a new value every 0.2 s: interpolated linearly" in found.notes
     )
     _, value, _ = one.truth[0]
     np.testing.assert_allclose([p.value for p in found.findings[0].parameters], value, rtol=0.02)
@@ -59,6 +59,6 @@ def test_a_speed_with_noise_has_its_own_field_and_leaves_nothing() -> None:
     found = diagnose_logged(replace(track, mag_b_gauss=mag).with_columns({"speed_m_s": noisy}))
     assert [one.effect for one in found.findings] == ["speed_field"]
     assert not found.unexplained.detected
-    assert any(note.startswith("column speed_m_s has noise of its own: ") for note in found.notes)
+    assert any(note.startswith("column speed_m_s is noisy: ") for note in found.notes)
     for value, truth in zip(found.findings[0].parameters, FIELD_PER_M_S, strict=True):
         assert value.value == pytest.approx(truth, rel=0.05)

@@ -44,4 +44,4 @@ def test_nothing_is_named_beside_the_current_but_half_a_step(driven: Track) -> N
     for told, true in zip(names["motor_current_field"].parameters, FIELD_PER_A, strict=True):
         assert abs(told.value - true) < 4 * told.std < 1e-4
     assert not found.unexplained.detected
-    assert any("motor_current_a has noise of its own" in note for note in found.notes)
+    assert any("motor_current_a is noisy" in note for note in found.notes)

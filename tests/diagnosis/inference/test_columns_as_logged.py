@@ -45,7 +45,7 @@ def test_a_quick_current_that_was_held_is_drawn_straight_where_the_field_follows
     current = 6.0 + 2.0 * course / course.std()
     mag = track.mag_b_gauss + current[:, None] * np.array([3e-3, -2e-3, 2e-3])
     track = replace(track, mag_b_gauss=mag).with_columns({"motor_current_a": held(current, 5)})
-    said = "column motor_current_a comes every 0.2 s: drawn straight between its values"
+    said = "column motor_current_a has a new value every 0.2 s: interpolated linearly"
     assert said in notes_at_the_richest_model(track)
 
 

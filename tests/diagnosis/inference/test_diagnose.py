@@ -29,7 +29,9 @@ def test_a_null_has_no_name_and_no_unknown(scenario):
     assert not found.unexplained.detected
     assert not found.mismatch
     # how far from another answer: no name's odds reach what is asked whatever was assumed
-    (near,) = (note for note in found.notes if note.startswith("nearest to being found is "))
+    (near,) = (
+        note for note in found.notes if note.startswith("the effect nearest to a finding is ")
+    )
     assert max(float(odds) for odds in re.findall(r"[+-]\d+\.\d", near)) < 3.0
     assert {limit.effect for limit in found.sensitivity} >= {"hard_iron_step", "sync_pulses"}
     assert all(check.inside_after for check in found.posterior_predictive.values())

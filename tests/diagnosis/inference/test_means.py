@@ -35,7 +35,7 @@ def driven(seed: int, memory_s: float, mean_s: float):
 def test_it_is_one_name(memory_s: float, mean_s: float):
     found = diagnose(driven(16, memory_s, mean_s))
     assert [one.effect for one in found.findings] == ["motor_current_field"]
-    (said,) = [one for one in found.notes if one.startswith("column motor_current_a is read as")]
+    (said,) = [one for one in found.notes if one.startswith("column motor_current_a is taken as")]
     assert f"the mean of {mean_s:.2g} s" in said
     how = found.findings[0].setting
     assert how["mean_s"] == pytest.approx(mean_s, abs=0.05)

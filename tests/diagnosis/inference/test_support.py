@@ -344,10 +344,12 @@ def test_a_name_that_gains_no_more_than_its_copies_or_owes_itself_to_a_prior_is_
     )  # fmt: skip
     assert doubts((told,)) == ()
     (copied,) = doubts((replace(told, heldout=replace(held, placebo_gain=0.02)),))
-    assert copied.startswith("hysteresis: it predicts readings that it was not fitted to no better")
+    assert copied.startswith(
+        "doubt hysteresis: on readings that it was not fitted to it predicts no better"
+    )
     owed = OnPriors(3.4, 3.0, False, (Assumed(EFFECT, 2.7, 4.1), Assumed(NOISE, 5.0, 1.2)))
     (note,) = doubts((replace(told, priors=owed),))
     assert note == (
         "hysteresis depends on a prior: with the noise steps between octaves doubled its evidence "
-        "is 1 nats, 3 are required"
+        "is 1 nats, and 3 are required"
     )

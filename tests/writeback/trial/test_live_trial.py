@@ -223,4 +223,4 @@ def test_at_rest_a_wrong_gyro_bias_is_still_seen():
     block = at_rest(200.0, noise_gauss=2e-3, bias_b_rad_s=bias)
     reasons = judged(LiveTrial(RIGHT, IDENTITY, NO_BIAS, bias), block)
     assert reasons
-    assert "carried by the gyroscope" in reasons[0]
+    assert "propagated by the gyroscope" in reasons[0]

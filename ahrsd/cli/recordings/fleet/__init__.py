@@ -55,7 +55,7 @@ _FOLDER = click.Path(path_type=Path)
 def command() -> None:
     """Calibrate and diagnose an archive of recordings; one recording is one row, exactly once.
 
-    A run may be killed at any moment: the same command goes on with what is missing.
+    A run may be killed at any moment: the same command continues with what is missing.
     """
 
 
@@ -65,16 +65,20 @@ def command() -> None:
 @click.option("--jobs", type=click.IntRange(min=1), help="Processes; default: one for each core.")
 @click.option("--cluster", metavar="tcp://...", help="A Dask scheduler, instead of processes here.")
 @limit_options("a recording", limit="600s", memory="2G")
-@click.option("--retry-failed", "again", is_flag=True, help="Do those again that gave no answer.")
+@click.option(
+    "--retry-failed", "again", is_flag=True, help="Repeat the recordings that gave no answer."
+)
 @click.option("--folders", default="vehicle", show_default=True, metavar="LEVEL,...",
-              help="What folders name, from the top: vehicle, place, serial, or -.")  # fmt: skip
+              help="The folder levels, from the top: vehicle, place, serial, or -.")  # fmt: skip
 @click.option("--vehicle", help="The vehicle of all recordings.")
 @click.option("--place", help="The place of all recordings.")
 @click.option("--match", "patterns", multiple=True, metavar="GLOB",
               help="File names that are recordings; default: by their suffixes.")  # fmt: skip
-@click.option("--rate", "rate_hz", type=float, help="Messages per second, where none has a time.")
+@click.option(
+    "--rate", "rate_hz", type=float, help="Messages per second, if messages have no time."
+)
 @columns_option
-@click.option("--report", "folder", type=_FOLDER, help="A page about the fleet in here.")
+@click.option("--report", "folder", type=_FOLDER, help="Folder for a page about the fleet.")
 def run(
     archive: str,
     output: Path,

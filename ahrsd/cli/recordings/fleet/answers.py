@@ -15,7 +15,7 @@ _FOLDER = click.Path(path_type=Path)
 @click.command()
 @click.argument("output", metavar="OUT", type=_FOLDER)
 @click.option("--json", "json_path", help="The same as JSON into this file, - for stdout.")
-@click.option("--report", "folder", type=_FOLDER, help="A page about the fleet in here.")
+@click.option("--report", "folder", type=_FOLDER, help="Folder for a page about the fleet.")
 def status(output: Path, json_path: str | None, folder: Path | None) -> None:
     """How many rows there are, of what, and whether a run is at work."""
     from ahrsd.fleet.questions import FleetRows, status_lines
@@ -57,13 +57,13 @@ def compact(output: Path) -> None:
 @click.argument("question", metavar="drift|recurring|failures|SELECT")
 @click.option("--json", "json_path", help="The whole answer as JSON into this file, - for stdout.")
 def ask(output: Path, question: str, json_path: str | None) -> None:
-    """What the rows of OUT say.
+    """Answer a question from the rows of OUT.
 
     \b
     drift       hard iron, gyro bias and heading error of each device over time and temperature,
                 with standard deviations and change points; largest heading error first
-    recurring   findings more frequent on a device, a vehicle, at a place or a temperature
-    failures    what gave no answer, and why
+    recurring   findings that are more frequent on a device, a vehicle, at a place or a temperature
+    failures    recordings that gave no answer, and why
     SELECT ...  one query over the table `recordings`; nothing can be written
     """
     from ahrsd.fleet.questions import (

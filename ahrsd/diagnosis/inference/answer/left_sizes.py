@@ -88,9 +88,10 @@ def with_remainder_sizes(
     if unexplained.detected:
         parts = dict.fromkeys(_describe_part(all_sets, best, key) for key in answer.unknown)
         described = (
-            ", ".join(parts) or "a source of one direction, too quick to be followed in time"
+            ", ".join(parts)
+            or "a source of one direction that varies too quickly to be followed in time"
         )
-        why = f"beyond what such recordings ordinarily leave: {described}"
+        why = f"larger than in ordinary recordings: {described}"
         sizes = remainder_sizes(all_sets, best, why, answer.unknown)
         return replace(unexplained, ordinary=sizes)
     if simulated and nats > priors.UNKNOWN_ODDS:

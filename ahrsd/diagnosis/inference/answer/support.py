@@ -33,8 +33,8 @@ from ahrsd.diagnosis.inference.search_rounds import ModelSearchResult
 
 #: note for an unknown part that may be more sources than are tested together
 TOO_MANY = (
-    f"models of more than {priors.WIDEST} coefficients were not asked: what is unknown may be "
-    "several sources, of which a shorter part of the recording tells more"
+    f"models of more than {priors.WIDEST} coefficients were not tested: the unknown cause may be "
+    "several sources; a shorter part of the recording shows more"
 )
 
 
@@ -106,8 +106,8 @@ def doubts(findings: Sequence[Finding]) -> tuple[str, ...]:
         held = one.heldout
         if held is not None and held.nll_gain_per_sample <= max(held.placebo_gain, 0.0):
             out.append(
-                f"{one.effect}: it predicts readings that it was not fitted to no better than its "
-                "time-shifted copies do: doubt it"
+                f"doubt {one.effect}: on readings that it was not fitted to it predicts no better "
+                "than its time-shifted copies"
             )
         elif one.priors is not None and not one.priors.stays:
             weakest = min(
@@ -116,7 +116,7 @@ def doubts(findings: Sequence[Finding]) -> tuple[str, ...]:
             nats, how = min((weakest.half_nats, "halved"), (weakest.double_nats, "doubled"))
             out.append(
                 f"{one.effect} depends on a prior: with {weakest.what} {how} its evidence is "
-                f"{nats:.0f} nats, {one.priors.asked:.0f} are required"
+                f"{nats:.0f} nats, and {one.priors.asked:.0f} are required"
             )
     return tuple(out)
 
@@ -151,8 +151,8 @@ def nearest_effect(answer: Answer, all_sets: Hypotheses) -> tuple[str, ...]:
     name = all_sets.component(key).effect
     other = "no effect" if rival is best else "an unknown cause"
     return (
-        f"nearest to being found is {name}: {sensitivity.log_odds:+.1f} nats over {other} where "
-        f"{required:.0f} are required; at most {most:+.1f} with each prior halved or doubled",
+        f"the effect nearest to a finding is {name}: {sensitivity.log_odds:+.1f} nats over {other} "
+        f"where {required:.0f} are required; at most {most:+.1f} with each prior halved or doubled",
     )
 
 

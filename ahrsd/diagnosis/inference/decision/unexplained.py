@@ -52,7 +52,7 @@ def largest_unexplained(
         if nats > priors.ODDS_REAL:
             frame, found = all_sets.component(key).frame, size_of(all_sets, best, key)
             unit = "rad/s" if frame == "gyro" else "gauss"
-            where = Where((), AXES, frame, f"a part of what is left ({key})")
+            where = Where((), AXES, frame, f"a part of the residual ({key})")
             return (key,), Unexplained(True, where, None, found, unit, evidence_nats=nats)
     return (), Unexplained(False)
 

@@ -102,14 +102,14 @@ def _interpolate_held(problem: Problem, name: str) -> Problem | None:
     held = tuple(one for one in find_held_columns(problem.recorded) if one.name == name)
     if not held:
         return None
-    note = f"column {label(name)} comes {held[0].interval_words}: drawn straight between its values"
+    note = f"column {label(name)} has a new value {held[0].interval_words}: interpolated linearly"
     return _replace_recorded(problem, interpolate_held_columns(problem.recorded, held), note)
 
 
 def _remove_noise(problem: Problem, name: str) -> Problem | None:
     """With a column without its logger's noise; None if that is not separable from the signal."""
     clean = denoise_columns(problem.recorded, (name,))
-    note = f"column {label(name)} has noise of its own: what follows it is judged without it"
+    note = f"column {label(name)} is noisy: effects of it are judged with its noise removed"
     return None if clean is None else _replace_recorded(problem, clean, note)
 
 
@@ -200,7 +200,7 @@ def _best_log_bayes_factors(
 
 def apply_logger_model(problem: Problem, logger: LoggerModel) -> Problem:
     """The problem with a column corrected for its logger."""
-    note = f"column {label(logger.column)} is read as {logger.words}"
+    note = f"column {label(logger.column)} is taken as {logger.words}"
     logged = {**problem.logged, logger.column: logger.setting}
     return replace(
         _replace_recorded(problem, logger.before_logging(problem.recorded), note), logged=logged
