@@ -162,7 +162,7 @@ def test_page_reports_the_setting_of_an_effect(usual):
     assert "by the column motor_&lt;1&gt;_a; logged 0.25 s late; each value the mean of" in text
 
 
-@pytest.mark.usefixtures("unprinted")
+@pytest.mark.usefixtures("without_figures")
 def test_page_reports_a_spectrum_that_is_worse_after(tmp_path):
     found = diagnosis()
     drawn = found.drawn
@@ -179,7 +179,7 @@ def test_page_reports_a_spectrum_that_is_worse_after(tmp_path):
     assert "farther from 1" not in page_of(replace(found, drawn=better), tmp_path)
 
 
-@pytest.mark.usefixtures("unprinted")
+@pytest.mark.usefixtures("without_figures")
 def test_a_longer_grey_bar_is_explained(usual, tmp_path):
     found = diagnosis()
     assert "A longer grey bar" not in usual.read_text()
@@ -189,7 +189,7 @@ def test_a_longer_grey_bar_is_explained(usual, tmp_path):
     )
 
 
-@pytest.mark.usefixtures("unprinted")
+@pytest.mark.usefixtures("without_figures")
 @pytest.mark.parametrize(("size", "real"), [(0.5e-3, False), (5e-3, True)])
 def test_time_course_within_its_own_band_is_not_called_real(tmp_path, size, real):
     edges = tuple(np.linspace(0.0, 333.0, 11))
