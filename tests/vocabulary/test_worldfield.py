@@ -132,7 +132,7 @@ def test_the_igrf_has_the_words_and_errors_of_the_wmm() -> None:
         ((10.0, 10.0, 0.0), math.nan, "no world magnetic model for the year nan"),
     ],
 )
-def test_what_is_not_known_is_refused_in_one_line(place, year, words) -> None:
+def test_unknown_position_or_date_is_refused_in_one_line(place, year, words) -> None:
     with pytest.raises(WorldFieldError) as refused:
         world_field(*place, year)
     assert words in str(refused.value)
