@@ -153,7 +153,7 @@ def test_a_capture_of_the_daemon_replays_as_it_ran_and_calibrates_from_all_of_it
     check_registers(result.json("magyc"), device.truth, true_fields)
 
 
-def test_another_configuration_does_not_change_what_a_capture_says(tmp_path):
+def test_other_configuration_does_not_change_the_result_of_a_capture(tmp_path):
     path = tmp_path / "run.mcap"
     record_daemon(path, binary_device(10, {}), 10.0)
     done = replay(path, Config(mode="passive"))

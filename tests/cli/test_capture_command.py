@@ -75,7 +75,7 @@ def test_ctrl_c_ends_in_order(run, emulated, tmp_path, capsys):
     assert summary["lost_bytes"] == 0
 
 
-def test_unplugging_keeps_what_came_and_is_75(run, emulated, tmp_path, capsys):
+def test_unplugging_keeps_the_received_data_and_is_code_75(run, emulated, tmp_path, capsys):
     with emulated() as (emulator, path):
 
         def unplug() -> None:
@@ -109,7 +109,7 @@ def test_wrong_output_is_refused_before_the_port_is_opened(run, tmp_path, capsys
     assert (tmp_path / "there.mcap").read_bytes() == b"precious"
 
 
-def test_a_port_that_is_not_there_leaves_no_file(run, tmp_path, capsys):
+def test_missing_port_leaves_no_file(run, tmp_path, capsys):
     assert run("capture", "/dev/does-not-exist", "-o", tmp_path / "a.mcap", *BAUD) == 75
     assert list(tmp_path.iterdir()) == []
 

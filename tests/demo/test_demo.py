@@ -155,7 +155,7 @@ def test_demo_ends_without_progress(monkeypatch):
         emulated.run_watched(Waiting(), Frozen(), 11.0)
 
 
-def test_the_report_promises_of_a_seed_only_what_it_keeps(done):
+def test_report_promises_only_what_the_seed_achieves(done):
     page = (done[0] / "report.html").read_text()
     assert "the same seed gives the same hidden truth, motion and noise" in page
     assert "the same run" not in page
@@ -192,7 +192,7 @@ def test_an_output_below_a_file_is_one_line(tmp_path, run, capsys):
     assert error.count("\n") == 1
 
 
-def test_a_demo_without_enough_time_says_no(tmp_path, run, capsys):
+def test_demo_without_enough_time_fails(tmp_path, run, capsys):
     assert run("demo", "--output", tmp_path, "--seconds", "60", "--seed", "3") == 1
     out = capsys.readouterr().out
     assert "The demo did not reach its goal: it ended in " in out

@@ -31,7 +31,7 @@ def test_a_magnet_passes_and_leaves_nothing():
     assert size[452:].max() < 1e-12
 
 
-def test_a_step_stays_and_the_truth_is_what_holds_afterwards():
+def test_step_stays_and_the_truth_is_that_after_it():
     step = field_difference(step_at_s=20.0, step_gauss=0.03)
     assert np.abs(step[:500]).max() < 1e-12
     assert np.linalg.norm(step[500:], axis=1) == pytest.approx(0.03)

@@ -94,7 +94,7 @@ def test_status_has_attitude_and_obstacles_to_a_write(pytestconfig):
     assert write_back.content["gates_shut"] == sum(not gate["ok"] for gate in status["gates"])
 
 
-def test_the_log_and_what_this_program_lost():
+def test_log_includes_records_lost_by_this_program():
     topics = Topics(0.0)
     note = {"record": "note", "host_s": 3.0, "level": "warning", "text": "the link was lost"}
     assert topics.of(note, 9.0)[0].content == ("warning", "the link was lost")
@@ -190,7 +190,7 @@ def test_missing_daemon_is_reported_once_and_awaited(tmp_path):
     assert process.returncode == 0
 
 
-def test_a_port_that_is_taken_ends_in_one_line_and_75():
+def test_occupied_port_is_refused_in_one_line_with_code_75():
     with closing(socket.create_server(("127.0.0.1", 0))) as other:
         port = other.getsockname()[1]
         done = CliRunner().invoke(group, ["foxglove", "--port", str(port)])
@@ -199,7 +199,7 @@ def test_a_port_that_is_taken_ends_in_one_line_and_75():
     assert f"127.0.0.1 port {port}: Address already in use; --port" in str(done.exception)
 
 
-def test_an_address_that_is_none():
+def test_invalid_address_is_refused():
     done = CliRunner().invoke(group, ["foxglove", "--address", "rov.local"])
     assert done.exit_code == 2
     assert "--address rov.local: must be an IP address" in done.output

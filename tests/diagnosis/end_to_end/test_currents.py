@@ -186,7 +186,7 @@ def test_delay_and_current_are_found_without_a_derivative_field(seed, shape):
         assert parameter.value == pytest.approx(truth, rel=0.02)
 
 
-@pytest.mark.slow  # a short one: inference/test_means
+@pytest.mark.slow  # a short one: inference/test_averaged_column
 @pytest.mark.parametrize(("memory_s", "mean_s"), [(0.5, 0.4), (6.0, 0.2)])
 def test_current_logged_as_a_mean_is_found_without_a_derivative_field(
     memory_s: float, mean_s: float

@@ -20,7 +20,7 @@ def answer(*effects, seed=3, samples=SAMPLES, **more):
     return diagnose(one.track), one
 
 
-@pytest.mark.slow  # a shorter one: test_quiet
+@pytest.mark.slow  # a shorter one: test_undisturbed
 @pytest.mark.parametrize("noise", ["white", "red"])
 def test_undisturbed_recording_has_no_findings(noise):
     found, _ = answer(noise=noise)
