@@ -37,7 +37,7 @@ def test_by_a_child():
 
 
 @pytest.mark.parametrize("workers", [(), ("-n", "1")], ids=["alone", "worker"])
-def test_seconds_are_told_by_test_and_phase(tmp_path, workers):
+def test_seconds_are_reported_by_test_and_phase(tmp_path, workers):
     (tmp_path / "test_three.py").write_text(THREE_TESTS)
     (tmp_path / "pytest.ini").write_text("[pytest]\n")
     command = [sys.executable, "-m", "pytest", "-p", "cpu_by_test", "--cpu-by-test", "cpu.csv"]

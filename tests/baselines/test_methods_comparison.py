@@ -40,7 +40,7 @@ def test_nothing_is_bridged(cut):
                 assert other.time_s[0] - one.time_s[-1] == pytest.approx(0.04)
 
 
-def test_the_truth_has_the_spread_of_the_noise_and_the_scale_is_no_matter(cut):
+def test_truth_has_the_spread_of_the_noise_at_any_scale(cut):
     true = spread_of([cut], [(UNIT_SOFT_IRON, HARD_IRON)])
     assert 0.001 < true < 0.004  # 1 mG in 0.47 G
     assert spread_of([cut], [(7 * UNIT_SOFT_IRON, HARD_IRON)]) == pytest.approx(true)
@@ -50,7 +50,7 @@ def test_the_truth_has_the_spread_of_the_noise_and_the_scale_is_no_matter(cut):
     assert spread_of([cut], [(None, np.zeros(3))]) > 20 * true
 
 
-def test_a_fit_of_half_of_it_is_judged_by_the_other_half():
+def test_fit_of_one_half_is_judged_by_the_other():
     data = simulate(n=6000, faster=3.0).data
     even, odd = halves(blocks(data, (6000,)))
     answers = [calibrate_with("ellipsoid", half) for half in (even, odd)]

@@ -1,4 +1,4 @@
-"""Data that no sensor gives: an answer is finite and positive definite, or there is none."""
+"""Data that no sensor produces: an answer is finite and positive definite, or there is none."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ def junk(seed, n, size, smooth, rate):
     constraint=st.sampled_from(["trace", "fang"]),
 )
 @settings(max_examples=10, deadline=None)
-def test_junk(method, seed, n, size, smooth, rate, derivative, constraint):
+def test_junk_gives_a_valid_answer_or_none(
+    method, seed, n, size, smooth, rate, derivative, constraint
+):
     chosen = MethodSettings(
         derivative=derivative, ellipsoid_constraint=constraint, sigma_mag_gauss=1e-3 * size
     )

@@ -39,7 +39,7 @@ def test_the_closed_form_gives_the_constrained_answer(kind, soft_iron):
 
 
 @pytest.mark.parametrize("wrong", [0.7, 1.3])
-def test_they_agree_where_the_given_magnitude_is_far_off(wrong):
+def test_methods_agree_when_the_given_magnitude_is_far_off(wrong):
     data = replace(
         simulate("wam", 2, n=3000).data, field_n_gauss=None, field_norm_gauss=wrong * SIZE
     )
@@ -110,7 +110,7 @@ def test_alternating_in_full_ends_at_the_same_place():
     assert turns < 80
 
 
-def test_a_field_that_is_unsure_in_places_counts_less_there():
+def test_readings_with_an_uncertain_field_have_less_weight():
     data = simulate("wam", 1, n=4000, soft_iron=np.eye(3)).data
     norms = np.full(4000, SIZE)
     norms[:1000] *= 1.05
@@ -145,7 +145,7 @@ def test_total_least_squares_differs_from_norm_preservation_in_second_order_only
     assert tls_rows(a, field, norms)[0].shape == (400,)
 
 
-def test_iterations_that_do_not_end_are_said(monkeypatch):
+def test_iterations_without_convergence_are_reported(monkeypatch):
     data = simulate("lam", 0, n=3000).data
     monkeypatch.setattr(attitude_independent, "_NP_MAX_ITERATIONS", 2)
     monkeypatch.setattr(attitude_independent, "_MAX_TURNS", 2)

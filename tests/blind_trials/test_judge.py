@@ -84,7 +84,7 @@ STEP = truth("single", effect())
         (truth("unidentifiable", effect()), said(finding("gyro_scale")), j.FALSE, True),
     ],
 )  # fmt: skip
-def test_every_verdict(case, answer, word, error):
+def test_every_verdict_is_reached(case, answer, word, error):
     verdict = judge(case, answer)
     assert (verdict.word, verdict.error) == (word, error)
 
@@ -107,20 +107,20 @@ def test_pairs(names, word):
     assert (verdict.word, verdict.multiple) == (word, 2.5)
 
 
-def test_a_name_for_the_same_signal_is_right_but_not_strictly():
+def test_effect_of_the_same_signal_is_right_but_not_strictly():
     lag = truth("single", effect("mag_low_pass", right=["mag_low_pass", "mag_time_lag"]))
     verdict = judge(lag, said(finding("mag_time_lag")))
     assert (verdict.word, verdict.first_right, verdict.strict) == (j.RIGHT, True, False)
 
 
-def test_a_table_in_degrees_may_be_refused_in_words_that_say_so():
+def test_table_in_degrees_may_be_refused_with_that_reason():
     case = truth("single", effect("unit_error"))
     refused = ToolAnswer("exit 2", "gyro: median 30, looks like deg/s", 0.3)
     assert judge(case, refused).word == j.RIGHT
     assert judge(case, ToolAnswer("exit 2", "no such file", 0.3)).word == j.NONE
 
 
-def test_intervals_onset_gain_and_coefficients_of_a_right_name():
+def test_intervals_onset_gain_and_coefficients_of_a_right_finding_are_scored():
     case = truth(
         "single",
         effect(
@@ -169,7 +169,7 @@ def test_semireal_is_judged_beyond_the_control():
     assert (unmoved.word, unmoved.error) == (j.MISSED, True)
 
 
-def test_what_the_control_says_too_is_no_false_name():
+def test_finding_in_the_control_is_not_a_false_finding():
     case = truth("semireal", effect("gyro_scale"))
     control = said(finding("mag_time_lag", "mag_low_pass"))
     both = said(finding("gyro_scale"), finding("mag_low_pass"))
@@ -207,7 +207,7 @@ def test_a_delay_of_the_other_sensor_counts_against_the_controls():
     assert judge(silent, of("mag_time_lag", 0.010), said()).error
 
 
-def test_half_a_step_is_the_delay_that_it_is():
+def test_half_a_step_is_scored_as_a_delay():
     lag = effect("mag_time_lag", right=["mag_time_lag", "gyro_integration"])
     case = truth("semireal", lag | {"parameters": [{"name": "lag", "value": 0.01, "unit": "s"}]})
     half = said(
@@ -218,7 +218,7 @@ def test_half_a_step_is_the_delay_that_it_is():
     assert (verdict.word, verdict.relative) == (j.RIGHT, pytest.approx(0.0, abs=1e-12))
 
 
-def test_what_the_recording_truly_has_is_no_false_name():
+def test_true_cause_of_the_recording_is_not_a_false_finding():
     case = truth("semireal", effect("gyro_scale"), allowed=["mag_time_lag"])
     both = said(finding("gyro_scale"), finding("mag_time_lag"))
     assert judge(case, both, said()).word == j.RIGHT
@@ -310,14 +310,14 @@ def test_alternatives_for_the_very_same_signal_share_the_confidence():
     assert rows["calibration error of the confidence"].value == pytest.approx(0.1)
 
 
-def test_calibration_error_of_an_honest_and_of_a_boasting_tool():
+def test_calibration_error_of_calibrated_and_overconfident_tools():
     honest = [(0.8, n % 5 != 0) for n in range(50)]
     boasting = [(1.0, n % 2 == 0) for n in range(50)]
     assert calibration_error(honest) == pytest.approx(0.0, abs=1e-12)
     assert calibration_error(boasting) == pytest.approx(0.5)
 
 
-def test_the_contracts_answer_is_read():
+def test_documented_answer_format_is_read():
     answer = read_answer(
         {
             "cpu_seconds": 2.5,
@@ -357,6 +357,6 @@ def test_the_contracts_answer_is_read():
 @pytest.mark.parametrize(
     "value", [None, [], {}, {"findings": 3, "unexplained": []}, {"findings": [{"where": 1}, "x"]}]
 )
-def test_an_odd_answer_is_no_crash(value):
+def test_malformed_answer_is_handled(value):
     answer = read_answer({"answer": value, "failure": "odd"})
     assert judge(STEP, answer).error is True

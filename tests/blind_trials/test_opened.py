@@ -1,6 +1,6 @@
-"""Cases of opened rings that were wrong once, made again by their seeds and answered.
+"""Cases of opened rings that were once answered wrongly, generated again from their seeds.
 
-No proof, since they were looked at; they hold what was mended.
+They are no proof, because they have been looked at; they keep what was corrected.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def answered(ring, case, folder):
         ("d1e56b7a", "sensor"),  # iron with two states had an object passed by beside it
     ],
 )
-def test_what_nobody_logged_is_an_unknown_without_a_name(case, frame, tmp_path):
+def test_unlogged_cause_is_unknown_without_a_finding(case, frame, tmp_path):
     found, truth = answered("ring120b", case, tmp_path)
     assert truth["kind"] in ("withheld", "outside")
     assert found.findings == ()
@@ -46,7 +46,7 @@ def test_what_nobody_logged_is_an_unknown_without_a_name(case, frame, tmp_path):
 
 
 @pytest.mark.slow
-def test_coarse_steps_are_named_and_nothing_rings_beside_them(tmp_path):
+def test_quantisation_is_found_without_a_false_line(tmp_path):
     found, truth = answered("ring300b", "196ca98c", tmp_path)
     (named,) = found.findings
     assert [named.effect] == truth["effects"][0]["right"]
@@ -56,13 +56,13 @@ def test_coarse_steps_are_named_and_nothing_rings_beside_them(tmp_path):
 
 
 @pytest.mark.slow
-def test_coarse_steps_that_repeat_are_not_stuck(tmp_path):
+def test_repeated_coarse_values_are_not_a_stuck_sensor(tmp_path):
     found, _ = answered("ring600b", "f51c6850", tmp_path)
     assert [one.effect for one in found.findings] == ["mag_quantisation"]
 
 
 @pytest.mark.slow
-def test_bursts_have_no_name_of_something_that_passes(tmp_path):
+def test_bursts_are_not_attributed_to_a_passing_object(tmp_path):
     found, _ = answered("ring600b", "5f89b619", tmp_path)
     assert found.findings == ()
     assert found.unexplained.detected
@@ -70,8 +70,8 @@ def test_bursts_have_no_name_of_something_that_passes(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_steady_line_is_named_though_its_copies_are_itself(tmp_path):
-    """A pump that runs evenly: moved in time, a line explains as much as before."""
+def test_steady_line_is_found_although_its_shifted_copies_fit_as_well(tmp_path):
+    """A pump at constant speed: shifted in time, the line explains as much as before."""
     found, _ = answered("ring600b", "5d716fae", tmp_path)
     assert [one.effect for one in found.findings] == ["ac_interference", "mag_time_lag"]
     assert min(one.confidence for one in found.findings) > 0.5
@@ -79,15 +79,15 @@ def test_a_steady_line_is_named_though_its_copies_are_itself(tmp_path):
 
 @pytest.mark.slow  # a shorter form: diagnosis/innovation_filter/test_noise
 @pytest.mark.parametrize("case", ["9e11d227", "ccdde21f"])
-def test_bursts_of_noise_leave_no_unknown(case, tmp_path):
+def test_noise_bursts_leave_no_unknown_cause(case, tmp_path):
     found, _ = answered("ring600b", case, tmp_path)
     assert [one.effect for one in found.findings] == ["noise_burst"]
     assert not found.unexplained.detected
 
 
 @pytest.mark.slow
-def test_a_spin_with_a_coarse_gyro_names_nothing(tmp_path):
-    """The field's own noise was hysteresis of 30 mG."""
+def test_spin_with_a_coarse_gyro_has_no_finding(tmp_path):
+    """The noise of the field was once reported as a hysteresis of 30 mG."""
     found, truth = answered("ring600b", "8d9dc4b5", tmp_path)
     assert truth["kind"] == "unidentifiable"
     assert found.findings == ()

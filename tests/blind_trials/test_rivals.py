@@ -1,4 +1,4 @@
-"""The rivals get a fair problem, and do with it what their packages do."""
+"""The rival tools get a fair problem, and use it as their packages do."""
 
 import json
 import sys
@@ -58,7 +58,7 @@ def test_the_true_column_is_among_the_first(strong, tmp_path):
     assert {"gyro_scale", "field_gradient", "mag_time_lag", "moving_iron"} <= set(regressed.names)
 
 
-def test_a_sensor_at_rest_gets_no_names(tmp_path):
+def test_sensor_at_rest_has_no_finding(tmp_path):
     pytest.importorskip("pysindy", reason=INSTALL)
     rng = np.random.default_rng(0)
     rest = np.column_stack(
@@ -114,7 +114,7 @@ def test_change_points_are_those_of_the_residual():
 
 
 @pytest.mark.slow
-def test_the_answer_has_the_contracts_form(tmp_path, strong, monkeypatch):
+def test_answer_has_the_documented_form(tmp_path, strong, monkeypatch):
     monkeypatch.setattr(
         rivals, "_TOOLS", {"stlsq": lambda p: rivals._answer([("gyro_scale", 0.5, [1.0, 9.0])])}
     )

@@ -1,4 +1,4 @@
-"""Make, run and score with a tool that knows nothing, and what happens to whoever cheats."""
+"""Generation, run and scoring of a round with a trivial tool, and detection of manipulation."""
 
 import json
 import os
@@ -222,7 +222,7 @@ def test_a_tool_that_lacks_a_package_is_stopped_and_its_answers_are_not_closed(s
     assert list(trial.answers("mine").iterdir()) == []
 
 
-def test_a_tool_that_answers_nothing_is_no_rival_whatever_it_says(sealed, tmp_path):
+def test_tool_without_any_answer_is_not_scored(sealed, tmp_path):
     """No list of words: a module that is not there, a library, a licence, a crash on every case."""
     trial, key_path, _ = sealed
     silent = tmp_path / "silent.py"
@@ -252,7 +252,7 @@ def test_a_tool_that_answers_nothing_is_no_rival_whatever_it_says(sealed, tmp_pa
     assert written["not_scored"] == {"older": why}
 
 
-def test_a_tool_that_answers_none_of_ten_cases_is_not_asked_the_rest(tmp_path):
+def test_tool_that_fails_ten_cases_is_stopped(tmp_path):
     folder, key_path, asked = tmp_path / "round", tmp_path / "key.json", tmp_path / "asked"
     cases = [case(f"null{k:04}", "null") for k in range(25)]
     for entry in cases:
@@ -292,7 +292,7 @@ def test_answers_of_a_tool_that_could_not_run_are_never_scored(sealed, tmp_path)
     assert "stlsq is not scored" in (tmp_path / "out" / "report.md").read_text()
 
 
-def test_nobody_who_could_run_is_no_round_to_score(sealed, tmp_path):
+def test_round_without_a_working_tool_is_not_scored(sealed, tmp_path):
     trial, key_path, _ = sealed
     folder = trial.answers("stlsq")
     folder.mkdir(parents=True)

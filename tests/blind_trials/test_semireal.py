@@ -100,7 +100,7 @@ def test_signal_to_noise_is_the_ideal_observers_where_noise_is_white(simulated):
     assert abs(own.own_delay_s) < 1e-3
 
 
-def test_a_calibration_does_not_stand_out_and_axes_do_not_matter(simulated):
+def test_visibility_ignores_calibration_and_axes(simulated):
     own = remainder.fit(simulated.at, simulated.mag, simulated.gyro)
     none, one = np.zeros_like(simulated.mag), np.ones_like(simulated.mag)
     assert own.signal_to_noise(one * [1e-3, -2e-3, 0], none) < 0.1
@@ -112,7 +112,7 @@ def test_a_calibration_does_not_stand_out_and_axes_do_not_matter(simulated):
     assert there == pytest.approx(own.signal_to_noise(mag, gyro), rel=0.02)
 
 
-def test_what_the_recording_has_itself_is_about_one_where_its_noise_is_stationary(simulated):
+def test_own_remainder_of_a_recording_is_near_one_for_stationary_noise(simulated):
     own = remainder.fit(simulated.at, simulated.mag, simulated.gyro)
     none = np.zeros_like(simulated.mag)
     late = (simulated.at > np.mean(simulated.at))[:, None]
@@ -122,7 +122,7 @@ def test_what_the_recording_has_itself_is_about_one_where_its_noise_is_stationar
     assert moved.score(steps[2], none) > 5
 
 
-def test_a_delay_of_its_own_is_found_and_is_no_noise(simulated):
+def test_own_delay_of_a_recording_is_found_and_not_counted_as_noise(simulated):
     own = remainder.fit(simulated.at, simulated.mag, simulated.gyro)
     late = np.array(
         [np.interp(simulated.at - 0.02, simulated.at, column) for column in simulated.mag.T]

@@ -113,7 +113,7 @@ _AT_ZERO = [
 
 
 @pytest.mark.parametrize("key", _AT_ZERO)
-def test_an_effect_of_no_strength_changes_nothing(rov, key):
+def test_effect_of_zero_strength_changes_nothing(rov, key):
     _, mag, gyro = sensed(rov)
     _, mag_0, gyro_0 = sensed(rov, key, 0.0)
     assert np.max(np.abs(mag_0 - mag)) < 1e-12
@@ -136,7 +136,7 @@ def test_an_effect_at_its_limit_shows_and_grows_in_proportion(rov, key):
         assert shown(2.0) / shown(1.0) == pytest.approx(2.0, rel=0.15)
 
 
-def test_lag_is_the_field_of_a_moment_ago(rov):
+def test_delay_gives_the_earlier_field(rov):
     at, mag, _ = sensed(rov, "mag_time_lag", 0.040)
     _, now, _ = sensed(rov)
     assert np.allclose(mag[1:], now[:-1], atol=1e-12)  # 25 Hz: 40 ms is one sample
@@ -188,7 +188,7 @@ def test_unidentifiable_cases_cannot_be_seen_and_others_can(most):
     assert seen["oracle_gain_nats_per_sample"] > seen["effects"][0]["snr"] ** 2 / 2 / samples
 
 
-def test_the_ring_of_600_has_the_dossiers_composition():
+def test_ring_of_600_has_the_documented_composition():
     orders = rings.orders("full", 600, seed=1)
     counts = {kind: sum(o.kind == kind for o in orders) for kind in rings.FULL}
     assert counts == rings.FULL
@@ -237,7 +237,7 @@ def test_same_seed_same_bytes_and_no_label(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_withheld_column_is_not_there():
+def test_withheld_column_is_missing():
     order = cases.Order("withheld", (("motor_current_field", 2.0),), withheld="motor")
     made = cases.make_case(order, [4, 4])
     assert not set(limits.GROUPS["motor"]) & set(made.rows.columns)

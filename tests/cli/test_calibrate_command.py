@@ -91,7 +91,7 @@ def test_a_capture_with_registers_in_force(run, tmp_path, capsys, true_fields):
     check_registers(found, device.truth, true_fields)
 
 
-def test_registers_hold_for_what_came_while_they_were_read(tmp_path, true_fields):
+def test_registers_apply_to_samples_received_while_they_were_read(tmp_path, true_fields):
     """The first second of a capture arrives before the registers are known; it is not raw."""
     device = binary_device(9, REGISTERS)
     path = tmp_path / "a.mcap"
@@ -153,7 +153,7 @@ def test_a_capture_of_the_daemon_replays_as_it_ran_and_calibrates_from_all_of_it
     check_registers(result.json("magyc"), device.truth, true_fields)
 
 
-def test_another_configuration_does_not_change_what_a_capture_says(tmp_path):
+def test_other_configuration_does_not_change_the_result_of_a_capture(tmp_path):
     path = tmp_path / "run.mcap"
     record_daemon(path, binary_device(10, {}), 10.0)
     done = replay(path, Config(mode="passive"))
@@ -185,7 +185,7 @@ def test_a_report_is_a_folder_as_with_every_command(run, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_replaced_is_told_before(run, tmp_path, capsys):
+def test_replaced_files_are_reported_before(run, tmp_path, capsys):
     path, target = FOLDER / "tumble_binary_restart.vnbin.gz", tmp_path / "c.json"
     assert run("calibrate", path, "--json", target) == 0
     assert "replaced" not in capsys.readouterr().err
@@ -204,7 +204,7 @@ def test_json_to_a_forbidden_path_is_one_line(run, tmp_path, capsys, command):
 
 
 @pytest.mark.parametrize("command", [("replay", "--rerun"), ("montecarlo", "wam", "--json")])
-def test_a_folder_that_takes_no_file_is_told_before_any_work(run, capsys, command):
+def test_unwritable_folder_is_reported_before_any_work(run, capsys, command):
     """Root may write everywhere, says the system; /proc takes no file all the same."""
     first, *options = command
     path = [FOLDER / "tumble_binary_restart.vnbin.gz"] if first == "replay" else []
@@ -214,7 +214,7 @@ def test_a_folder_that_takes_no_file_is_told_before_any_work(run, capsys, comman
     assert said.out == "" and said.err.count("\n") == 1
 
 
-def test_a_viewer_file_that_could_not_be_written_is_told(run, tmp_path, capsys, monkeypatch):
+def test_unwritable_viewer_file_is_reported(run, tmp_path, capsys, monkeypatch):
     path = FOLDER / "tumble_binary_restart.vnbin.gz"
     monkeypatch.setattr("ahrsd.cli.recordings.replay.refuse_unwritable", lambda target: None)
     assert run("replay", path, "--rerun", tmp_path / "none" / "run.rrd") == 2
@@ -263,9 +263,7 @@ def at_rest(tmp_path_factory) -> Path:
     return path
 
 
-def test_a_recording_that_does_not_determine_it_is_a_no_with_its_reason(
-    run, at_rest, tmp_path, capsys
-):
+def test_undetermined_calibration_is_refused_with_a_reason(run, at_rest, tmp_path, capsys):
     assert run("calibrate", at_rest, "--json", "-", "--report", tmp_path / "r") == 1
     found = json.loads(capsys.readouterr().out)
     assert faults(found, CALIBRATION) == []
@@ -277,7 +275,7 @@ def test_a_recording_that_does_not_determine_it_is_a_no_with_its_reason(
     assert "This motion does not determine: " in page
 
 
-def test_the_words_for_a_person_say_what_is_not_known(run, at_rest, capsys):
+def test_text_output_lists_undetermined_directions(run, at_rest, capsys):
     assert run("calibrate", at_rest) == 1
     out = capsys.readouterr().out
     assert "hard iron  not determined, not determined, not determined mG" in out

@@ -49,7 +49,7 @@ def test_a_device_with_unknown_firmware_can_be_recorded(run, emulated, tmp_path)
     assert CaptureReader(tmp_path / "a.mcap").header["firmware"] == "7.0.0.0"
 
 
-def test_passive_sends_not_one_byte(run, emulated, tmp_path, capsys):
+def test_passive_sends_no_byte(run, emulated, tmp_path, capsys):
     with emulated() as (emulator, path):
         assert run("capture", path, "-o", tmp_path / "a.mcap", "--seconds", 1, "--passive") == 0
         assert emulator.counters["commands"] == 0
@@ -75,7 +75,7 @@ def test_ctrl_c_ends_in_order(run, emulated, tmp_path, capsys):
     assert summary["lost_bytes"] == 0
 
 
-def test_unplugging_keeps_what_came_and_is_75(run, emulated, tmp_path, capsys):
+def test_unplugging_keeps_the_received_data_and_is_code_75(run, emulated, tmp_path, capsys):
     with emulated() as (emulator, path):
 
         def unplug() -> None:
@@ -102,14 +102,14 @@ def test_unplugging_keeps_what_came_and_is_75(run, emulated, tmp_path, capsys):
         ("no/folder/a.mcap", "is no folder"),
     ],
 )
-def test_a_wrong_output_is_told_before_the_port_is_touched(run, tmp_path, capsys, name, words):
+def test_wrong_output_is_refused_before_the_port_is_opened(run, tmp_path, capsys, name, words):
     (tmp_path / "there.mcap").write_bytes(b"precious")
     assert run("capture", "/dev/does-not-exist", "-o", tmp_path / name) == 2
     assert words in capsys.readouterr().err
     assert (tmp_path / "there.mcap").read_bytes() == b"precious"
 
 
-def test_a_port_that_is_not_there_leaves_no_file(run, tmp_path, capsys):
+def test_missing_port_leaves_no_file(run, tmp_path, capsys):
     assert run("capture", "/dev/does-not-exist", "-o", tmp_path / "a.mcap", *BAUD) == 75
     assert list(tmp_path.iterdir()) == []
 

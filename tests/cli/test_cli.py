@@ -48,7 +48,7 @@ def test_help_lists_every_command_and_imports_nothing_heavy():
 
 
 @pytest.mark.parametrize("words", [[], ["make", "--cases", "3", "-o", "new"], ["score", "x"]])
-def test_without_the_source_tree_the_blind_trials_say_in_one_line_what_to_install(words):
+def test_blind_trials_without_the_source_tree_name_what_to_install(words):
     code = (
         "import sys\n"
         "sys.path = [path for path in sys.path if not path.endswith('tests/tools')]\n"
@@ -64,7 +64,7 @@ def test_without_the_source_tree_the_blind_trials_say_in_one_line_what_to_instal
 
 
 @pytest.mark.parametrize(("given", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2")])
-def test_matrices_take_one_thread_unless_told_otherwise(given, used):
+def test_blas_uses_one_thread_by_default(given, used):
     code = (
         "import ahrsd.__main__, os, sys\n"
         "assert 'numpy' not in sys.modules\n"
@@ -141,7 +141,7 @@ def test_wrong_usage_is_2(run, capsys):
     assert "Missing argument 'PORT'" in capsys.readouterr().err
 
 
-def test_a_reader_that_goes_away_is_no_error():
+def test_closed_output_pipe_is_no_error():
     reading, writing = os.pipe()
     os.close(reading)
     done = subprocess.run(
@@ -158,7 +158,7 @@ def test_a_reader_that_goes_away_is_no_error():
 class TestRun:
     """Options of `run` that need no device."""
 
-    def test_print_config_reloads_to_what_is_in_force(self, run, tmp_path, capsys):
+    def test_printed_configuration_reloads_to_the_one_in_force(self, run, tmp_path, capsys):
         (tmp_path / "a.toml").write_text("[gates]\nclosure_deg = 4.0\n")
         assert run("run", "--config", str(tmp_path / "a.toml"), "--port", "/dev/vn100",
                    "--mode", "stage", "--print-config") == 0  # fmt: skip
@@ -179,7 +179,7 @@ class TestRun:
         assert run("run") == 2
         assert "no port: give --port" in capsys.readouterr().err
 
-    def test_a_port_that_is_not_there_is_75_and_one_line(self, run, tmp_path, capsys):
+    def test_missing_port_is_code_75_and_one_line(self, run, tmp_path, capsys):
         (tmp_path / "a.toml").write_text(f'state_directory = "{tmp_path}"')
         port = "/dev/does-not-exist"
         assert run("run", "--config", tmp_path / "a.toml", "--port", port) == 75

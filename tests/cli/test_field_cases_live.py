@@ -172,7 +172,7 @@ def test_packets_of_the_ros_2_driver_are_heard_live(tmp_path: Path) -> None:
     assert "link lost" not in said
 
 
-def test_what_the_ros_2_driver_had_set_is_put_back(tmp_path: Path) -> None:
+def test_settings_of_the_ros_2_driver_are_restored(tmp_path: Path) -> None:
     with device("f03_ros2_left_it_follows_75", tmp_path) as scripted:
         config = "configure_stream = true\n"
         said = run(scripted, tmp_path, "output set up for the session", 20, config)
@@ -190,7 +190,7 @@ def test_the_autopilots_packets_have_the_rate_of_their_register(tmp_path: Path) 
     assert rate_of(said) == "50 Hz, register 75: 800 Hz / 16"
 
 
-def test_an_adapter_that_echoes_answers_nothing(tmp_path: Path) -> None:
+def test_echoing_adapter_is_not_a_device(tmp_path: Path) -> None:
     with device("f06_echo", tmp_path) as scripted:
         read = ahrsd("registers", "read", scripted.port, "--baud", 115200)
         said = run(scripted, tmp_path, "OBSERVING", 20)
@@ -278,7 +278,7 @@ def test_the_emulator_answers_as_devices_did_in_public_reports() -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may open every port")
-def test_a_port_that_may_not_be_opened_names_the_group(tmp_path: Path) -> None:
+def test_port_without_permission_is_refused_with_the_group(tmp_path: Path) -> None:
     with device("plain", tmp_path) as scripted:
         Path(scripted.port).chmod(0o000)
         read = ahrsd("registers", "read", scripted.port)

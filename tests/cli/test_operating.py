@@ -31,7 +31,7 @@ def test_every_command_that_is_named_exists():
     assert {"status", "explain", "watch", "bundle", "operator", "registers", "run"} <= commands
 
 
-def test_alarms_are_states_or_words_that_the_program_says():
+def test_documented_alarms_are_states_or_messages_of_the_program():
     table = PAGE[PAGE.index("## Alarms") : PAGE.index("What the device itself may answer")]
     alarms = re.findall(r"^\| `([^`]+)` \|", table, re.MULTILINE)
     assert len(alarms) >= 8
@@ -41,7 +41,7 @@ def test_alarms_are_states_or_words_that_the_program_says():
         assert alarm in STATES or said, alarm
 
 
-def test_what_it_says_when_it_does_not_work_is_what_it_says():
+def test_quoted_error_messages_are_those_of_the_program():
     table = PAGE[PAGE.index("## When it does not work") :]
     cells = re.findall(r"^\| ([^|]*`[^|]*) \|", table, re.MULTILINE)
     said = [text for cell in cells for text in re.findall(r"`([^`]+)`", cell)]
@@ -58,7 +58,7 @@ def test_the_states_that_need_a_person_are_explained():
         assert f"`{state}`" in table
 
 
-def test_the_drop_in_undoes_what_the_unit_forbids():
+def test_documented_drop_in_lifts_the_restrictions_of_the_unit():
     unit = (PROJECT / "systemd" / "ahrsd.service").read_text(encoding="utf-8")
     drop_in = re.search(r"```\n\[Service\]\n(.*?)```", PAGE, re.DOTALL)
     keys = [line.split("=")[0] for line in drop_in[1].splitlines()]

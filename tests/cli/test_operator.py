@@ -1,4 +1,6 @@
-"""A person's word reaches the daemon once, whole, and in time, or not at all, and is answered."""
+"""Commands of a person reach the daemon once, complete and in time, or not at all, and are
+answered.
+"""
 
 import json
 import os
@@ -62,7 +64,7 @@ def answer_of(box, name):
     return json.loads(path.read_text())
 
 
-def test_a_word_is_taken_once_and_in_order(box, inbox):
+def test_command_is_taken_once_and_in_order(box, inbox):
     first, second = box.put("approve", "ae188205"), box.put("lock", "crew aboard")
     assert heard(inbox, 2) == [
         OperatorCommand(first, "approve", "ae188205"),
@@ -72,7 +74,7 @@ def test_a_word_is_taken_once_and_in_order(box, inbox):
     assert list(box.folder.iterdir()) == []
 
 
-def test_whoever_said_it_gets_the_answer(box, inbox):
+def test_sender_of_a_command_gets_the_answer(box, inbox):
     answers = []
     caller = threading.Thread(
         target=lambda: answers.append(box.say("approve", "ae188205", VERY_LONG_S))
@@ -85,7 +87,7 @@ def test_whoever_said_it_gets_the_answer(box, inbox):
     assert list(box.folder.iterdir()) == []
 
 
-def test_a_word_that_lay_there_at_the_start_is_dropped_and_answered(box, caplog):
+def test_command_from_before_the_start_is_dropped_and_answered(box, caplog):
     name = box.put("approve", "ae188205")
     future = time.time() + 20.0
     os.utime(box.folder / f"{name}.json", (future, future))  # no stamp makes it one of this run
@@ -97,7 +99,7 @@ def test_a_word_that_lay_there_at_the_start_is_dropped_and_answered(box, caplog)
     inbox.close(10.0)
 
 
-def test_a_word_is_of_now_where_somebody_looked_in_time(box, inbox, monkeypatch):
+def test_command_is_recent_if_the_folder_was_checked_in_time(box, inbox, monkeypatch):
     inbox._looked_s -= 2 * LONGEST_S  # a disk that hung
     monkeypatch.setattr("ahrsd.daemon.operator_inbox._EVERY_S", 0.01)
     inbox.close(10.0)
@@ -114,7 +116,7 @@ def test_a_word_is_of_now_where_somebody_looked_in_time(box, inbox, monkeypatch)
     [b"", b"{", b"[]", b'{"verb": "approve"}', b'{"verb": "commit", "argument": ""}',
      b'{"verb": "approve", "argument": 3}', b"\xff" * 4000],
 )  # fmt: skip
-def test_what_is_not_a_word_does_nothing_and_goes(box, inbox, body, caplog):
+def test_invalid_command_file_is_removed_without_effect(box, inbox, body, caplog):
     (box.folder / ".1").write_bytes(body)
     (box.folder / ".1").rename(box.folder / "1.json")
     assert "is not a command" in answer_of(box, "1")["text"]
@@ -124,7 +126,7 @@ def test_what_is_not_a_word_does_nothing_and_goes(box, inbox, body, caplog):
 
 
 @pytest.mark.parametrize("kind", ["folder", "FIFO", "link"])
-def test_an_odd_entry_is_complained_about_once_and_left_alone(box, inbox, tmp_path, kind, caplog):
+def test_odd_folder_entry_is_reported_once_and_kept(box, inbox, tmp_path, kind, caplog):
     path = box.folder / "x.json"
     if kind == "folder":
         path.mkdir()
@@ -144,7 +146,7 @@ def test_an_odd_entry_is_complained_about_once_and_left_alone(box, inbox, tmp_pa
     assert heard(inbox)[0].verb == "lock"
 
 
-def test_no_folder_is_no_word_and_is_said(tmp_path):
+def test_missing_command_folder_is_reported(tmp_path):
     inbox = OperatorInbox(OperatorBox(tmp_path / "nowhere"))
     until(lambda: "nobody can approve" in inbox.fault)
     assert inbox.take() == []
@@ -155,7 +157,7 @@ def test_no_folder_is_no_word_and_is_said(tmp_path):
 
 
 @pytest.mark.parametrize("umask", [0o000, 0o022, 0o077])
-def test_only_the_daemons_user_may_speak_whatever_the_umask(tmp_path, umask):
+def test_only_the_user_of_the_daemon_may_command_with_any_umask(tmp_path, umask):
     before = os.umask(umask)
     try:
         box = OperatorBox(tmp_path)
@@ -168,7 +170,7 @@ def test_only_the_daemons_user_may_speak_whatever_the_umask(tmp_path, umask):
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o702])
-def test_a_folder_that_others_may_write_to_is_refused_by_name(tmp_path, mode, run, capsys):
+def test_command_folder_writable_by_others_is_refused(tmp_path, mode, run, capsys):
     box = OperatorBox(tmp_path)
     box.folder.mkdir()
     box.folder.chmod(mode)
@@ -189,7 +191,7 @@ def test_a_folder_that_others_may_write_to_is_refused_by_name(tmp_path, mode, ru
     inbox.close(10.0)
 
 
-def test_a_folder_that_becomes_writable_for_others_in_the_run_is_refused_too(box, inbox):
+def test_command_folder_made_writable_during_the_run_is_refused(box, inbox):
     box.folder.chmod(0o777)
     until(lambda: "others than its owner may write there" in inbox.fault)
     (box.folder / "1.json").write_text('{"verb": "arm", "argument": ""}')
@@ -202,14 +204,14 @@ def test_a_folder_that_becomes_writable_for_others_in_the_run_is_refused_too(box
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")
-def test_a_folder_of_a_stranger_is_refused_by_name(box):
+def test_command_folder_of_another_user_is_refused(box):
     os.chown(box.folder, 12345, 12345)
     with pytest.raises(OperatorFolderError, match="belongs to user 12345, who could approve"):
         box.prepare()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as another user")
-def test_root_with_any_umask_is_heard_by_a_daemon_of_another_user(box, tmp_path):
+def test_command_of_root_with_any_umask_is_accepted(box, tmp_path):
     """The reader runs as the folder's owner, in a process of its own."""
     top = Path(tempfile.gettempdir())
     for folder in (tmp_path, *tmp_path.parents):
@@ -228,7 +230,7 @@ def test_root_with_any_umask_is_heard_by_a_daemon_of_another_user(box, tmp_path)
     assert path.stat().st_uid == 12345
 
 
-def test_a_link_is_no_folder_for_words(tmp_path):
+def test_link_as_command_folder_is_refused(tmp_path):
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     (tmp_path / "operator").symlink_to("elsewhere")
     with pytest.raises(OperatorFolderError, match="is not a folder"):
@@ -266,7 +268,7 @@ def qualify(core):
     return core.writeback.proposal.id
 
 
-def test_each_word_is_answered_with_the_reason(core):
+def test_each_command_is_answered_with_a_reason(core):
     assert answers(core, "approve", "ae188205") == [
         ("word", False, "no candidate to approve in OBSERVING")
     ]
@@ -303,7 +305,7 @@ def test_a_lock_that_the_journal_did_not_take_is_refused(core):
 # -- the command -----------------------------------------------------------------------------------
 
 
-def test_the_command_says_that_nobody_listens(run, tmp_path, box, capsys, monkeypatch):
+def test_missing_daemon_is_reported(run, tmp_path, box, capsys, monkeypatch):
     monkeypatch.setattr("ahrsd.cli.running.daemon._WAIT_S", 0.1)
     assert run("operator", "lock", "--state-directory", tmp_path) == 75
     assert capsys.readouterr().err == "ahrsd: no daemon took the command within 0 s\n"

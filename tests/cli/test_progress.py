@@ -26,7 +26,7 @@ def streams(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", ["a.vnraw", "a.vnraw.gz", "a.csv", "a.csv.gz"])
-def test_what_is_told_moves_and_adds_up_to_the_file(streams, name):
+def test_progress_adds_up_to_the_file_size(streams, name):
     told: list[int] = []
     path = streams / name
     replay(path, Config(), rate_hz=25.0 if "raw" in name else None, progress=told.append)
@@ -52,7 +52,7 @@ def test_a_bar_shows_how_much_of_the_file_is_done(tmp_path, monkeypatch):
     assert f"{whole / 2:.1f}/{whole:.1f} kB" in text
 
 
-def test_where_nobody_looks_there_is_no_bar(tmp_path):
+def test_no_progress_bar_without_a_terminal(tmp_path):
     with byte_progress(tmp_path / "a.csv") as done, count_progress("cases") as counted:
         assert done is None
         assert counted is None

@@ -37,7 +37,7 @@ def here(run, tmp_path):
     return lambda *words: run(*words, "--state-directory", tmp_path)
 
 
-def test_a_lock_forbids_writes_and_lets_old_values_come_back(here, emulated, tmp_path, capsys):
+def test_lock_forbids_writes_and_permits_a_rollback(here, emulated, tmp_path, capsys):
     with emulated() as (emulator, path):
         write = ("registers", "write", path, 23, NEW, "--yes", *BAUD)
         assert here(*write) == 0
@@ -55,7 +55,7 @@ def test_a_lock_forbids_writes_and_lets_old_values_come_back(here, emulated, tmp
     assert kinds(tmp_path) == [*hand, "LOCKED", *hand, "UNLOCKED", *hand]
 
 
-def test_a_daemon_begins_locked_where_a_person_locked_before(here, tmp_path):
+def test_daemon_starts_locked_after_an_earlier_lock(here, tmp_path):
     assert here("registers", "lock", "dry dock", "--serial", SERIAL) == 0
     policy = WriteBackPolicy(
         mode=Mode.STAGE, approval="auto", armed_at_start=True, max_change_auto_deg=180.0
@@ -82,7 +82,7 @@ def vars_of(record):
     return {"kind": record.kind, "facts": record.facts}
 
 
-def test_where_a_daemon_runs_it_is_told_and_its_journal_is_left_alone(here, tmp_path, capsys):
+def test_lock_is_sent_to_a_running_daemon_and_its_journal_is_unchanged(here, tmp_path, capsys):
     box, words, done = OperatorBox(tmp_path), [], threading.Event()
     box.prepare()
     inbox = OperatorInbox(box)
@@ -112,7 +112,7 @@ def test_where_a_daemon_runs_it_is_told_and_its_journal_is_left_alone(here, tmp_
     assert "the daemon refused: said" in said.err
 
 
-def test_a_daemon_with_another_device_is_not_told(here, tmp_path, monkeypatch, capsys):
+def test_lock_is_not_sent_to_a_daemon_with_another_device(here, tmp_path, monkeypatch, capsys):
     def answers(serial):
         class Daemon:
             def __init__(self, path):
@@ -141,9 +141,7 @@ def test_a_daemon_with_another_device_is_not_told(here, tmp_path, monkeypatch, c
     assert kinds(tmp_path) == ["LOCKED"]
 
 
-def test_a_daemon_that_is_gone_leaves_its_folder_and_the_journal_takes_the_word(
-    here, tmp_path, monkeypatch
-):
+def test_lock_is_journaled_when_the_daemon_is_gone(here, tmp_path, monkeypatch):
     monkeypatch.setattr("ahrsd.cli.device.registers._WAIT_S", 0.1)
     OperatorBox(tmp_path).prepare()
     assert here("registers", "lock", "crew aboard", "--serial", SERIAL) == 0
@@ -151,7 +149,7 @@ def test_a_daemon_that_is_gone_leaves_its_folder_and_the_journal_takes_the_word(
     assert list(OperatorBox(tmp_path).folder.iterdir()) == []
 
 
-def test_of_several_devices_one_must_be_named(here, tmp_path, capsys):
+def test_one_of_several_devices_must_be_named(here, tmp_path, capsys):
     assert here("registers", "lock", "crew aboard") == 1
     assert "there is no journal" in capsys.readouterr().err
     for serial in (1, 2):
@@ -165,7 +163,7 @@ def test_of_several_devices_one_must_be_named(here, tmp_path, capsys):
     assert "it is not locked" in capsys.readouterr().out
 
 
-def test_exported_lines_are_what_the_device_takes(here, emulated, tmp_path, capsys):
+def test_exported_lines_are_accepted_by_the_device(here, emulated, tmp_path, capsys):
     with emulated() as (emulator, path):
         assert here("registers", "write", path, 23, NEW, "--yes", *BAUD) == 0
         capsys.readouterr()
@@ -188,7 +186,7 @@ def test_exported_lines_are_what_the_device_takes(here, emulated, tmp_path, caps
     assert held[23, 0] == pytest.approx([float(value) for value in NEW.split(",")])
 
 
-def test_exported_json_is_what_diff_reads(here, emulated, tmp_path, capsys):
+def test_exported_json_is_read_by_diff(here, emulated, tmp_path, capsys):
     file = tmp_path / "now.json"
     with emulated() as (_, path):
         assert here("registers", "export", path, "23", "84", "--json", "-o", file, *BAUD) == 0

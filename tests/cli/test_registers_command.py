@@ -54,7 +54,7 @@ def test_reading_sends_nothing_but_reads(run, emulated, capsys):
         assert emulator.counters["saves"] == 0
 
 
-def test_write_journals_verifies_and_tells_how_to_go_back(run, emulated, tmp_path, capsys):
+def test_write_is_journaled_verified_and_explains_the_rollback(run, emulated, tmp_path, capsys):
     with emulated() as (emulator, path):
         code = run("registers", "write", path, 23, *NEW, "--yes",
                    "--state-directory", tmp_path, *BAUD)  # fmt: skip
@@ -99,7 +99,7 @@ def test_without_yes_nothing_is_written(run, emulated, tmp_path, capsys):
     assert "new  c [1.1 0 0; 0 1 0; 0 0 0.9]  b [0.125 -0.0625 0.03] gauss" in output.out
 
 
-def test_what_is_there_already_is_not_written_again(run, emulated, tmp_path, capsys):
+def test_unchanged_values_are_not_written_again(run, emulated, tmp_path, capsys):
     with emulated() as (_, path):
         assert run("registers", "write", path, 23, *IDENTITY, "--yes",
                    "--state-directory", tmp_path, *BAUD) == 0  # fmt: skip
@@ -143,7 +143,7 @@ def test_save_writes_flash_once_and_journals_it(run, emulated, tmp_path):
     ]
 
 
-def test_a_refused_write_leaves_the_device_as_it_was(run, emulated, tmp_path, capsys):
+def test_refused_write_leaves_the_device_unchanged(run, emulated, tmp_path, capsys):
     with emulated(faults=("refused_write",)) as (emulator, path):
         assert run("registers", "write", path, 23, *NEW, "--yes",
                    "--state-directory", tmp_path, *BAUD) == 1  # fmt: skip
@@ -185,7 +185,7 @@ def test_wrong_values_never_reach_the_port(run, arguments, words, capsys):
     assert words in capsys.readouterr().err
 
 
-def test_a_port_that_is_not_there_is_75(run, capsys):
+def test_missing_port_is_code_75(run, capsys):
     assert run("registers", "read", "/dev/does-not-exist", *BAUD) == 75
     error = capsys.readouterr().err
     assert error.count("\n") == 1
@@ -223,7 +223,7 @@ def test_diff_of_device_file_and_journal(run, emulated, tmp_path, capsys):
         ("empty.json", 2, "have no register in common"),
     ],
 )
-def test_diff_of_what_is_no_set_of_registers(
+def test_diff_of_invalid_registers_is_refused(
     run, tmp_path, monkeypatch, capsys, first, code, words
 ):
     monkeypatch.chdir(tmp_path)
@@ -306,7 +306,7 @@ FAR = [*FACTORY[:9], 1.4, 0, 0]
         ({"device": {"serial": 7}}, f"is of the device 7, and this one is {SERIAL}"),
     ],
 )  # fmt: skip
-def test_what_may_not_be_written_is_one_line(
+def test_forbidden_write_is_refused_in_one_line(
     write_from, emulated, tmp_path, capsys, changes, words
 ):
     with emulated() as (emulator, port):

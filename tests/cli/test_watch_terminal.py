@@ -59,7 +59,7 @@ def terminal(tmp_path):
     server.close()
 
 
-def test_it_fits_scrolls_and_ends_by_a_key(terminal):
+def test_watch_fits_scrolls_and_ends_by_a_key(terminal):
     drawn, press, process = terminal
     text = drawn("arrows scroll, q ends")
     assert "0 of 2 held-out segments are usable" in text
@@ -87,7 +87,7 @@ def test_keys_count_one_by_one_however_they_come_and_while_records_pour(terminal
     assert process.wait(PATIENCE_S) == 0
 
 
-def test_where_the_daemon_ends_it_says_so_and_ends_too(terminal):
+def test_watch_reports_the_end_of_the_daemon_and_ends(terminal):
     drawn, _, process = terminal
     drawn("arrows scroll, q ends")
     drawn.server.close()

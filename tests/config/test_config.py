@@ -117,7 +117,7 @@ def test_each_mistake_is_one_line_with_file_key_value_and_what_is_allowed(tmp_pa
     assert "\n" not in caught.value.lines[0]
 
 
-def test_all_mistakes_are_told_at_once(tmp_path):
+def test_all_mistakes_are_reported_at_once(tmp_path):
     with pytest.raises(ConfigError) as caught:
         load(tmp_path, 'mode = "x"\n[device]\nrate_hz = 0\nprt = "a"\n')
     assert [line.split(": ")[1].split(" ")[0] for line in caught.value.lines] == [
@@ -264,7 +264,7 @@ def test_the_command_line_names_the_state_directory_as_the_other_commands_do(tmp
         ('pty = "/x"\nownr = true', "share.0.ownr = True: unknown key; did you mean owner?"),
     ],
 )
-def test_a_share_that_cannot_be_is_one_line(tmp_path, share, words):
+def test_impossible_share_is_refused_in_one_line(tmp_path, share, words):
     with pytest.raises(ConfigError) as error:
         load(tmp_path, f"[[share]]\n{share}\n")
     assert words in str(error.value)

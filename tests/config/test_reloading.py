@@ -1,4 +1,6 @@
-"""The configuration read again: what may change does, the rest is said, a wrong file is not."""
+"""Reloading the configuration: permitted changes apply, others are reported, a wrong file is
+rejected.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,7 @@ def until(condition):
     return found
 
 
-def test_what_may_change_is_taken_and_the_rest_waits():
+def test_permitted_changes_apply_and_others_wait_for_a_restart():
     new = check_config(
         {
             "mode": "commit",
@@ -63,7 +65,7 @@ def test_what_may_change_is_taken_and_the_rest_waits():
     assert change.config.interlock.max_age_s == Config().interlock.max_age_s
 
 
-def test_nothing_that_lets_a_write_through_changes_in_a_run():
+def test_no_setting_that_permits_a_write_changes_during_a_run():
     for table in ("write_back", "trial", "still", "budget", "device", "location", "estimator"):
         assert not any(
             may_change(table, key) for key in type(getattr(Config(), table)).model_fields
@@ -86,7 +88,7 @@ def taken(reloader, applied):
     return said
 
 
-def test_a_wrong_file_changes_nothing_and_is_said(file):
+def test_wrong_file_changes_nothing_and_is_reported(file):
     reloader, applied = Reloader(lambda: load_config(file), Config()), []
     file.write_text("[gates]\nmax_heading_sigma_deg = 0.5\nmisspelt = 1\n[device]\nbaud = 1\n")
     said = taken(reloader, applied)
@@ -99,7 +101,7 @@ def test_a_wrong_file_changes_nothing_and_is_said(file):
     assert "is a FIFO, not a regular file" in taken(reloader, applied)[0][1]
 
 
-def test_a_right_file_is_taken_once(file):
+def test_correct_file_is_applied_once(file):
     reloader, applied = Reloader(lambda: load_config(file), Config()), []
     file.write_text('mode = "stage"\n[gates]\nmax_heading_sigma_deg = 0.5\n')
     assert taken(reloader, applied) == [
@@ -113,7 +115,7 @@ def test_a_right_file_is_taken_once(file):
     assert len(applied) == 1
 
 
-def test_without_a_file_that_is_said():
+def test_missing_file_is_reported():
     assert taken(Reloader(None, Config()), []) == [
         (False, "the old configuration stays: there is no file to read again: give --config")
     ]
@@ -123,12 +125,12 @@ def limits(**changes):
     return asdict(check_config({"gates": changes}, "test").gates.limits())
 
 
-def test_limits_are_an_input_like_any_other():
+def test_limits_are_a_recorded_input():
     item = LimitsChanged(5, limits(max_heading_sigma_deg=0.5))
     assert capture.input_from_json(capture.input_to_json(item)) == item
 
 
-def test_a_verdict_by_other_limits_allows_nothing():
+def test_verdict_with_other_limits_permits_nothing():
     core = Core(core_settings(Config()))
     back = core.writeback
     back.on_no_device(None, 1.0)

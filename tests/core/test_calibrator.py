@@ -1,4 +1,4 @@
-"""Samples to a judged estimate: what the estimator sees and what not, and the field's scale."""
+"""From samples to a judged estimate: what the estimator receives, and the scale of the field."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def run(blocks: list[SampleBlock], **changes: object) -> Calibrator:
     return calibrator
 
 
-def test_it_finds_what_is_hidden_in_the_device(blocks):
+def test_calibrator_finds_the_calibration_of_the_emulated_device(blocks):
     estimate = run(blocks).finish()
     assert estimate is not None
     assert estimate.converged
@@ -67,8 +67,8 @@ def test_it_finds_what_is_hidden_in_the_device(blocks):
     assert np.abs((estimate.gyro_bias_rad_s - truth.gyro_bias_rad_s) / estimate.sigma[9:]).max() < 4
 
 
-def test_what_is_held_out_is_never_seen_by_the_estimator(blocks):
-    """Whatever is in the held-out parts changes nothing (a step would: `monitoring`)."""
+def test_held_out_samples_never_reach_the_estimator(blocks):
+    """Changes of held-out samples do not change the estimate (a step would: `monitoring`)."""
     plain, other = (Calibrator(settings(), Affine.identity(), np.zeros(3)) for _ in range(2))
     held, rng = 0, np.random.default_rng(1)
     for block in later(blocks, 3):
@@ -85,7 +85,7 @@ def test_what_is_held_out_is_never_seen_by_the_estimator(blocks):
 
 
 def later(blocks: list[SampleBlock], times: int) -> list[SampleBlock]:
-    """The same minute again and again, a minute apart."""
+    """The same minute repeated, a minute apart."""
     return [
         replace(block, time_s=block.time_s + 60.0 * k, host_s=block.host_s + 60.0 * k)
         for k in range(times)
@@ -93,7 +93,7 @@ def later(blocks: list[SampleBlock], times: int) -> list[SampleBlock]:
     ]
 
 
-def test_nothing_is_held_out_of_a_batch_and_no_step_is_lost(blocks):
+def test_batch_has_no_held_out_samples_and_loses_no_step(blocks):
     samples = sum(len(block) for block in blocks)
     seen: list[SampleBlock] = []
     calibrator = Calibrator(settings(held_out=False), Affine.identity(), np.zeros(3))
@@ -107,13 +107,15 @@ def test_nothing_is_held_out_of_a_batch_and_no_step_is_lost(blocks):
     for block in blocks:
         calibrator.take(block)
     assert sum(len(block) for block in seen) == samples
-    assert sum(int(np.count_nonzero(np.isnan(block.dt_s))) for block in seen) == 1  # the very first
+    assert (
+        sum(int(np.count_nonzero(np.isnan(block.dt_s))) for block in seen) == 1
+    )  # the first sample
     estimate = calibrator.finish()
     assert estimate is not None
     assert estimate.samples == samples
 
 
-def test_a_known_field_gives_the_scale(blocks):
+def test_known_field_sets_the_scale(blocks):
     field = world_field(37.8, -122.4, 0.0, 2025.5)
     plain, known = run(blocks).estimate, run(blocks, world_field=field).estimate
     assert plain is not None
@@ -130,13 +132,13 @@ def test_a_known_field_gives_the_scale(blocks):
     assert strength.mean() == pytest.approx(field.total_gauss, rel=0.01)
 
 
-def test_without_an_estimate_nothing_is_judged():
+def test_nothing_is_judged_without_an_estimate():
     calibrator = Calibrator(settings(), Affine.identity(), np.zeros(3))
     assert calibrator.judge_estimate(0.0, HEALTH, BASIS) == ()
     assert calibrator.finish() is None
 
 
-def test_it_is_judged_by_every_gate(blocks):
+def test_estimate_is_judged_by_every_gate(blocks):
     calibrator = run(blocks)
     gates = calibrator.judge_estimate(60.0, HEALTH, BASIS)
     assert len(gates) > 30
@@ -150,7 +152,7 @@ def test_it_is_judged_by_every_gate(blocks):
     ]
 
 
-def test_anew_has_seen_nothing_and_keeps_what_is_in_force(blocks):
+def test_restarted_calibrator_is_empty_and_keeps_the_calibration_in_force(blocks):
     present = Affine(np.eye(3), np.array([0.1, 0.0, 0.0]))
     calibrator = Calibrator(settings(), present, np.array([0.01, 0.0, 0.0]))
     for block in blocks[:100]:
@@ -163,7 +165,7 @@ def test_anew_has_seen_nothing_and_keeps_what_is_in_force(blocks):
     assert fresh.present_gyro_bias_rad_s.tolist() == [0.01, 0.0, 0.0]
 
 
-def test_what_is_left_over_is_told_once_and_judged():
+def test_remaining_residual_is_reported_once_and_judged():
     """A field that follows the attitude, half of the magnetometer's noise on each axis."""
     motion = (("circles", 40.0), ("roll", 30.0), ("pitch", 30.0), ("circles", 40.0), ("roll", 30.0))
     made = pieces.drive(motion, 700)

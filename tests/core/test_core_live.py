@@ -1,6 +1,7 @@
-"""A live run and its capture: the same decisions, also through a whole write-back and after a kill.
+"""A live run and the replay of its capture decide the same, also through a whole write and after
+a kill.
 
-Emulated device (a process of its own) and daemon run faster than real time, as in the demo.
+The emulated device (a separate process) and the daemon run faster than real time, as in the demo.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from drivers.vn100.emulator.scenarios import Setup
 
 SPEED = 15.0  # a disk that takes 0.3 s to sync must not look like one that hangs
 BAUD = 115200
-#: a quiet machine takes half a minute, and what a busy one has not proven by then it never will
+#: an idle machine takes half a minute; a busy one that has not proven it by then never will
 GIVEN_UP_S = 240.0
 pytestmark = pytest.mark.timeout(600)
 EASY_TRIAL = {"max_spread_percent": 100.0, "max_jump_deg": 180.0}
@@ -42,14 +43,14 @@ SCENE = Setup("rov", seed=2, output="binary", rate_hz=25, baud=BAUD, motion=MOTI
 
 
 class AlwaysSafe:
-    """A vehicle that never objects."""
+    """A vehicle that always permits a write."""
 
     def safe(self):
         return True
 
 
 def easy_gates():
-    """Limits that a minute of motion passes: what is tested here is not their wisdom."""
+    """Limits that a minute of motion passes; their values are not tested here."""
     easy = {}
     for name, info in GatesSection.model_fields.items():
         bounds = {type(m).__name__: m for m in info.metadata}
@@ -73,7 +74,7 @@ def config_for(folder, **tables):
 
 
 class Run:
-    """A daemon that a listener stops; the listener also is the operator."""
+    """A daemon that a listener stops; the listener also acts as the operator."""
 
     def __init__(self, config: Config, folder: Path, port: Path, end) -> None:
         self.capture = folder / "capture.mcap"
@@ -115,7 +116,7 @@ def after(seconds):
 
 
 def reached(state):
-    """In this state, or past it: what a stall of the machine undid is not waited for."""
+    """In this state or past it: a state that a stall of the machine ended is not waited for."""
     return lambda run, _: bool(run.states) and run.states[-1][1] in (state, "ROLLED_BACK")
 
 
@@ -146,7 +147,7 @@ def same_decisions(run, config):
 
 
 @pytest.mark.slow
-def test_a_run_and_its_replay_decide_the_same(tmp_path):
+def test_replay_of_a_run_decides_the_same(tmp_path):
     config = config_for(tmp_path, gates={})
     port = tmp_path / "vn100"
     with EmulatorProcess(SCENE, link=port, speed=SPEED, lossless=True):
@@ -156,8 +157,8 @@ def test_a_run_and_its_replay_decide_the_same(tmp_path):
     assert len(live.stream.gaps) == 0
 
 
-@pytest.mark.slow  # the quick one: a demo and its replay, in demo/test_demo.py
-def test_through_a_whole_write_back_with_approval(tmp_path):
+@pytest.mark.slow  # the short one: a demo and its replay, in demo/test_demo.py
+def test_replay_decides_the_same_through_an_approved_write(tmp_path):
     config = config_for(tmp_path, mode="stage")
     port = tmp_path / "vn100"
     with EmulatorProcess(SCENE, link=port, speed=SPEED, lossless=True):
@@ -175,7 +176,7 @@ def test_through_a_whole_write_back_with_approval(tmp_path):
 
 
 @pytest.mark.slow
-def test_through_replugs_resets_and_damage(tmp_path):
+def test_replay_decides_the_same_through_replugs_resets_and_damage(tmp_path):
     faults = ("unplug=0@20+2", "reset@45", "bit_flip=0.0005@60+5", "byte_drop=0.0005@70+5")
     scene = Setup("rov", seed=2, output="binary", rate_hz=50, baud=BAUD, faults=faults)
     config = config_for(tmp_path, mode="stage")
@@ -195,7 +196,7 @@ def test_through_replugs_resets_and_damage(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_kill_in_the_trial_leaves_a_capture_and_a_journal_that_is_followed(tmp_path):
+def test_capture_and_journal_are_used_after_a_kill_in_a_trial(tmp_path):
     config, port = config_for(tmp_path, mode="stage"), tmp_path / "vn100"
     second = tmp_path / "second"
     second.mkdir()
@@ -221,7 +222,7 @@ if __name__ == "__main__":
     def tell(run, event):
         if isinstance(event, StateChanged):
             print(f"{event.at_s:.6f} {event.new} {event.reason}", flush=True)
-            if event.new == "TRIAL":  # what the kernel has by then is not lost
+            if event.new == "TRIAL":  # data that the kernel has by then are not lost
                 threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGKILL)).start()
 
     Run(config_for(sys.argv[1], mode="stage"), Path(sys.argv[1]), Path(sys.argv[2]), tell)()

@@ -1,4 +1,4 @@
-"""The decision log: plain values, bounded memory, a hash that says whether two runs agree."""
+"""The decision log: plain values, bounded memory, and a hash that shows whether two runs agree."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def gate(value: float) -> GateResult:
     return GateResult("observability.score", value, 1.0, value > 1.0, 0.0, "", "turn")
 
 
-def test_an_entry_is_what_the_contract_says():
+def test_entry_has_the_documented_form():
     log = DecisionLog()
     log.add(120.0, "CANDIDATE", [gate(2.1)], hard_iron_gauss=[0.1, -0.2, 0.3])
     assert log.entries == [
@@ -28,7 +28,7 @@ def test_an_entry_is_what_the_contract_says():
     ]
 
 
-def test_the_hash_is_that_of_the_entries_and_can_be_checked_by_others():
+def test_hash_can_be_recomputed_from_the_entries():
     log = DecisionLog()
     log.add(1.0, "OBSERVING", [gate(0.5)])
     log.add(2.0, "CANDIDATE", [gate(1.5)], reason="all gates open")
@@ -45,7 +45,7 @@ def hash_of(value: float) -> str:
     return log.sha256
 
 
-def test_what_only_the_arithmetic_of_a_processor_changes_is_not_in_the_hash():
+def test_hash_ignores_processor_dependent_rounding():
     assert hash_of(0.123456789) == hash_of(0.123456789 * (1 + 3e-9))
     assert hash_of(0.123456789) != hash_of(0.123556789)
     assert hash_of(2.2e-14) == hash_of(0.0) == hash_of(-1e-15)  # what is left of a difference
@@ -53,7 +53,7 @@ def test_what_only_the_arithmetic_of_a_processor_changes_is_not_in_the_hash():
     assert hash_of(20.7) != hash_of(20.8)
 
 
-def test_the_hash_is_that_of_these_bytes():
+def test_hash_input_has_the_documented_bytes():
     log = DecisionLog()
     log.add(120.123456, "CANDIDATE", [gate(2.1000049)], hard_iron_gauss=[0.10220049, -1e-9])
     assert log.entries[0]["hard_iron_gauss"] == [0.10220049, -1e-9]
@@ -63,7 +63,7 @@ def test_the_hash_is_that_of_these_bytes():
     )
 
 
-def test_what_json_cannot_say_becomes_null():
+def test_values_that_json_cannot_represent_become_null():
     log = DecisionLog()
     log.add(1.0, "OBSERVING", [gate(float("nan")), gate(float("inf"))], more={"a": [np.nan, 1.0]})
     json.dumps(log.entries, allow_nan=False)
@@ -71,7 +71,7 @@ def test_what_json_cannot_say_becomes_null():
     assert log.entries[0]["more"] == {"a": [None, 1.0]}
 
 
-def test_only_the_newest_are_kept_and_all_are_in_the_hash():
+def test_only_the_newest_entries_are_kept_and_all_are_in_the_hash():
     short, whole = DecisionLog(keep=3), DecisionLog()
     for k in range(10):
         short.add(float(k), "OBSERVING")

@@ -1,4 +1,4 @@
-"""What is said to the device, and when: the session against the emulated device, no port."""
+"""Commands to the device and their order: the session with the emulated device, without a port."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Talk:
         self.hear()
 
     def hear(self):
-        """What the core does with what was said; the journal answers at once."""
+        """What the core does with the session's events; the journal answers at once."""
         said = self.device_session.take_events()
         self.said += said
         for one in said:
@@ -103,7 +103,7 @@ class Talk:
         return [type(one) for one in self.said]
 
 
-def test_the_device_is_known_before_its_samples_count():
+def test_device_is_identified_before_its_samples_count():
     talk = Talk().in_phase(Phase.READY)
     assert talk.kinds() == [Identified, ConfigurationRead]
     assert talk.said[0].identity.serial == talk.device.serial
@@ -112,7 +112,7 @@ def test_the_device_is_known_before_its_samples_count():
     assert talk.close() == Closed(None)
 
 
-def test_passive_says_nothing():
+def test_passive_sends_nothing():
     talk = Talk(Mode.PASSIVE, change_stream=True)
     assert talk.device_session.phase is Phase.READY
     talk.until(lambda: len(talk.events) > 20)
@@ -131,7 +131,7 @@ AT_ONCE = (Phase.KEEPING, Phase.CLOSING)  # the journal answers before time pass
 @pytest.mark.parametrize(
     "phase", [p for p in Phase if p not in (Phase.RUNNING, Phase.LOOKING, Phase.DONE, *AT_ONCE)]
 )
-def test_closed_in_any_phase_the_device_is_as_it_was(phase):
+def test_device_is_restored_when_closed_in_any_phase(phase):
     talk = Talk(change_stream=True)
     if phase is Phase.RESTORING:
         talk.in_phase(Phase.READY)
@@ -151,7 +151,7 @@ def test_closed_in_any_phase_the_device_is_as_it_was(phase):
     assert talk.device.memory.ram == talk.before
 
 
-def test_reading_need_not_end_before_closing():
+def test_session_can_close_while_reading():
     talk = Talk(faults=("off@1",))
     talk.until(lambda: talk.sent)
     assert talk.device_session.phase is Phase.IDENTIFYING
@@ -159,7 +159,7 @@ def test_reading_need_not_end_before_closing():
     assert talk.close(0.1) == Closed(None)
 
 
-def test_an_unknown_device_that_does_not_answer_is_listened_to_and_asked_again():
+def test_silent_unknown_device_is_used_and_queried_again():
     talk = Talk(faults=("lost_reply@0+12",))
     talk.until(lambda: Unanswered in talk.kinds())
     talk.in_phase(Phase.READY)
@@ -167,8 +167,8 @@ def test_an_unknown_device_that_does_not_answer_is_listened_to_and_asked_again()
     assert talk.kinds() == [Unanswered, Identified, ConfigurationRead]
 
 
-def test_of_a_known_device_nothing_is_used_before_it_answers_again():
-    """`Unanswered` makes the core take the stream as it is: not where the registers are known."""
+def test_samples_of_a_known_device_are_unused_until_it_answers_again():
+    """`Unanswered` makes the core use the stream as it is, except if the registers are known."""
     talk = Talk(faults=("lost_reply@3+8",)).in_phase(Phase.READY)
     talk.until(lambda: talk.now_s > 3.1)
     talk.device_session.identify_again(talk.now_s)
@@ -179,7 +179,7 @@ def test_of_a_known_device_nothing_is_used_before_it_answers_again():
     assert talk.kinds() == [*known, StreamChanged, *known]
 
 
-def test_another_device_is_not_given_the_first_ones_settings():
+def test_settings_of_one_device_are_not_restored_to_another():
     talk = Talk(change_stream=True).in_phase(Phase.READY)
     talk.device_session.on_link_lost(talk.now_s)
     other = build(Setup(output="binary", rate_hz=20))
@@ -196,8 +196,8 @@ def test_another_device_is_not_given_the_first_ones_settings():
     assert other.memory.ram == talk.before
 
 
-def test_a_device_that_cannot_be_asked_is_not_written_to_at_the_end():
-    """Plugged in again it may be another one: what is not known is not put back."""
+def test_unidentified_device_is_not_written_at_the_end():
+    """After replugging it may be another device, and an unidentified device is not restored."""
     talk = Talk(change_stream=True).in_phase(Phase.READY)
     talk.device_session.on_link_lost(talk.now_s)
     talk.device_session.on_opened(115200, talk.now_s)
@@ -207,8 +207,10 @@ def test_a_device_that_cannot_be_asked_is_not_written_to_at_the_end():
     assert b"VNWRG" not in talk.sent[sent:]
 
 
-def test_what_is_put_back_is_put_back_to_the_same_device_only():
-    """Behind an adapter that stays, another device answers: the serial number is read first."""
+def test_settings_are_restored_only_to_the_same_device():
+    """Behind an adapter that stays plugged another device may answer: the serial number is read
+    first.
+    """
     talk = Talk(change_stream=True).in_phase(Phase.READY)
     talk.device.replace_unit(7)
     before = dict(talk.device.memory.ram)
@@ -217,7 +219,7 @@ def test_what_is_put_back_is_put_back_to_the_same_device_only():
     assert talk.device.memory.ram == before
 
 
-def test_an_output_that_vanished_is_set_up_again():
+def test_missing_output_is_set_up_again():
     talk = Talk(change_stream=True, output="ascii", faults=("reset@3",)).in_phase(Phase.READY)
     talk.until(lambda: talk.kinds().count(Identified) == 2)
     gone = talk.said[talk.kinds().index(Identified, 1) - 1]
@@ -228,8 +230,8 @@ def test_an_output_that_vanished_is_set_up_again():
     assert talk.device.memory.ram == talk.before
 
 
-def test_each_set_up_that_fails_cuts_the_stream_and_the_first_one_is_told():
-    """A device that restarted meanwhile sends its own message, also the second time."""
+def test_each_failed_set_up_cuts_the_stream_and_the_first_is_reported():
+    """A device that restarted in between sends its own message, also the second time."""
     talk = Talk(change_stream=True, faults=("refused_write",)).in_phase(Phase.READY)
     talk.until(lambda: talk.kinds().count(StreamChanged) == 3, 60.0)
     texts = [one.text for one in talk.said if isinstance(one, StreamChanged)]
@@ -237,7 +239,7 @@ def test_each_set_up_that_fails_cuts_the_stream_and_the_first_one_is_told():
     assert texts[1:] == ["", ""]
 
 
-def test_what_cannot_be_put_back_is_said():
+def test_settings_that_cannot_be_restored_are_reported():
     talk = Talk(change_stream=True, faults=("refused_write@3",)).in_phase(Phase.READY)
     talk.until(lambda: talk.now_s > 3.1)
     closed = talk.close(STOP_S + 0.1)
@@ -251,7 +253,7 @@ def write_23(values):
     return quiet(write_verified(23, values))
 
 
-def test_the_gate_is_asked_for_every_command_of_the_write_back():
+def test_every_command_of_the_write_back_passes_the_gate():
     talk = Talk(Mode.STAGE).in_phase(Phase.READY)
     new = (*talk.before[23, 0][:9], 0.1, 0.2, 0.3)
     asked = []
@@ -272,7 +274,7 @@ def test_the_gate_is_asked_for_every_command_of_the_write_back():
     assert talk.device.memory.get(23)[9:] == pytest.approx((0.1, 0.2, 0.3), abs=1e-7)
 
 
-def test_a_lost_link_ends_a_procedure_with_the_reason():
+def test_lost_link_ends_a_procedure_with_a_reason():
     talk = Talk(Mode.STAGE).in_phase(Phase.READY)
     talk.device_session.run("look", read(23), Purpose.STAGE, talk.now_s)
     talk.device_session.on_link_lost(talk.now_s)
@@ -282,7 +284,7 @@ def test_a_lost_link_ends_a_procedure_with_the_reason():
 
 
 @pytest.mark.parametrize("phase", [Phase.SETTING_UP, Phase.READY])
-def test_cleanup_puts_back_what_the_session_changed(phase):
+def test_cleanup_restores_the_settings_of_the_session(phase):
     talk = Talk(change_stream=True).in_phase(phase)
     procedure = talk.device_session.cleanup()
     fresh = DeviceSession(Mode.STAGE, change_stream=True)
@@ -294,7 +296,7 @@ def test_cleanup_puts_back_what_the_session_changed(phase):
     assert talk.device.memory.ram == talk.before
 
 
-def test_cleanup_of_a_transaction_turns_the_output_on_and_writes_nothing():
+def test_cleanup_of_a_transaction_only_turns_the_output_on():
     talk = Talk(Mode.STAGE).in_phase(Phase.READY)
     assert talk.device_session.cleanup() is None
     talk.device_session.run("look", quiet(read(23)), Purpose.STAGE, talk.now_s)

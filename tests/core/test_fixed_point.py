@@ -103,7 +103,7 @@ def written(held: dict[int, Values], new: dict[int, Values]) -> dict[int, Values
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_written_device_proposes_no_change(seed: int) -> None:
+def test_no_change_is_proposed_after_a_write(seed: int) -> None:
     rng = np.random.default_rng(seed)
     held, estimate = registers(rng), truth(rng)
     raw = field(rng) @ estimate.soft_iron + estimate.hard_iron_gauss
@@ -120,8 +120,8 @@ def test_a_written_device_proposes_no_change(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_what_the_written_device_sends_is_the_true_field(seed: int) -> None:
-    """Round, centred, turned by register 26 only, and of the scale that the device had."""
+def test_output_after_a_write_is_the_true_field(seed: int) -> None:
+    """Spherical, centred, rotated by register 26 only, and with the scale that the device had."""
     rng = np.random.default_rng(seed)
     held, estimate = registers(rng), truth(rng)
     h = field(rng)
@@ -137,7 +137,7 @@ def test_what_the_written_device_sends_is_the_true_field(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_it_equals_composing_a_fit_of_the_output_with_what_is_in_place(seed: int) -> None:
+def test_composition_equals_that_of_a_fit_of_the_output(seed: int) -> None:
     """vn100-protocol.md 5.4.3: C' = R^T C2 R C1, B' = B1 + C1^-1 R^T B2."""
     rng = np.random.default_rng(seed)
     held, estimate = registers(rng), truth(rng)
@@ -152,8 +152,8 @@ def test_it_equals_composing_a_fit_of_the_output_with_what_is_in_place(seed: int
     assert rotated.after(first).to_register() == pytest.approx(new.to_register(), abs=1e-12)
 
 
-def test_correcting_twice_is_impossible() -> None:
-    """The same estimate, written again and again, moves nothing: C is set, never multiplied."""
+def test_repeated_write_changes_nothing() -> None:
+    """C is set and never multiplied, so that the same estimate written again changes nothing."""
     rng = np.random.default_rng(5)
     held, estimate = registers(rng), truth(rng)
     new = compose(estimate, held).new
@@ -167,7 +167,7 @@ def test_correcting_twice_is_impossible() -> None:
         assert np.array(values[:9]) == pytest.approx(np.array(new[23][:9], float), abs=2e-5)
 
 
-def test_the_proposal_is_deterministic_and_its_id_is_of_the_text() -> None:
+def test_proposal_is_deterministic_and_its_id_is_derived_from_its_text() -> None:
     rng = np.random.default_rng(6)
     held, estimate = registers(rng), truth(rng)
     one, two = compose(estimate, held), compose(estimate, held)
@@ -179,7 +179,7 @@ def test_the_proposal_is_deterministic_and_its_id_is_of_the_text() -> None:
     assert len(one.id) == 8
 
 
-def test_a_known_checksum() -> None:
+def test_checksum_of_the_protocol_example() -> None:
     """vn100-protocol.md 5.2."""
     values = (1.02, 0.01, 0.0, 0.01, 0.98, 0.0, 0.0, 0.0, 1.01, 0.05, -0.03, 0.1)
     assert register_lines({23: values}) == (
@@ -187,7 +187,7 @@ def test_a_known_checksum() -> None:
     )
 
 
-def test_a_compensated_rate_leaves_register_84_alone() -> None:
+def test_register_84_is_unchanged_when_the_rate_is_compensated() -> None:
     rng = np.random.default_rng(7)
     held, estimate = registers(rng), truth(rng)
     proposal = compose(estimate, held, gyro_is_raw=False)
@@ -195,7 +195,7 @@ def test_a_compensated_rate_leaves_register_84_alone() -> None:
     assert proposal.gyro_change_rad_s == 0.0
 
 
-def test_a_known_field_sets_the_scale() -> None:
+def test_known_field_sets_the_scale() -> None:
     rng = np.random.default_rng(8)
     held = registers(rng)
     estimate = replace(truth(rng), soft_iron=1.1 * soft_iron(rng), field_known=True)
@@ -204,7 +204,7 @@ def test_a_known_field_sets_the_scale() -> None:
     assert pytest.approx(np.eye(3), abs=1e-5) == C @ estimate.soft_iron
 
 
-def test_heading_change_of_a_hard_iron_that_is_known() -> None:
+def test_heading_change_of_a_known_hard_iron() -> None:
     """0.024 G across a horizontal 0.24 G turns the heading by up to asin(0.1)."""
     rng = np.random.default_rng(9)
     estimate = replace(truth(rng), soft_iron=np.eye(3))
@@ -214,7 +214,7 @@ def test_heading_change_of_a_hard_iron_that_is_known() -> None:
     assert heading_change_deg(shifted, shifted, estimate) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_apart_is_what_a_person_would_see() -> None:
+def test_distance_of_proposals_is_in_degrees_of_heading() -> None:
     rng = np.random.default_rng(10)
     held, estimate = registers(rng), truth(rng)
     one = compose(estimate, held)
@@ -236,7 +236,7 @@ BAD: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("text", BAD)
-def test_what_must_not_reach_a_device_is_refused(text: str) -> None:
+def test_unwritable_estimate_is_refused(text: str) -> None:
     rng = np.random.default_rng(11)
     held = registers(rng)
     with pytest.raises(UnwritableError, match=text):
@@ -257,7 +257,7 @@ def test_unusable_registers_are_refused(held: dict[int, Values]) -> None:
         compose(truth(np.random.default_rng(12)), held)
 
 
-def test_an_undetermined_direction_must_stay_where_the_device_has_it() -> None:
+def test_undetermined_direction_must_keep_the_value_of_the_device() -> None:
     rng = np.random.default_rng(13)
     identity = Affine.identity().to_register()
     held: dict[int, Values] = {23: identity, 84: identity}

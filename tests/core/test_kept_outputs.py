@@ -1,4 +1,4 @@
-"""The user's outputs outlive a program that is killed, a full disk, and what comes in between."""
+"""The user's output settings survive a kill, a full disk, and changes in between."""
 
 from __future__ import annotations
 
@@ -79,22 +79,24 @@ KEPT = ("OUTPUTS_KEPT", {"serial": 5, "old": {str(n): list(v) for n, v in USERS.
         (75, OURS, (1, 16, 6, 1, 0x83F), True),
     ],
 )
-def test_what_a_session_leaves_is_told_from_what_a_person_wrote(register, users, present, left):
+def test_outputs_left_by_a_session_are_distinguished_from_those_of_a_person(
+    register, users, present, left
+):
     assert left_by_session(register, {register: users}, present) is left
 
 
-def test_an_output_that_moved_to_a_free_register_is_the_sessions():
+def test_output_in_a_free_register_belongs_to_the_session():
     users = {75: (3, 40, 0x29, 0x7FFF, 0x0210, 0x000C), 76: (0, 1, 0)}
     assert left_by_session(76, users, (2, *users[75][1:]))
     assert not left_by_session(76, users, (2, 8, *users[75][2:]))
     assert not left_by_session(76, {76: (0, 1, 0)}, (2, *users[75][1:]))
 
 
-def test_the_users_outputs_are_told_register_by_register():
+def test_outputs_of_the_user_are_determined_per_register():
     kept = KeptOutputs()
     found = {**USERS, 6: (0,), 75: OURS, 7: (20,), 23: (1.0,) * 12}
     kept.update(5, found, records(KEPT))
-    assert kept.users == {**USERS, 7: (20,)}  # 7 is none of the session's: somebody wrote it
+    assert kept.users == {**USERS, 7: (20,)}  # 7 is not set by the session: somebody wrote it
     assert kept.left == (75, 6)
     assert "$VNWRG,06,14*" in kept.describe_left(put_back=False)
     kept.update(5, found, [])
@@ -108,7 +110,7 @@ def test_only_an_open_record_of_this_device_counts():
     assert open_record(records(KEPT, ("OUTPUTS_BACK", {"serial": 5})), 5) is None
 
 
-def test_a_journal_that_cannot_be_trusted_leaves_what_this_run_kept():
+def test_outputs_kept_by_this_run_are_used_without_a_trusted_journal():
     kept = KeptOutputs()
     kept.update(5, {**USERS, 6: (0,)}, records(KEPT))
     kept.update(5, {**USERS, 6: (0,)}, None)
@@ -117,7 +119,7 @@ def test_a_journal_that_cannot_be_trusted_leaves_what_this_run_kept():
     assert kept.users == {**USERS, 6: (0,)}
 
 
-def test_a_record_is_written_before_the_first_change_and_one_behind_the_last():
+def test_outputs_are_journaled_before_the_first_and_after_the_last_change():
     run = world()
     sent = []
     run.listen = sent.append
@@ -132,8 +134,8 @@ def test_a_record_is_written_before_the_first_change_and_one_behind_the_last():
 
 
 @pytest.mark.parametrize("output", [pytest.param("ascii", marks=pytest.mark.slow), "binary"])
-def test_a_kill_at_any_moment_of_the_set_up_leaves_the_users_outputs(output):
-    """A run is killed after n steps, for one n after the other; each next one ends orderly."""
+def test_outputs_of_the_user_survive_a_kill_at_any_moment_of_the_set_up(output):
+    """A run is killed after n steps, for consecutive n; each following run ends in order."""
     run = world(output=output, rate_hz=20)
     users, found = outputs(run.emulator.memory.ram), set()
     for steps in range(10, 70, 2):
@@ -141,7 +143,7 @@ def test_a_kill_at_any_moment_of_the_set_up_leaves_the_users_outputs(output):
             run.step()
         found.add(tuple(outputs(run.emulator.memory.ram).items()))
         run.restart()
-        if steps % 4 == 0:  # else killed twice
+        if steps % 4 == 0:  # otherwise killed twice
             run.run(0.1)
             assert run.until(lambda: run.core.device_session.phase is Phase.READY, 3.0)
             end(run)
@@ -152,7 +154,7 @@ def test_a_kill_at_any_moment_of_the_set_up_leaves_the_users_outputs(output):
     assert len(found) > 2  # killed before, while and after they were changed
 
 
-def test_what_was_written_since_the_kill_is_the_users():
+def test_outputs_written_after_the_kill_belong_to_the_user():
     run = world()
     run.run(3.0)
     run.emulator.memory.ram[75, 0] = (1, 80, 1, 8)
@@ -164,11 +166,11 @@ def test_what_was_written_since_the_kill_is_the_users():
     assert run.emulator.memory.get(6, 1) == (19,)
 
 
-def test_a_device_that_restarted_since_the_kill_has_the_users_outputs_already():
+def test_device_restarted_after_the_kill_already_has_the_outputs_of_the_user():
     run = world()
     run.run(3.0)
     flash = outputs(run.emulator.memory.flash)
-    run.emulator.memory.flash[6, 1] = (19,)  # saved by somebody while nobody looked
+    run.emulator.memory.flash[6, 1] = (19,)  # saved by somebody in between
     run.emulator.memory.start()
     run.restart()
     run.run(3.0)
@@ -176,7 +178,7 @@ def test_a_device_that_restarted_since_the_kill_has_the_users_outputs_already():
     assert outputs(run.emulator.memory.ram) == {**flash, (6, 1): (19,)}
 
 
-def test_with_a_full_disk_the_device_keeps_its_outputs_until_there_is_room():
+def test_outputs_are_unchanged_while_the_disk_is_full():
     run = world()
     run.disk_full = True
     run.run(5.0)
@@ -185,14 +187,14 @@ def test_with_a_full_disk_the_device_keeps_its_outputs_until_there_is_room():
     assert run.samples > 0
     run.disk_full = False
     assert run.until(lambda: run.emulator.memory.get(75)[0] == 1, 40.0)
-    run.disk_full = True  # the record is there: a reset needs no other
+    run.disk_full = True  # the record exists: a reset needs no other
     run.emulator.memory.start()
     assert run.until(lambda: run.emulator.memory.get(75)[0] == 0, 1.0)
     assert run.until(lambda: run.emulator.memory.get(75)[0] == 1, 20.0)
 
 
-def test_a_save_that_fails_sets_up_nothing_that_is_not_kept():
-    """The disk was full at the start and is not any more when the outputs would be set up again."""
+def test_failed_save_sets_up_only_journaled_outputs():
+    """The disk was full at the start, and is no longer when the outputs would be set up again."""
     run = world(
         Mode.COMMIT, motion=(("static", 1000.0),), faults=("power_cut_wnv@1",),
         output="ascii", rate_hz=20,
@@ -229,8 +231,8 @@ def planted(run):
 
 
 @pytest.mark.parametrize("configure", [True, False])
-def test_no_save_takes_a_killed_sessions_outputs_along(configure):
-    """Where they may be put back they are, before VNWNV; where not, there is no VNWNV."""
+def test_save_never_includes_the_outputs_of_a_killed_session(configure):
+    """They are restored before VNWNV if permitted; otherwise there is no VNWNV."""
     run = world(Mode.COMMIT, configure, motion=(("static", 1000.0),), output="binary", rate_hz=20)
     users = outputs(run.emulator.memory.ram)
     if not configure:
@@ -260,7 +262,7 @@ def wait_for(condition, seconds=30.0):
 
 
 def sent_in(capture):
-    """What a replay of a run computes that it sends, and what it says."""
+    """What the replay of a run computes that it sends and reports."""
     sent, texts = [], []
 
     def listen(event):
@@ -272,8 +274,8 @@ def sent_in(capture):
     return b"".join(sent), texts
 
 
-def test_a_program_that_is_killed_and_the_next_one(emulated, tmp_path):
-    """kill -9 on a real port. A replay of the next run comes to the same bytes for the device."""
+def test_next_run_restores_the_outputs_of_a_killed_program(emulated, tmp_path):
+    """kill -9 on a real port. The replay of the next run gives the same bytes for the device."""
     config = tmp_path / "ahrsd.toml"
     config.write_text(
         f'state_directory = "{tmp_path}"\n[device]\nbaud = 115200\nconfigure_stream = true\n'

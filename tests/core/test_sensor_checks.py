@@ -1,4 +1,6 @@
-"""A stuck or saturated sensor, a wrong unit and a wrong sign are said; a sound sensor is not."""
+"""A stuck or saturated sensor, a wrong unit and a wrong sign are reported, a sound sensor is
+not.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +77,7 @@ def said(time_s, field, gyro, rows=10):
 @pytest.mark.parametrize(
     "seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 5))]
 )
-def test_a_sound_sensor_is_not_spoken_of(kind, seed):
+def test_nothing_is_reported_for_a_sound_sensor(kind, seed):
     checks, told = said(*stream(kind, seed=seed))
     assert told == []
     assert checks.findings == {}
@@ -89,8 +91,8 @@ def test_a_sound_sensor_is_not_spoken_of(kind, seed):
         for seed in range(3)
     ],
 )
-def test_soft_iron_on_a_vehicle_that_turns_about_one_axis_is_no_wrong_sign(kind, seed):
-    """What soft iron makes of that turn looks like a large one about the others, to either side."""
+def test_soft_iron_with_turns_about_one_axis_is_not_a_wrong_sign(kind, seed):
+    """Soft iron makes the turn look like a large one about the other axes, in both directions."""
     iron = np.eye(3)
     i, j = ("xyz".index(axis) for axis in kind)
     iron[i, j] = iron[j, i] = 0.1
@@ -109,14 +111,14 @@ def test_soft_iron_on_a_vehicle_that_turns_about_one_axis_is_no_wrong_sign(kind,
         assert told == []
 
 
-def test_what_fits_is_what_is():
+def test_fitted_gyro_gains_are_the_true_ones():
     checks, _ = said(*stream())
     g, sigma, _ = checks._fit_gyro_gain()
     assert np.allclose(g, 1.0, atol=0.2)
     assert np.all(sigma < 0.2)
 
 
-def test_a_magnetometer_that_is_stuck_while_the_vehicle_turns():
+def test_stuck_magnetometer_is_reported_when_the_vehicle_turns():
     time_s, field, gyro = stream()
     field[:] = field[0]
     checks, told = said(time_s, field, gyro)
@@ -128,7 +130,7 @@ def test_a_magnetometer_that_is_stuck_while_the_vehicle_turns():
 
 
 @pytest.mark.parametrize("value", [0.0, 0.01])
-def test_a_gyroscope_that_is_stuck_while_the_field_turns(value):
+def test_stuck_gyro_is_reported_when_the_field_turns(value):
     time_s, field, gyro = stream()
     gyro[:] = value
     checks, told = said(time_s, field, gyro)
@@ -138,7 +140,7 @@ def test_a_gyroscope_that_is_stuck_while_the_field_turns(value):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_gyroscope_without_one_axis_is_named_for_it(axis):
+def test_dead_gyro_axis_is_reported(axis):
     time_s, field, gyro = stream()
     gyro[:, axis] = 0.0
     checks, _ = said(time_s, field, gyro)
@@ -146,7 +148,7 @@ def test_a_gyroscope_without_one_axis_is_named_for_it(axis):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_one_axis_that_is_stuck_is_named(axis):
+def test_stuck_magnetometer_axis_is_reported(axis):
     time_s, field, gyro = stream()
     field[1000:, axis] = 0.1234
     checks, _ = said(time_s, field, gyro)
@@ -154,7 +156,7 @@ def test_one_axis_that_is_stuck_is_named(axis):
     assert f"the magnetometer gives the same value on axis {'xyz'[axis]} (0.1234 gauss)" in text
 
 
-def test_a_saturated_axis_is_called_so():
+def test_saturated_axis_is_reported():
     time_s, field, gyro = stream()
     field[:, 2] = 2.5
     checks, _ = said(time_s, field, gyro)
@@ -163,7 +165,7 @@ def test_a_saturated_axis_is_called_so():
     assert "it is saturated: move it away from the magnet" in text
 
 
-def test_a_field_without_noise_at_rest():
+def test_constant_readings_without_noise_are_reported_at_rest():
     time_s, field, gyro = stream("rest", noise=0.0)
     checks, _ = said(time_s, field, gyro)
     assert set(checks.findings) == {"magnetometer still", "gyroscope still"}
@@ -173,7 +175,7 @@ def test_a_field_without_noise_at_rest():
 
 @pytest.mark.parametrize("kind", ["planar", "3D"])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_gyroscope_in_degrees(kind, seed):
+def test_gyro_in_degrees_is_reported(kind, seed):
     time_s, field, gyro = stream(kind, seed=seed)
     checks, told = said(time_s, field, np.degrees(gyro))
     (text,) = checks.findings.values()
@@ -184,21 +186,21 @@ def test_a_gyroscope_in_degrees(kind, seed):
 
 @pytest.mark.parametrize(("kind", "axes"), [("planar", "z"), ("3D", "x, y, z")])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_gyroscope_of_the_wrong_sign(kind, axes, seed):
+def test_gyro_with_the_wrong_sign_is_reported(kind, axes, seed):
     time_s, field, gyro = stream(kind, seed=seed)
     checks, _ = said(time_s, field, -gyro)
     (text,) = checks.findings.values()
     assert text.startswith(f"the field turns against the gyroscope on axis {axes}:")
 
 
-def test_one_axis_of_the_wrong_sign_is_named():
+def test_axis_with_the_wrong_sign_is_reported():
     time_s, field, gyro = stream()
     checks, _ = said(time_s, field, gyro * [1, -1, 1])
     (text,) = checks.findings.values()
     assert text.startswith("the field turns against the gyroscope on axis y:")
 
 
-def test_what_is_over_is_said_once():
+def test_end_of_a_fault_is_reported_once():
     time_s, field, gyro = stream()
     field[400:1200] = field[400]
     checks, told = said(time_s, field, gyro)
@@ -207,16 +209,16 @@ def test_what_is_over_is_said_once():
     assert told[1] == f"over: {told[0]}" or told[1].startswith("over: the magnetometer gives")
 
 
-def test_how_the_blocks_are_cut_says_nothing_else():
+def test_findings_do_not_depend_on_the_block_size():
     time_s, field, gyro = stream()
     for rows in (3, 64):
         checks, _ = said(time_s, field, -gyro, rows)
         assert set(checks.findings) == {"gyroscope sign"}
 
 
-def test_readings_that_no_sensor_gives_are_counted():
+def test_impossible_readings_are_counted():
     checks = SensorChecks()
-    assert checks.count(3, 480) == []  # too few to speak of
+    assert checks.count(3, 480) == []  # too few to report
     assert checks.count(10, 490) == [checks.findings["readings"]]
     assert checks.findings["readings"].startswith("2 % of the newest 500 readings are of no use")
     assert checks.count(11, 990) == ["over: " + checks_text(2, 500)]
@@ -228,7 +230,7 @@ def checks_text(percent, count):
     return checks.findings["readings"]
 
 
-def test_a_device_that_restarts_begins_anew():
+def test_findings_are_cleared_after_a_restart():
     time_s, field, gyro = stream()
     field[:] = field[0]
     checks, _ = said(time_s, field, gyro)
@@ -254,7 +256,7 @@ def test_a_device_that_restarts_begins_anew():
     ],
     ids=["degrees", "negated"],
 )
-def test_status_and_explain_say_it_and_the_core_goes_on(change, words):
+def test_finding_is_in_status_and_explain_and_the_core_continues(change, words):
     core = Core(core_settings(Config(), policy=WriteBackPolicy(mode=Mode.PASSIVE)))
     core.handle(RegistersKnown(0, {}, "test"))
     time_s, field, gyro = stream(seconds=40.0)

@@ -1,4 +1,6 @@
-"""Samples wait for the device's answer: which come out, in which order, and which never do."""
+"""Samples that wait for an answer of the device: which are released, in which order, and which
+never.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from ahrsd.samples import SampleBlock
 
 
 def block(number: int, rows: int = 4) -> SampleBlock:
-    """Its temperature says which one it is."""
+    """A block identified by its temperature."""
     time_s = number + np.arange(rows) / rows
     dt_s = np.full(rows, 1.0 / rows)
     return SampleBlock(
@@ -31,7 +33,7 @@ def holding(*came: int) -> UnconfirmedSamples[str]:
     return line
 
 
-def test_what_came_before_the_question_counts_and_what_came_behind_it_waits():
+def test_samples_before_the_query_are_released_and_later_ones_wait():
     line = holding(1, 2, 3)
     released = line.confirm(2.0)
     assert numbers(released) == [1, 2]
@@ -41,13 +43,13 @@ def test_what_came_before_the_question_counts_and_what_came_behind_it_waits():
     assert line.span_s == 0.0
 
 
-def test_what_is_released_at_once_comes_in_groups():
+def test_released_samples_come_in_groups():
     released = holding(1, 2, 3, 4, 5).confirm(9.0)
     assert [len(group) for group, _ in released] == [2, 2, 1]
     assert [how for _, how in released] == ["how 2", "how 4", "how 5"]
 
 
-def test_an_answer_to_a_question_from_before_the_doubt_counts_for_nothing():
+def test_answer_to_a_query_from_before_the_doubt_is_ignored():
     line = holding(1)
     line.confirm(1.5)
     line.hold(block(2), 2.0, "")
@@ -56,7 +58,7 @@ def test_an_answer_to_a_question_from_before_the_doubt_counts_for_nothing():
     assert numbers(line.confirm(2.6)) == [2]
 
 
-def test_between_two_doubts_without_an_answer_nothing_counts():
+def test_samples_between_two_unanswered_doubts_are_dropped():
     line = holding(1)
     line.mark_doubt(1.5, perhaps_restarted=False)
     line.hold(block(2), 2.0, "")
@@ -72,7 +74,7 @@ def test_between_two_doubts_without_an_answer_nothing_counts():
     assert np.isfinite(after.dt_s[1:]).all()
 
 
-def test_where_the_doubt_may_be_a_restart_nothing_from_before_it_counts():
+def test_samples_from_before_a_possible_restart_are_dropped():
     line = holding(1, 2)
     line.mark_doubt(2.5, perhaps_restarted=True)
     line.hold(block(3), 3.0, "")
@@ -80,7 +82,7 @@ def test_where_the_doubt_may_be_a_restart_nothing_from_before_it_counts():
     assert line.dropped == 8
 
 
-def test_a_device_that_never_answers_does_not_fill_the_memory():
+def test_memory_is_bounded_when_the_device_never_answers():
     line: UnconfirmedSamples[None] = UnconfirmedSamples()
     for number in range(MOST_ROWS // 1000 + 50):
         line.hold(block(number, 1000), float(number), None)
@@ -91,8 +93,8 @@ def test_a_device_that_never_answers_does_not_fill_the_memory():
 
 
 @given(st.lists(st.sampled_from(["hold", "gap", "restart", "ask", "answer"]), max_size=60))
-def test_what_counts_was_vouched_for_from_both_sides(script):
-    """Judged by a plain reading of the rule over the whole history."""
+def test_released_samples_are_confirmed_before_and_after(script):
+    """Judged by a plain implementation of the rule over the whole history."""
     line: UnconfirmedSamples[int] = UnconfirmedSamples()
     events, asked, counted = [], None, []
     for at_s, what in enumerate(script, start=1):
@@ -113,7 +115,7 @@ def test_what_counts_was_vouched_for_from_both_sides(script):
 def vouched(events: list[tuple[int, str]], came: int) -> bool:
     """Whether the block that came then may be used by the end of the history."""
     doubts = [(at, what) for at, what in events if what in ("gap", "restart")]
-    good = [  # answers to questions that no doubt overtook
+    good = [  # answers to queries that no doubt followed
         (at, int(what.split()[1]))
         for at, what in events
         if what.startswith("answer")

@@ -1,4 +1,4 @@
-"""A named effect that follows a column of the vehicle is taken out of the running stream."""
+"""An effect that follows a column of the vehicle is removed from the running stream."""
 
 from __future__ import annotations
 
@@ -69,11 +69,11 @@ def vehicle(*terms):
     ],
     ids=lambda value: getattr(value, "identifier", None),
 )
-def test_only_what_a_column_gives_sample_by_sample_is_followed(one, follows):
+def test_only_effects_that_follow_a_column_sample_by_sample_are_removed(one, follows):
     assert follows_a_column(one) is follows
 
 
-def test_columns_are_drawn_between_the_words_and_unknown_far_from_them():
+def test_columns_are_interpolated_between_messages_and_unknown_far_from_them():
     told, _ = vehicle()
     for at_s, ampere in ((10.0, 0.0), (11.0, 4.0)):
         told.record_columns(at_s, {"motor_current_a": ampere})
@@ -84,7 +84,7 @@ def test_columns_are_drawn_between_the_words_and_unknown_far_from_them():
     assert own.covariates["motor_current_a"].tolist() == list(range(8))  # the stream's own wins
 
 
-def test_the_term_is_subtracted_and_a_missing_column_is_a_gap():
+def test_term_is_subtracted_and_a_missing_column_is_a_gap():
     free, said = vehicle(term(), term("mag_time_lag", [0.01], {}))
     host_s = np.array([10.0, 10.1])
     assert free.without_terms(block(host_s)) is None
@@ -104,7 +104,7 @@ def test_the_term_is_subtracted_and_a_missing_column_is_a_gap():
     assert free.waits_for == ()
 
 
-def test_without_a_model_the_block_is_the_same_object():
+def test_block_is_unchanged_without_a_model():
     plain, said = vehicle()
     given = block(np.array([1.0, 2.0]))
     assert plain.with_columns(given) is given
@@ -114,7 +114,7 @@ def test_without_a_model_the_block_is_the_same_object():
 
 
 @pytest.mark.slow
-def test_the_core_calibrates_as_if_the_current_were_off():
+def test_core_calibrates_as_without_the_current():
     made = simulate(ScenarioSettings("mam", "rov", seed=4, samples=5000, rate_hz=25.0))
     s, host_s = made.samples, made.samples.time_s + 100.0
     ampere = 6.0 + 5.0 * np.sign(np.sin(host_s / 5.0)) * (host_s > 130.0)
@@ -145,14 +145,14 @@ def test_the_core_calibrates_as_if_the_current_were_off():
     assert errors["without"] > 0.02
 
 
-def test_the_file_is_read_once_and_says_what_is_wrong_with_it(tmp_path):
+def test_file_is_read_once_and_its_faults_are_reported(tmp_path):
     path = tmp_path / "columns"
     file = ColumnsFile(path, 60.0)
     until(lambda: "No such file" in file.fault)
     assert file.news() is None
     path.write_text("{}")
     until(lambda: file.fault == "")
-    assert file.news() is None  # nobody knows when it was written
+    assert file.news() is None  # the time of writing is not known
     rewrite(path, '{"motor_current_a": 3.2, "rudder_deg": -4}')
     found = []
     until(lambda: found.append(file.news()) or found[-1])
@@ -181,7 +181,7 @@ def rewrite(path, text):
     draft.rename(path)
 
 
-def test_a_configured_model_must_be_one(tmp_path):
+def test_configured_model_must_be_valid(tmp_path):
     path = tmp_path / "model.json"
     config = check_config({"terms": {"model": str(path)}}, "c.toml")
     with pytest.raises(ConfigError, match="cannot be read: No such file"):
@@ -194,7 +194,7 @@ def test_a_configured_model_must_be_one(tmp_path):
     assert terms_text(Config()) == ""
 
 
-def test_without_a_model_the_daemon_does_not_load_the_library_of_effects():
+def test_effects_library_is_not_loaded_without_a_model():
     code = "import sys, ahrsd.daemon.service; print([m for m in sys.modules if 'effects' in m])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout == "[]\n"

@@ -1,4 +1,4 @@
-"""Bad input to `ahrsd run`: one clear line, the right exit code, the device as it was."""
+"""Bad input to `ahrsd run`: one clear line, the correct exit code, and an unchanged device."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from patience import PATIENCE_S
 from ahrsd.inputs import Received
 from ahrsd.recording.capture import CaptureReader
 
-LIMIT_S = 60.0  # of a busy machine; what hangs does so for ever
+LIMIT_S = 60.0  # allows for a busy machine; a real hang lasts for ever
 HOLD = (
     "import serial, sys, time\n"
     "port = serial.Serial(sys.argv[1])\n"
@@ -33,7 +33,7 @@ def one_line(text):
 
 @pytest.fixture
 def refused(run, tmp_path, capsys):
-    """`refused(*arguments)`: exit code and the one line of a run that does not begin."""
+    """`refused(*arguments)`: exit code and the one line of a run that does not start."""
 
     def call(*arguments, config=""):
         file = tmp_path / "ahrsd.toml"
@@ -48,14 +48,14 @@ def refused(run, tmp_path, capsys):
     return call
 
 
-def test_a_port_that_does_not_exist(refused, tmp_path):
+def test_missing_port_is_refused(refused, tmp_path):
     port = tmp_path / "nowhere"
     code, line = refused("--port", port)
     assert code == 75
     assert line.startswith(f"ahrsd: {port} does not exist")
 
 
-def test_a_port_that_is_no_port(refused, tmp_path):
+def test_path_that_is_not_a_port_is_refused(refused, tmp_path):
     port = tmp_path / "file"
     port.write_text("")
     code, line = refused("--port", port)
@@ -63,7 +63,7 @@ def test_a_port_that_is_no_port(refused, tmp_path):
     assert str(port) in line
 
 
-def test_a_held_port_names_its_holder(refused, emulated):
+def test_port_in_use_is_refused_with_its_holder(refused, emulated):
     with emulated() as (emulator, path):
         with subprocess.Popen([sys.executable, "-c", HOLD, path], stdout=subprocess.PIPE) as other:
             try:
@@ -76,7 +76,7 @@ def test_a_held_port_names_its_holder(refused, emulated):
         assert emulator.counters["commands"] == 0
 
 
-def test_a_wrong_rate_in_the_configuration(refused, emulated):
+def test_wrong_configured_rate_is_refused(refused, emulated):
     with emulated(output="imu") as (emulator, path):
         before = dict(emulator.memory.ram)
         code, line = refused("--port", path, config="[device]\nbaud = 9600\n")
@@ -87,27 +87,27 @@ def test_a_wrong_rate_in_the_configuration(refused, emulated):
 
 
 @pytest.mark.parametrize("baud", ["115200", '"auto"'])
-def test_only_garbage(refused, emulated, baud):
+def test_garbage_on_the_line_is_refused(refused, emulated, baud):
     with emulated(faults=("garbage",)) as (_, path):
         code, line = refused("--port", path, config=f"[device]\nbaud = {baud}\n")
         assert code == 75
         assert "bytes arrive but no message" in line
 
 
-def test_silence(refused, emulated):
+def test_silent_device_is_refused(refused, emulated):
     with emulated(faults=("off",)) as (_, path):
         code, line = refused("--port", path, config="[device]\nbaud = 115200\n")
         assert code == 75
         assert "the device does not answer: check power, cable" in line
 
 
-def test_a_typo_in_the_configuration(refused):
+def test_typo_in_the_configuration_is_refused_with_a_suggestion(refused):
     code, line = refused("--port", "/dev/null", config="[device]\nbuad = 9600\n")
     assert code == 2
     assert line.endswith("device.buad = 9600: unknown key; did you mean baud?")
 
 
-def test_a_folder_that_cannot_be_made(run, emulated, tmp_path, capsys):
+def test_folder_that_cannot_be_made_is_refused(run, emulated, tmp_path, capsys):
     blocked = tmp_path / "file"
     blocked.write_text("")
     config = tmp_path / "ahrsd.toml"
@@ -119,7 +119,7 @@ def test_a_folder_that_cannot_be_made(run, emulated, tmp_path, capsys):
         assert emulator.counters["refused"] == 0
 
 
-def test_a_message_of_no_use_keeps_running_and_says_what_to_configure(live, caplog):
+def test_stream_without_a_field_keeps_running_and_advises_a_setting(live, caplog):
     caplog.set_level(logging.INFO, "ahrsd")
     daemon = live({"faults": ("reset@9",)})
     daemon.emulator.memory.preset(6, (17,))  # VNYIA: attitude, acceleration, rates; no field
@@ -134,7 +134,7 @@ def test_a_message_of_no_use_keeps_running_and_says_what_to_configure(live, capl
     assert caplog.text.count("VNYIA carries") == 1
 
 
-def test_a_device_that_refuses_every_write_keeps_its_output(live):
+def test_device_that_refuses_every_write_keeps_its_output(live):
     stream = {"configure_stream": True, "rate_hz": 50.0}
     with live({"output": "imu", "faults": ("refused_write",)}, device=stream) as daemon:
         daemon.until(lambda: daemon.noted("output cannot be set up, its own output stays"))
@@ -144,7 +144,7 @@ def test_a_device_that_refuses_every_write_keeps_its_output(live):
         assert daemon.emulator.memory.ram == daemon.before
 
 
-def test_an_output_that_does_not_fit_the_port_changes_nothing(live):
+def test_output_that_exceeds_the_baud_rate_is_not_configured(live):
     stream = {"configure_stream": True, "rate_hz": 800.0}
     with live({"output": "imu"}, device=stream) as daemon:
         daemon.until(lambda: daemon.noted("ask for at most 180 Hz or use a faster port"))
@@ -152,8 +152,8 @@ def test_an_output_that_does_not_fit_the_port_changes_nothing(live):
         assert b"VNWRG" not in daemon.heard
 
 
-def test_a_full_disk_costs_no_sample(live, small_disk, caplog):
-    """What must not change: the samples. What must: one line, now and again when it is over."""
+def test_full_disk_loses_no_sample(live, small_disk, caplog):
+    """No sample may be lost. One line is logged at once, and one when space is available again."""
     caplog.set_level(logging.INFO, "ahrsd")
     filler = small_disk / "filler"
     free = os.statvfs(small_disk)
@@ -173,11 +173,11 @@ def test_a_full_disk_costs_no_sample(live, small_disk, caplog):
     assert caplog.text.count("capture: No space left") == 1
     reader = CaptureReader(daemon.capture)
     assert sum(isinstance(item, Received) for item in reader) > 10
-    assert reader.notes == []  # what could not be stored waited in memory
+    assert reader.notes == []  # unstored data waited in memory
 
 
-def test_a_journal_that_cannot_be_written_writes_nothing(live, tmp_path):
-    """The folder of the journal is a file: root writes through permissions."""
+def test_nothing_is_written_when_the_journal_is_not_writable(live, tmp_path):
+    """The folder of the journal is a file, because root ignores permissions."""
     blocked = tmp_path / "blocked"
     with live({"output": "imu"}, mode="stage", state_directory=str(blocked)) as daemon:
         blocked.write_text("")
@@ -194,7 +194,7 @@ def test_a_journal_that_cannot_be_written_writes_nothing(live, tmp_path):
         assert daemon.emulator.memory.ram == daemon.before
 
 
-def test_a_full_disk_of_the_journal_writes_nothing_to_the_device(live, small_disk, tmp_path):
+def test_nothing_is_written_when_the_disk_of_the_journal_is_full(live, small_disk, tmp_path):
     captures = {"directory": str(tmp_path / "captures")}
     (tmp_path / "captures").mkdir()
     setup = {"mode": "stage", "state_directory": str(small_disk), "capture": captures}
@@ -224,7 +224,7 @@ def importer(name):
 @pytest.mark.parametrize(
     "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
 )
-def test_a_signal_ends_the_command_in_time_with_everything_put_back(emulated, tmp_path, number):
+def test_signal_ends_the_command_in_time_with_the_device_restored(emulated, tmp_path, number):
     config = tmp_path / "ahrsd.toml"
     config.write_text(
         f'state_directory = "{tmp_path}"\n[device]\nbaud = 115200\nconfigure_stream = true\n'
@@ -249,7 +249,7 @@ def test_a_signal_ends_the_command_in_time_with_everything_put_back(emulated, tm
         assert emulator.memory.ram == before
 
 
-def test_a_signal_while_it_still_looks_for_the_rate(emulated, tmp_path):
+def test_signal_during_the_search_for_the_rate_ends_the_command(emulated, tmp_path):
     with emulated(faults=("off",)) as (_, path):
         command = [sys.executable, "-m", "ahrsd", "-v", "run", "--port", path]
         environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path)}

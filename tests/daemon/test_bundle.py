@@ -1,4 +1,4 @@
-"""The support archive: own files only, bounded, nothing followed, and what is missing is said."""
+"""The support archive: only own files, bounded, no links followed, and missing parts listed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def bundle_of(state, status=None):
     return collect(state, state / "captures", 'mode = "observe"\n', status)
 
 
-def test_what_is_in_it_and_what_is_not(state):
+def test_archive_has_journal_newest_capture_status_and_configuration(state):
     found = bundle_of(state, {"schema": "ahrsd.status/1"})
     assert found.parts["journal/journal-1.jsonl"] == b"one\n"
     assert found.parts["captures/ahrsd-new.mcap"] == b"ahrsd-new.mcap"
@@ -38,7 +38,7 @@ def test_what_is_in_it_and_what_is_not(state):
     assert found.parts["left-out.txt"].decode() == found.left_out[0] + "\n"
 
 
-def test_links_fifos_devices_and_folders_are_left_out_by_name(state, tmp_path):
+def test_links_fifos_devices_and_folders_are_left_out_and_listed(state, tmp_path):
     (tmp_path / "secret").write_text("a key")
     (state / "journal-2.jsonl").symlink_to(tmp_path / "secret")
     os.mkfifo(state / "journal-3.jsonl")
@@ -58,15 +58,15 @@ def test_links_fifos_devices_and_folders_are_left_out_by_name(state, tmp_path):
     assert b"a key" not in b"".join(found.parts.values())
 
 
-def test_it_is_bounded(state, monkeypatch):
+def test_archive_is_bounded(state, monkeypatch):
     monkeypatch.setattr("ahrsd.daemon.support_bundle._CAPTURE_BYTES", 4)
     monkeypatch.setattr("ahrsd.daemon.support_bundle._JOURNAL_BYTES", 2)
     monkeypatch.setattr("ahrsd.daemon.support_bundle._MOST_JOURNALS", 1)
     (state / "journal-0.jsonl").write_text("older\n")
     os.utime(state / "journal-0.jsonl", (1, 1))
     found = bundle_of(state)
-    assert found.parts["journal/journal-1.jsonl"] == b"e\n"  # its newest
-    assert found.parts["captures/ahrsd-new.mcap"] == b"ahrs"  # its first
+    assert found.parts["journal/journal-1.jsonl"] == b"e\n"  # its newest part
+    assert found.parts["captures/ahrsd-new.mcap"] == b"ahrs"  # its first part
     assert found.left_out == [
         f"{state / 'journal-1.jsonl'}: its first 2 bytes",
         "1 older journals",
@@ -75,14 +75,16 @@ def test_it_is_bounded(state, monkeypatch):
     ]
 
 
-def test_without_any_folder_there_is_still_an_archive(tmp_path):
+def test_archive_is_made_without_any_folder(tmp_path):
     found = collect(tmp_path / "no", tmp_path / "no" / "captures", "", None)
     assert set(found.parts) == {"versions.json", "config.toml"}
 
 
 @pytest.mark.parametrize("ending", FORMATS)
 @pytest.mark.parametrize("umask", [0o000, 0o077])
-def test_the_name_says_the_format_and_only_its_owner_may_read_it(state, tmp_path, ending, umask):
+def test_archive_format_follows_the_name_and_only_the_owner_may_read_it(
+    state, tmp_path, ending, umask
+):
     file = tmp_path / f"x{ending}"
     (tmp_path / "victim").write_text("mine")
     file.symlink_to(tmp_path / "victim")
@@ -103,13 +105,13 @@ def test_the_name_says_the_format_and_only_its_owner_may_read_it(state, tmp_path
     assert body == b"one\n"
 
 
-def test_another_name_is_refused(state, tmp_path):
+def test_unknown_archive_format_is_refused(state, tmp_path):
     with pytest.raises(AhrsdError, match=r"must end in .tar.gz, .tgz, .tar, .zip"):
         write_bundle(tmp_path / "x.rar", bundle_of(state))
     assert not (tmp_path / "x.rar").exists()
 
 
-def test_the_command_says_what_it_left_out(run, state, tmp_path, capsys):
+def test_command_lists_what_it_left_out(run, state, tmp_path, capsys):
     os.mkfifo(state / "journal-3\x1b.jsonl")
     config = tmp_path / "a.toml"
     config.write_text(f'state_directory = "{state}"\n')

@@ -1,4 +1,4 @@
-"""The daemon on an emulated device: it ends in time, leaves the device as it was, survives."""
+"""The daemon on an emulated device: it stops in time, restores the device, and survives faults."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def registers(live, *numbers):
 
 
 def streaming(live):
-    """Whether the emulated device sends now, after all that was asked of it."""
+    """Whether the emulated device is sending after all commands it received."""
     before = live.emulator.counters["messages"]
     live_s = threading.Event()
     live_s.wait(0.3)
     return live.emulator.counters["messages"] > before
 
 
-def test_what_was_changed_for_the_session_is_put_back(live):
+def test_session_settings_are_restored(live):
     with live({"output": "ascii", "rate_hz": 40}, device=OWN_STREAM) as daemon:
         daemon.until(lambda: daemon.core.stream.facts.rate_hz > 49.0)
         assert registers(daemon, 6, 75) == {6: (0,), 75: (1, 16, 6, 1, 0x83F)}
@@ -49,7 +49,7 @@ def test_what_was_changed_for_the_session_is_put_back(live):
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6])
-def test_it_may_be_stopped_at_any_moment_of_the_set_up(live, after_s):
+def test_daemon_can_be_stopped_at_any_moment_of_the_set_up(live, after_s):
     with live({"output": "ascii"}, device=OWN_STREAM) as daemon:
         daemon.until(lambda: daemon.heard)
         threading.Event().wait(after_s)
@@ -79,7 +79,7 @@ def test_observe_sends_register_reads_only(live):
 @pytest.mark.parametrize(
     "state", ["QUALIFIED", "PREPARING", "CHECKING", "STAGING", "STAGED", "TRIAL"]
 )
-def test_a_stop_in_a_transaction_leaves_the_old_values(live, state):
+def test_stop_in_a_transaction_leaves_the_old_values(live, state):
     with live({"output": "imu"}, mode="stage") as daemon:
         Operator(daemon, state, lambda: daemon.daemon.stop("test"))
         daemon.until(lambda: daemon.daemon._stop_reason)
@@ -92,7 +92,7 @@ def test_a_stop_in_a_transaction_leaves_the_old_values(live, state):
 
 
 @pytest.mark.parametrize("state", ["CHECKING", "STAGING", "TRIAL"])
-def test_unplugged_in_a_transaction_it_is_reconciled_afterwards(live, state):
+def test_device_unplugged_in_a_transaction_is_reconciled_afterwards(live, state):
     with live({"output": "imu"}, mode="stage") as daemon:
 
         def unplug():
@@ -110,7 +110,7 @@ def test_unplugged_in_a_transaction_it_is_reconciled_afterwards(live, state):
         assert daemon.emulator.memory.ram == daemon.before
 
 
-def test_stopped_while_unplugged(live, caplog):
+def test_daemon_stops_while_the_device_is_unplugged(live, caplog):
     with live({"output": "ascii"}, device=OWN_STREAM) as daemon:
         daemon.until(lambda: daemon.core.stream.facts.rate_hz > 49.0)
         daemon.emulator.plugged = False
@@ -120,7 +120,7 @@ def test_stopped_while_unplugged(live, caplog):
         assert daemon.noted("not everything was put back")
 
 
-def test_a_device_that_is_back_is_told_however_soon(live, caplog):
+def test_returning_device_is_reported_however_soon(live, caplog):
     caplog.set_level(logging.INFO, "ahrsd")
     with live({"output": "imu"}) as daemon:
         daemon.flowing()
@@ -131,7 +131,7 @@ def test_a_device_that_is_back_is_told_however_soon(live, caplog):
         assert daemon.stop() < LIMIT_S
 
 
-def test_a_reset_is_noticed_and_the_session_is_set_up_again(live):
+def test_reset_is_noticed_and_the_session_is_set_up_again(live):
     setup = {"output": "ascii", "faults": ("reset@4",)}
     with live(setup, device=OWN_STREAM) as daemon:
         daemon.until(lambda: daemon.noted("output is gone: the device restarted"))
@@ -141,7 +141,7 @@ def test_a_reset_is_noticed_and_the_session_is_set_up_again(live):
         assert daemon.emulator.memory.ram == daemon.before
 
 
-def test_after_a_reset_to_silence_the_session_is_set_up_again(live):
+def test_session_is_set_up_again_after_a_reset_to_silence(live):
     setup = {"output": "binary", "rate_hz": 40, "faults": ("reset@4",)}
     with live(setup, device=OWN_STREAM) as daemon:
         daemon.until(lambda: daemon.notes.count("output set up") == 1)
@@ -154,7 +154,7 @@ def test_after_a_reset_to_silence_the_session_is_set_up_again(live):
         assert daemon.stop() < LIMIT_S
 
 
-def test_another_device_begins_anew_and_nothing_is_written_to_it(live):
+def test_another_device_starts_a_new_calibration_and_is_not_written(live):
     with live({"output": "imu", "faults": ("replug_other_serial@9+1",)}, mode="stage") as daemon:
         daemon.until(lambda: daemon.core.calibrator.started)
         first = daemon.core.calibrator
@@ -166,7 +166,7 @@ def test_another_device_begins_anew_and_nothing_is_written_to_it(live):
         assert b"VNWRG" not in daemon.heard
 
 
-def test_a_stalled_device_is_named_once_and_comes_back(live, caplog):
+def test_stalled_device_is_reported_once_and_recovers(live, caplog):
     caplog.set_level(logging.INFO, "ahrsd")
     with live({"output": "imu", "faults": ("mute@3+8",)}) as daemon:
         daemon.until(lambda: "nothing comes from the device" in caplog.text, 20.0)
@@ -175,7 +175,7 @@ def test_a_stalled_device_is_named_once_and_comes_back(live, caplog):
     assert caplog.text.count("nothing comes from the device") == 1
 
 
-def test_a_device_that_did_not_answer_is_asked_again(live):
+def test_device_that_did_not_answer_is_queried_again(live):
     with live({"output": "imu", "faults": ("lost_reply@0+4",)}) as daemon:
         daemon.until(lambda: daemon.noted("listening only"))
         daemon.until(lambda: daemon.core.device_session.identity, 20.0)
@@ -183,7 +183,7 @@ def test_a_device_that_did_not_answer_is_asked_again(live):
         assert daemon.stop() < LIMIT_S
 
 
-def test_a_bug_in_the_core_does_not_leave_the_device_changed(live, caplog):
+def test_device_is_restored_after_an_exception_in_the_core(live, caplog):
     with live({"output": "ascii"}, device=OWN_STREAM) as daemon:
         daemon.until(lambda: daemon.core.stream.facts.rate_hz > 49.0)
         daemon.core.stream.take = None
@@ -194,7 +194,7 @@ def test_a_bug_in_the_core_does_not_leave_the_device_changed(live, caplog):
     assert "internal error" in caplog.text
 
 
-def test_a_bug_in_a_transaction_leaves_the_output_on(live):
+def test_output_is_on_after_an_exception_in_a_transaction(live):
     with live({"output": "imu"}, mode="stage") as daemon:
 
         def breakdown():
@@ -208,7 +208,7 @@ def test_a_bug_in_a_transaction_leaves_the_output_on(live):
         assert daemon.heard.rstrip().split(b"\r\n")[-1].startswith(b"$VNASY,1")
 
 
-def test_a_bug_in_the_estimator_is_a_state_and_the_run_goes_on(live, caplog):
+def test_run_continues_after_an_exception_in_the_estimator(live, caplog):
     with live({"output": "ascii"}, device=OWN_STREAM) as daemon:
         daemon.until(lambda: daemon.core.stream.facts.rate_hz > 49.0)
         daemon.core.calibrator.take = None
@@ -227,8 +227,8 @@ def test_a_bug_in_the_estimator_is_a_state_and_the_run_goes_on(live, caplog):
     assert again.core.decisions.sha256 == daemon.core.decisions.sha256
 
 
-def test_samples_go_on_while_the_estimator_is_at_it(live):
-    """Also the end: a search that lasts must hold up neither a reader of the socket nor a stop."""
+def test_samples_continue_while_the_estimator_is_busy(live):
+    """A long search must not delay a reader of the socket or a stop."""
     free = threading.Event()
     with live({"output": "imu"}) as daemon:
         daemon.flowing()
@@ -239,7 +239,7 @@ def test_samples_go_on_while_the_estimator_is_at_it(live):
             free.wait(PATIENCE_S)
 
         daemon.core.calibrator.take = search
-        daemon.until(busy.is_set)  # once the device was asked who it is
+        daemon.until(busy.is_set)  # after the device was identified
         seen = [e for e in list(daemon.events) if isinstance(e, SamplesSeen)]
         daemon.until(
             lambda: len([e for e in daemon.events if isinstance(e, SamplesSeen)]) > len(seen) + 3
@@ -249,8 +249,8 @@ def test_samples_go_on_while_the_estimator_is_at_it(live):
         free.set()
 
 
-def test_a_broken_reader_is_a_lost_link(live, monkeypatch):
-    """What must not happen: a daemon that is deaf and does not know it."""
+def test_exception_in_the_reader_is_a_lost_link(live, monkeypatch):
+    """The daemon must not continue without input and without noticing it."""
     with live({"output": "imu"}) as daemon:
         daemon.flowing()
         monkeypatch.setattr(threading, "excepthook", lambda _: None)
@@ -261,7 +261,7 @@ def test_a_broken_reader_is_a_lost_link(live, monkeypatch):
     assert [i for i in CaptureReader(daemon.capture) if isinstance(i, LinkLost)]
 
 
-def test_it_says_now_and_then_how_it_stands(live, caplog, monkeypatch):
+def test_status_is_logged_periodically(live, caplog, monkeypatch):
     monkeypatch.setattr("ahrsd.daemon.health_log.STATUS_S", 2.0)
     caplog.set_level(logging.INFO, "ahrsd")
     line = (
@@ -273,7 +273,7 @@ def test_it_says_now_and_then_how_it_stands(live, caplog, monkeypatch):
         daemon.until(lambda: re.search(line, caplog.text), 30.0)
 
 
-def test_the_log_counts_what_comes_again():
+def test_repeated_log_lines_are_counted():
     lines = []
     folded = FoldedLog(lambda level, text: lines.append((level, text)))
     for at_s in range(50):
@@ -293,8 +293,10 @@ def test_the_log_counts_what_comes_again():
     assert len(lines) == 204
 
 
-def test_a_host_that_was_suspended_begins_the_link_anew(live, monkeypatch):
-    """Its clock stood still: what a stream without time of its own missed would show nowhere."""
+def test_suspension_of_the_host_restarts_the_link(live, monkeypatch):
+    """The host clock stood still, so a stream without device time would not show the missing
+    samples.
+    """
     real, slept = time.clock_gettime, [0.0]
 
     def clock(which):
@@ -316,7 +318,7 @@ def test_a_host_that_was_suspended_begins_the_link_anew(live, monkeypatch):
     assert [item.reason for item in lost] == ["the host was suspended for 3600.0 s"]
 
 
-def test_a_host_clock_that_is_set_moves_no_sample(live, monkeypatch):
+def test_setting_the_host_clock_moves_no_sample(live, monkeypatch):
     real, step = time.time, [0.0]
     monkeypatch.setattr(time, "time", lambda: real() + step[0])
     with live({"output": "binary"}) as daemon:
@@ -334,4 +336,4 @@ def test_a_host_clock_that_is_set_moves_no_sample(live, monkeypatch):
     assert np.round(np.diff([i.wall_s for i in told]) / 86400.0, 2).tolist() == [-1.0, 8.0]
     assert {i.boot_id for i in told} == {host_clock.boot_id()}
     offsets_s = [i.boot_s - i.host_ns * 1e-9 for i in told]
-    assert np.ptp(offsets_s) < 0.5  # nobody can set boottime
+    assert np.ptp(offsets_s) < 0.5  # boottime cannot be set

@@ -1,4 +1,4 @@
-"""The memory of a run is taken at its start and does not change."""
+"""The memory of a run is allocated at its start and does not change."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GLIBC = pytest.mark.skipif(
 
 
 def run(text):
-    """What a process of its own prints last, as JSON."""
+    """The last line that a separate process prints, as JSON."""
     head = (
         "import json, resource, threading\n"
         "import numpy as np\n"
@@ -35,7 +35,7 @@ def run(text):
 
 
 @GLIBC
-def test_what_is_taken_is_there_and_stays():
+def test_allocated_memory_is_resident_and_stays():
     before, taken, filled, emptied = run(
         "fill(); at = [rss()]\n"
         "take_heap(32 << 20); at.append(rss())\n"
@@ -49,7 +49,7 @@ def test_what_is_taken_is_there_and_stays():
 
 
 @GLIBC
-def test_threads_use_it_too():
+def test_threads_use_the_allocated_memory():
     taken, filled = run(
         "take_heap(32 << 20); at, kept = [rss()], []\n"
         "for _ in range(4):\n"
@@ -61,7 +61,7 @@ def test_threads_use_it_too():
 
 
 @GLIBC
-def test_what_is_not_there_is_said_at_the_start():
+def test_missing_memory_is_reported_at_the_start():
     (said,) = run(
         "_, most = resource.getrlimit(resource.RLIMIT_AS)\n"
         "resource.setrlimit(resource.RLIMIT_AS, (2**31, most))\n"
@@ -71,12 +71,12 @@ def test_what_is_not_there_is_said_at_the_start():
     assert said == "estimator.window_steps: its 2048 MB of memory are not there; less of it"
 
 
-def test_another_c_library_is_left_alone(monkeypatch):
+def test_other_c_libraries_are_not_changed(monkeypatch):
     monkeypatch.setattr(ctypes, "CDLL", lambda name: object())
     assert take_heap(MB) is False
 
 
-def test_a_larger_window_needs_more():
+def test_larger_window_needs_more_memory():
     usual = EstimatorParameters()
     twice = EstimatorParameters(window_steps=2 * usual.window_steps)
     assert 20 * MB < needed_bytes(usual) < 32 * MB
@@ -84,8 +84,8 @@ def test_a_larger_window_needs_more():
 
 
 @GLIBC
-def test_a_short_commands_arrays_take_the_pages_of_those_before():
-    """Page faults of a hundred arrays of 16 MB, after the first of them: none."""
+def test_arrays_of_a_short_command_reuse_pages():
+    """Page faults of a hundred arrays of 16 MB after the first: none."""
     faults, kept = run(
         "from ahrsd.daemon.heap import keep_heap\n"
         "def faults(): return resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
@@ -100,5 +100,5 @@ def test_a_short_commands_arrays_take_the_pages_of_those_before():
         "hundred()\n"
         "print(json.dumps([mapped, hundred()]))\n"
     )
-    assert faults >= 100  # huge pages or not
+    assert faults >= 100  # with or without huge pages
     assert kept <= 10

@@ -1,8 +1,7 @@
-"""Files of others under a running daemon: FIFOs, `/dev/full`, owners, modes, control codes.
+"""Foreign files under a running daemon: FIFOs, `/dev/full`, owners, modes, control codes.
 
-At every path that the daemon opens something stands that never answers or that is no file.
-Promised: the device is heard on, a stop ends, and what is on trial is undone when the vehicle's
-word ends.
+At every path that the daemon opens there is something that never answers or is no regular file. The
+device is read on, a stop ends the run, and a trial is undone when the vehicle's permission ends.
 """
 
 from __future__ import annotations
@@ -38,22 +37,22 @@ def captured(running: Program) -> int:
 
 
 def goes_on(running: Program, bytes_more: int = 20_000) -> None:
-    """The device is heard and recorded still."""
+    """The device is still read and recorded."""
     before = captured(running)
     running.until(lambda: captured(running) > before + bytes_more)
 
 
 def replace_by_fifo(path: Path) -> None:
-    """From this moment on there is a FIFO in the file's place; nobody writes into it."""
+    """Puts a FIFO in the place of the file; nobody writes to it."""
     draft = path.with_suffix(".fifo")
     os.mkfifo(draft)
     draft.rename(path)
 
 
-# -- what never answers ----------------------------------------------------------------------------
+# -- files that never answer -----------------------------------------------------------------------
 
 
-def test_a_fifo_as_interlock_from_the_start_stops_nothing(program):
+def test_fifo_as_interlock_does_not_stop_the_run(program):
     with program() as running:
         running.word = None
         os.mkfifo(running.interlock)
@@ -64,7 +63,7 @@ def test_a_fifo_as_interlock_from_the_start_stops_nothing(program):
         assert running.writes(running.unit.serial) == []
 
 
-def test_a_fifo_as_interlock_in_a_trial_undoes_the_trial(program):
+def test_fifo_as_interlock_undoes_a_trial(program):
     with program(trial_s=60.0) as running:
         running.start()
         running.until_record("RAM_VERIFIED")
@@ -77,8 +76,10 @@ def test_a_fifo_as_interlock_in_a_trial_undoes_the_trial(program):
         assert running.stop(30.0) == 0
 
 
-def test_a_word_that_ends_in_a_trial_undoes_it_whatever_else_hangs(program, tmp_path):
-    """The columns hang and an operator's word is a FIFO while the vehicle falls silent."""
+def test_ended_permission_undoes_a_trial_although_other_files_hang(program, tmp_path):
+    """The vehicle's columns hang and an operator command is a FIFO when the vehicle falls
+    silent.
+    """
     columns = tmp_path / "columns.json"
     columns.write_text("{}")
     more = f'[terms]\nfile = "{columns}"\n'
@@ -100,7 +101,7 @@ def test_a_word_that_ends_in_a_trial_undoes_it_whatever_else_hangs(program, tmp_
         "journal",
     ],
 )
-def test_a_fifo_at_any_path_of_others_stops_neither_stream_nor_stop(program, tmp_path, name):
+def test_fifo_at_any_foreign_path_blocks_neither_stream_nor_stop(program, tmp_path, name):
     columns = tmp_path / "columns.json"
     with program(more=f'[terms]\nfile = "{columns}"\n') as running:
         if name == "columns":
@@ -119,7 +120,7 @@ def test_a_fifo_at_any_path_of_others_stops_neither_stream_nor_stop(program, tmp
         assert running.stop(30.0) == 0
 
 
-def test_dev_full_as_journal_writes_nothing_and_stops_nothing(program):
+def test_dev_full_as_journal_prevents_writes_and_does_not_stop_the_run(program):
     with program() as running:
         (running.state / f"journal-{running.unit.serial}.jsonl").symlink_to("/dev/full")
         running.start()
@@ -139,7 +140,7 @@ def test_dev_full_as_journal_writes_nothing_and_stops_nothing(program):
         ),
     ],
 )
-def test_a_fifo_where_a_start_reads_ends_in_one_line(program, tmp_path, place):
+def test_fifo_read_at_the_start_is_a_one_line_error(program, tmp_path, place):
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)
     more = {
@@ -161,7 +162,7 @@ def test_a_fifo_where_a_start_reads_ends_in_one_line(program, tmp_path, place):
         assert "Traceback" not in done.stderr
 
 
-def test_a_bundle_follows_no_link_and_waits_for_no_fifo(program, tmp_path):
+def test_bundle_follows_no_link_and_waits_for_no_fifo(program, tmp_path):
     secret = tmp_path / "secret"
     secret.write_text("nobody's business")
     secret.chmod(0o600)
@@ -179,7 +180,7 @@ def test_a_bundle_follows_no_link_and_waits_for_no_fifo(program, tmp_path):
     assert b"nobody's business" not in listed
 
 
-# -- who may say what ------------------------------------------------------------------------------
+# -- permissions -----------------------------------------------------------------------------------
 
 
 @root_only
@@ -191,7 +192,7 @@ def test_a_bundle_follows_no_link_and_waits_for_no_fifo(program, tmp_path):
         pytest.param(0, 0o777, marks=pytest.mark.slow),
     ],
 )
-def test_a_folder_of_words_that_others_may_write_is_refused_by_name(program, owner, mode):
+def test_command_folder_writable_by_others_is_refused(program, owner, mode):
     with program(approval="operator") as running:
         box = running.state / "operator"
         box.mkdir()
@@ -212,7 +213,7 @@ def test_a_folder_of_words_that_others_may_write_is_refused_by_name(program, own
 @pytest.mark.parametrize(
     "umask", [0o777, *(pytest.param(one, marks=pytest.mark.slow) for one in (0o077, 0o022))]
 )
-def test_a_caller_with_any_umask_is_heard(program, umask):
+def test_commands_work_with_any_umask(program, umask):
     with program() as running:
         running.start()
         running.until(lambda: "OBSERVING" in running.said)
@@ -222,7 +223,7 @@ def test_a_caller_with_any_umask_is_heard(program, umask):
 
 
 @pytest.mark.parametrize("umask", [pytest.param(0o022, marks=pytest.mark.slow), 0o000])
-def test_captures_are_the_owners_alone(program, umask):
+def test_captures_are_readable_only_by_the_owner(program, umask):
     with program(more=LOCATION) as running:
         running.start(umask=umask)
         running.until(lambda: captured(running) > 10_000)
@@ -231,7 +232,7 @@ def test_captures_are_the_owners_alone(program, umask):
             assert stat.S_IMODE(path.stat().st_mode) & 0o077 == 0, path
 
 
-def test_a_persons_text_forges_no_line_of_the_log(program):
+def test_operator_text_cannot_forge_log_lines(program):
     with program() as running:
         running.start()
         running.until(lambda: "OBSERVING" in running.said)
@@ -242,7 +243,7 @@ def test_a_persons_text_forges_no_line_of_the_log(program):
         assert "\x1b" not in running.said
 
 
-def test_a_folder_in_the_place_of_a_word_is_complained_about_once(program):
+def test_folder_in_place_of_a_command_is_reported_once(program):
     with program() as running:
         running.start()
         running.until(lambda: "OBSERVING" in running.said)
@@ -252,11 +253,13 @@ def test_a_folder_in_the_place_of_a_word_is_complained_about_once(program):
         assert len([line for line in running.said.splitlines() if "folder.json" in line]) <= 2
 
 
-# -- a word is fresh when it is seen to change -----------------------------------------------------
+# -- a permission is recent when it changes --------------------------------------------------------
 
 
 def stamped(running: Program, ahead_s: float) -> None:
-    """The vehicle's last word, stamped so far in the future; nobody says anything more."""
+    """The vehicle's last permission with a time stamp in the future; nothing is written
+    afterwards.
+    """
     running.word = None
     time.sleep(0.3)
     draft = running.folder / "late"
@@ -269,7 +272,7 @@ def stamped(running: Program, ahead_s: float) -> None:
 @pytest.mark.parametrize(
     "ahead_s", [0.8, *(pytest.param(s, marks=pytest.mark.slow) for s in (8.0, 30.0))]
 )
-def test_an_old_word_with_a_stamp_ahead_is_never_fresh_again(program, ahead_s):
+def test_old_permission_with_a_future_stamp_never_becomes_valid(program, ahead_s):
     with program(approval="operator") as running:
         running.start()
         running.until(lambda: "candidate" in running.said)
@@ -283,7 +286,7 @@ def test_an_old_word_with_a_stamp_ahead_is_never_fresh_again(program, ahead_s):
         running.stop()
 
 
-def test_a_clock_that_is_set_back_revives_no_word(program):
+def test_setting_the_clock_back_revives_no_permission(program):
     with program(approval="operator") as running:
         running.start()
         running.until(lambda: "candidate" in running.said)

@@ -25,7 +25,7 @@ def fill(path, count=5):
     return journal
 
 
-def test_records_come_back_with_their_facts(tmp_path):
+def test_records_are_read_back_with_their_facts(tmp_path):
     path = journal_path(tmp_path / "state", 100012345)
     assert path.name == "journal-100012345.jsonl"
     written = fill(path).records()
@@ -38,7 +38,7 @@ def test_records_come_back_with_their_facts(tmp_path):
     assert journal.torn == b""
 
 
-def test_the_format_is_what_the_module_says(tmp_path):
+def test_format_is_as_documented_in_the_module(tmp_path):
     fill(tmp_path / "j.jsonl", 1)
     body = json.loads((tmp_path / "j.jsonl").read_text())
     crc = body.pop("crc")
@@ -58,7 +58,7 @@ def test_reading_creates_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_power_cut_at_every_byte_of_the_last_line(tmp_path):
+def test_power_cut_at_any_byte_of_the_last_line_loses_only_that_line(tmp_path):
     path = tmp_path / "j.jsonl"
     journal = fill(path, 2)
     receipt = receipt_path(path).read_bytes()
@@ -75,7 +75,7 @@ def test_a_power_cut_at_every_byte_of_the_last_line(tmp_path):
         assert [r.kind for r in Journal.open(path).records()][-1] == "RAM_SENT"
 
 
-def test_blocks_that_never_reached_the_disk_are_a_torn_line(tmp_path):
+def test_unwritten_disk_blocks_are_a_torn_line(tmp_path):
     fill(tmp_path / "j.jsonl", 2)
     with (tmp_path / "j.jsonl").open("ab") as file:
         file.write(bytes(80) + b'"seq":3}\n')
@@ -84,7 +84,7 @@ def test_blocks_that_never_reached_the_disk_are_a_torn_line(tmp_path):
     assert len(journal.torn) == 89
 
 
-def test_every_changed_byte_is_found(tmp_path):
+def test_any_changed_byte_is_found(tmp_path):
     path = tmp_path / "j.jsonl"
     fill(path, 2)
     whole = path.read_bytes()
@@ -97,7 +97,7 @@ def test_every_changed_byte_is_found(tmp_path):
 
 
 @pytest.mark.parametrize("line", [0, 2, 4])
-def test_a_missing_or_doubled_line_is_named(tmp_path, line):
+def test_missing_or_doubled_line_is_reported(tmp_path, line):
     path = tmp_path / "j.jsonl"
     fill(path)
     lines = path.read_bytes().splitlines(keepends=True)
@@ -125,7 +125,7 @@ def test_both_file_and_folder_are_synced_before_append_returns(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("call", ["fsync", "pwrite"])
-def test_what_is_not_durable_is_refused_and_not_in_the_journal(tmp_path, monkeypatch, call):
+def test_record_that_is_not_durable_is_refused_and_removed(tmp_path, monkeypatch, call):
     journal = fill(tmp_path / "j.jsonl", 2)
     before = (tmp_path / "j.jsonl").read_bytes()
 
@@ -137,10 +137,10 @@ def test_what_is_not_durable_is_refused_and_not_in_the_journal(tmp_path, monkeyp
         with pytest.raises(JournalError, match="No space left on device"):
             journal.append("PREPARED")
     assert (tmp_path / "j.jsonl").read_bytes() == before
-    assert journal.append("PREPARED").seq == 3  # as soon as it can
+    assert journal.append("PREPARED").seq == 3  # as soon as it is possible
 
 
-def test_a_real_full_disk(small_disk):
+def test_record_on_a_full_disk_is_refused(small_disk):
     journal = fill(small_disk / "j.jsonl", 2)
     (small_disk / "filler").write_bytes(bytes(190_000))
     with pytest.raises(JournalError, match="cannot be written"):
@@ -152,7 +152,7 @@ def test_a_real_full_disk(small_disk):
     assert journal.append("PREPARED").seq == count + 1
 
 
-def test_a_second_writer_is_noticed(tmp_path):
+def test_second_writer_is_noticed(tmp_path):
     first = fill(tmp_path / "j.jsonl", 1)
     Journal.open(tmp_path / "j.jsonl").append("RAM_SENT")
     with pytest.raises(JournalError, match="another program"):
@@ -160,7 +160,7 @@ def test_a_second_writer_is_noticed(tmp_path):
 
 
 @pytest.mark.parametrize("how", ["gone", "empty", "cut", "exchanged"])
-def test_a_journal_that_was_lost_is_not_one_that_never_was(tmp_path, how):
+def test_lost_journal_is_recognised_by_its_receipt(tmp_path, how):
     path = tmp_path / "j.jsonl"
     fill(path, 4)
     lines = path.read_bytes().splitlines(keepends=True)
@@ -177,11 +177,11 @@ def test_a_journal_that_was_lost_is_not_one_that_never_was(tmp_path, how):
         Journal.open(path)
     assert "\n" not in str(lost.value)
     assert "remove j.receipt" in str(lost.value)
-    receipt_path(path).unlink()  # as it says
+    receipt_path(path).unlink()  # as the message says
     assert len(Journal.open(path).records()) == {"cut": 3, "exchanged": 4}.get(how, 0)
 
 
-def test_a_receipt_is_made_with_the_next_record_and_must_be_whole(tmp_path):
+def test_receipt_is_made_with_the_next_record_and_must_be_complete(tmp_path):
     path = tmp_path / "j.jsonl"
     fill(path, 2)
     receipt_path(path).unlink()  # an older version made none
@@ -193,7 +193,7 @@ def test_a_receipt_is_made_with_the_next_record_and_must_be_whole(tmp_path):
             Journal.open(path)
 
 
-def test_a_power_cut_between_record_and_receipt_loses_nothing(tmp_path):
+def test_power_cut_between_record_and_receipt_loses_nothing(tmp_path):
     path = tmp_path / "j.jsonl"
     fill(path, 2)
     before = receipt_path(path).read_bytes()
@@ -205,7 +205,7 @@ def test_a_power_cut_between_record_and_receipt_loses_nothing(tmp_path):
     assert journal.append("PROVEN").seq == 4
 
 
-def test_a_journal_removed_under_a_program_is_not_begun_anew(tmp_path):
+def test_journal_removed_during_a_run_is_not_started_again(tmp_path):
     journal = fill(tmp_path / "j.jsonl", 2)
     journal.path.unlink()
     with pytest.raises(JournalError, match="cannot be written"):
@@ -215,7 +215,7 @@ def test_a_journal_removed_under_a_program_is_not_begun_anew(tmp_path):
 
 @pytest.mark.parametrize("where", ["journal", "receipt"])
 @pytest.mark.parametrize("what", ["FIFO", "folder", "symbolic link", "dangling link", "socket"])
-def test_what_is_no_regular_file_is_one_line_at_once(tmp_path, what, where):
+def test_journal_that_is_no_regular_file_is_a_one_line_error(tmp_path, what, where):
     book = tmp_path / "j.jsonl"
     path = book if where == "journal" else receipt_path(book)
     if what == "FIFO":
@@ -241,13 +241,13 @@ def test_what_is_no_regular_file_is_one_line_at_once(tmp_path, what, where):
             journal.append("PROVEN")
 
 
-def test_a_device_as_journal_is_refused():
+def test_device_as_journal_is_refused():
     with pytest.raises(JournalError, match="/dev/full: is a device where"):
         Journal.open(Path("/dev/full"))
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
-def test_a_file_of_a_stranger_is_refused_and_of_the_folders_owner_is_not(tmp_path):
+def test_journal_of_another_user_is_refused_unless_the_folder_owner(tmp_path):
     folder = tmp_path / "state"
     fill(folder / "j.jsonl", 1)
     os.chown(folder / "j.jsonl", 12345, 12345)
@@ -257,12 +257,12 @@ def test_a_file_of_a_stranger_is_refused_and_of_the_folders_owner_is_not(tmp_pat
     assert len(Journal.open(folder / "j.jsonl").records()) == 1
 
 
-def test_the_journals_own_keys_are_not_for_facts(tmp_path):
+def test_reserved_keys_are_refused_as_facts(tmp_path):
     with pytest.raises(ValueError, match="seq is the journal's own key"):
         Journal.open(tmp_path / "j.jsonl").append("PREPARED", seq=9)
 
 
-def test_the_lines_for_a_terminal(tmp_path):
+def test_register_commands_for_a_terminal(tmp_path):
     journal = fill(tmp_path / "j.jsonl", 1)
     (line,) = wrg_lines(journal.records()[0])
     body, _, checksum = line.removeprefix("$").partition("*")

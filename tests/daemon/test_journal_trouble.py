@@ -1,4 +1,4 @@
-"""A journal that is lost, foreign or in the way, and clocks that lie, through the whole core."""
+"""A lost, foreign or blocked journal, and wrong clocks, through the whole core."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ POLICY = WriteBackPolicy(
 
 
 class Recorded(VirtualRun):
-    """A run that keeps what it was fed."""
+    """A run that keeps its inputs."""
 
     def __init__(self, *arguments, **named):
         self.fed = []
@@ -58,7 +58,7 @@ class Recorded(VirtualRun):
         super().restart()
 
     def plant(self):
-        """The calibrator says the same for ever, and every gate is green."""
+        """The calibrator always returns the same values, and every gate is open."""
         truth = draw_truth(3)
         found = estimate(
             soft_iron=truth.soft_iron,
@@ -97,7 +97,7 @@ def committed(output="binary"):
 
 @pytest.mark.parametrize("clock", ["1970", "an hour behind"])
 @pytest.mark.parametrize("reboot", [False, True])
-def test_a_clock_that_was_set_confirms_nothing_and_a_restart_does(clock, reboot):
+def test_restart_confirms_a_save_and_a_set_clock_does_not(clock, reboot):
     run = committed()
     facts = run.journal[run.emulator.serial][-1]["facts"]
     assert facts["boot_id"] == "virtual boot"
@@ -121,7 +121,7 @@ def test_a_clock_that_was_set_confirms_nothing_and_a_restart_does(clock, reboot)
 
 
 @pytest.mark.parametrize("reboot", [False, True])
-def test_a_restart_while_nobody_looked_is_told_by_the_devices_time(reboot):
+def test_restart_between_runs_is_shown_by_the_device_time(reboot):
     run = committed()
     run.emulator.restart(run.now_s + 0.5)
     run.now_s += 4.0
@@ -131,7 +131,7 @@ def test_a_restart_while_nobody_looked_is_told_by_the_devices_time(reboot):
     assert run.until(lambda: run.kinds[-1] == "CONFIRMED", 20.0), run.notes[-4:]
 
 
-def test_a_stream_without_time_proves_no_restart():
+def test_stream_without_device_time_proves_no_restart():
     run = committed("imu")
     assert run.journal[run.emulator.serial][-1]["facts"]["device_s"] is None
     run.emulator.restart(run.now_s)
@@ -141,7 +141,7 @@ def test_a_stream_without_time_proves_no_restart():
     assert run.kinds[-1] == "FLASH_ACKED"
 
 
-def test_a_replay_of_the_inputs_concludes_the_same():
+def test_replay_of_the_inputs_decides_the_same():
     run = committed()
     run.emulator.restart(run.now_s + 0.5)
     run.now_s += 4.0
@@ -152,7 +152,7 @@ def test_a_replay_of_the_inputs_concludes_the_same():
         again.handle(item if isinstance(item, Received) else input_from_json(input_to_json(item)))
     assert again.writeback.state is State.CONFIRMED
     assert again.decisions.sha256 == run.core.decisions.sha256
-    old = Core(run.core.settings)  # and as an older version recorded it: nothing is proven
+    old = Core(run.core.settings)  # and as recorded by an older version: nothing is proven
     for item in run.fed:
         if isinstance(item, Received):
             old.handle(item)
@@ -167,14 +167,14 @@ def test_a_replay_of_the_inputs_concludes_the_same():
     assert old.writeback.state is State.COMMITTED
 
 
-def test_a_capture_without_boot_id_loads():
+def test_capture_without_boot_id_can_be_read():
     item = input_from_json(b'{"type":"WallClock","host_ns":5,"wall_s":1.8e9}')
     assert item == WallClock(5, 1.8e9, "", None)
     whole = WallClock(5, 1.8e9, "9d3a", 12.25)
     assert input_from_json(input_to_json(whole)) == whole
 
 
-def test_every_record_has_the_time_by_every_clock(tmp_path):
+def test_every_record_has_the_time_of_every_clock(tmp_path):
     keeper = JournalKeeper(journal_in(tmp_path), lambda: 0)
     keeper.opened(SERIAL)
     assert keeper.append(JournalAppend("OUTPUTS_KEPT", {"serial": SERIAL})).error == ""
@@ -192,7 +192,7 @@ def test_every_record_has_the_time_by_every_clock(tmp_path):
 @pytest.mark.parametrize(
     "facts", [{"serial": 7, "old": REGISTERS, "new": REGISTERS}, {"device": {"serial": "7"}}]
 )
-def test_a_record_of_another_device_is_refused_by_name(tmp_path, facts):
+def test_record_of_another_device_is_refused(tmp_path, facts):
     path = journal_path(tmp_path, SERIAL)
     journal = Journal.open(path)
     journal.append("PREPARED", txn="t", serial=SERIAL, old=REGISTERS, new=REGISTERS)
@@ -205,7 +205,7 @@ def test_a_record_of_another_device_is_refused_by_name(tmp_path, facts):
     assert len(Journal.open(path).records()) == 2
 
 
-def test_a_record_of_another_device_is_not_obeyed():
+def test_record_of_another_device_only_permits_observing():
     first = committed()
     theirs = first.journal[first.emulator.serial][:2]  # PREPARED and RAM_VERIFIED
     theirs[0]["facts"]["serial"] = 7
@@ -221,7 +221,7 @@ def test_a_record_of_another_device_is_not_obeyed():
 
 
 @pytest.mark.parametrize("how", ["gone", "empty", "FIFO", "folder", "link", "device"])
-def test_a_lost_or_blocking_journal_is_one_line_and_nothing_stops(tmp_path, how):
+def test_lost_or_blocked_journal_is_reported_and_the_run_continues(tmp_path, how):
     run = world(mode=Mode.STAGE)
     path = journal_path(tmp_path, run.emulator.serial)
     journal = Journal.open(path)
@@ -256,7 +256,7 @@ def test_a_lost_or_blocking_journal_is_one_line_and_nothing_stops(tmp_path, how)
     assert run.writes == 0
 
 
-def test_the_way_out_of_a_lost_journal_is_the_one_that_it_names(tmp_path):
+def test_advice_for_a_lost_journal_works(tmp_path):
     path = journal_path(tmp_path, SERIAL)
     Journal.open(path).append("PREPARED")
     path.unlink()

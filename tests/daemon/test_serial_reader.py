@@ -1,4 +1,4 @@
-"""What waits for the core is bounded, and nothing that was read is dropped."""
+"""Data waiting for the core are bounded, and no byte that was read is dropped."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from drivers.vn100.session import SILENCE_S
 
 
 class Endless:
-    """A port on which numbered lines never end; it blocks once `stop_at` were read."""
+    """A port with endless numbered lines; it blocks after `stop_at` were read."""
 
     def __init__(self, stop_at=10**9):
         self.numbers, self.stop_at, self.read_so_far = itertools.count(), stop_at, 0
@@ -36,7 +36,7 @@ def ended(reader):
     return not reader._thread.is_alive()
 
 
-def test_a_reader_that_nobody_follows_gives_up_and_says_so():
+def test_reader_gives_up_with_a_reason_when_its_data_are_not_processed():
     inbox, port = Inbox(limit_bytes=10_000), Endless()
     reader = SerialReader(port, inbox, lambda: 7)
     assert ended(reader)
@@ -48,11 +48,11 @@ def test_a_reader_that_nobody_follows_gives_up_and_says_so():
     assert inbox.backlog_bytes == 0
 
 
-def test_a_reader_that_is_followed_goes_on():
+def test_reader_continues_when_its_data_are_processed():
     inbox, port = Inbox(limit_bytes=500 * 135), Endless(stop_at=400)
     reader = SerialReader(port, inbox, lambda: 7)
     heard = []
-    for more in (400, 800, 1200):  # three times what the limit allows to wait
+    for more in (400, 800, 1200):  # three times the limit of waiting data
         port.stop_at = more
         heard += [inbox.get(5.0).data for _ in range(400)]
         assert inbox.backlog_bytes == 0
@@ -60,7 +60,7 @@ def test_a_reader_that_is_followed_goes_on():
     assert reader.stop()
 
 
-def test_a_reader_that_may_wait_leaves_the_rest_in_the_port():
+def test_reader_that_may_wait_leaves_further_data_in_the_port():
     inbox, port = Inbox(patient_bytes=1000), Endless()
     reader = SerialReader(port, inbox, lambda: 7)
     heard = []
@@ -75,7 +75,7 @@ def test_a_reader_that_may_wait_leaves_the_rest_in_the_port():
     assert reader.stop()
 
 
-def test_what_waits_can_be_taken_at_once_and_marks_are_nothing():
+def test_waiting_data_can_be_taken_at_once_without_markers():
     inbox = Inbox()
     inbox.wake()
     inbox.put(Bytes(1, b"a"))
@@ -88,7 +88,7 @@ def test_what_waits_can_be_taken_at_once_and_marks_are_nothing():
     assert inbox.get(0.0) is None
 
 
-def test_a_core_that_falls_behind_loses_the_link_and_no_byte(live):
+def test_core_that_falls_behind_loses_the_link_and_no_byte(live):
     behind = threading.Event()
     with live({"output": "imu"}) as daemon:
         daemon.flowing()
@@ -119,7 +119,7 @@ def test_a_core_that_falls_behind_loses_the_link_and_no_byte(live):
 
 
 class Starved:
-    """In place of the daemon's link: an open port whose thread does not come to read."""
+    """A stand-in for the daemon's link: an open port whose thread does not get to read."""
 
     is_open = True
 
@@ -133,7 +133,7 @@ class Starved:
         return self.link.close()
 
 
-def test_half_a_message_is_not_given_up_while_the_rest_waits_to_be_read(live):
+def test_partial_message_is_kept_while_its_end_waits_to_be_read(live):
     with live({"output": "imu"}) as daemon:
         daemon.flowing()
         daemon.stop()
@@ -151,7 +151,7 @@ def test_half_a_message_is_not_given_up_while_the_rest_waits_to_be_read(live):
     assert deframer.counters.damage[Cause.CUT] == cut + 1
 
 
-def test_what_lies_in_the_port_is_seen_while_the_reader_waits_on_it(tmp_path):
+def test_data_in_the_port_are_seen_while_the_reader_waits(tmp_path):
     ours, theirs = pty.openpty()
     link = SerialLink(Path(os.ttyname(theirs)), 115200, lambda: 7)
     try:

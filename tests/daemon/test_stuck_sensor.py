@@ -1,4 +1,6 @@
-"""A stuck, absurd or saturated sensor beside `ahrsd run`: said in plain words, never an end."""
+"""A stuck, absurd or saturated sensor with `ahrsd run`: reported in plain words, without an
+abort.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ def saturated_axis(field):
 
 
 class OneInFifty:
-    """A reading that no sensor gives, now and then."""
+    """An impossible reading now and then."""
 
     def __init__(self, value):
         self.value, self.count = value, 0
@@ -42,7 +44,7 @@ class OneInFifty:
 
 @contextlib.contextmanager
 def daemon(emulated, folder, change_field=None, **setup):
-    """A running `ahrsd run` beside a device whose sensors are changed; yields `ask`."""
+    """A running `ahrsd run` with a device whose sensors are modified; yields `ask`."""
     with emulated(**{"output": "binary", "scenario": "rov", "rate_hz": 50, **setup}) as made:
         device, port = made
         world = device._world
@@ -67,7 +69,7 @@ def daemon(emulated, folder, change_field=None, **setup):
             with (
                 contextlib.suppress(DeviceError),
                 DaemonConnection(path) as running,
-            ):  # busy, or just begun
+            ):  # busy, or just started
                 return running.ask(what)
             return None
 
@@ -88,7 +90,9 @@ def until(condition):
     return found
 
 
-@pytest.mark.filterwarnings("ignore:invalid value encountered")  # the emulator, at an infinity
+@pytest.mark.filterwarnings(
+    "ignore:invalid value encountered"
+)  # raised by the emulator for an infinity
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -100,7 +104,7 @@ def until(condition):
     ],
     ids=["constant", "saturated", "1e30", "nan", "inf"],
 )
-def test_it_is_said_and_the_daemon_runs_on(emulated, tmp_path, change, words):
+def test_sensor_fault_is_reported_and_the_daemon_continues(emulated, tmp_path, change, words):
     with daemon(emulated, tmp_path, change) as ask:
 
         def said():
@@ -116,6 +120,6 @@ def test_it_is_said_and_the_daemon_runs_on(emulated, tmp_path, change, words):
     (capture,) = (tmp_path / "captures").glob("*.mcap")
     assert list(CaptureReader(capture))
     if change is saturated_axis:
-        return  # not one sample is left, which a replay refuses in one line
+        return  # no sample remains, which a replay refuses in one line
     again = replay(capture, Config())
     assert any(words in text for text in again.core.source.sensors.findings.values())

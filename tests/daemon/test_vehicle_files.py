@@ -1,4 +1,4 @@
-"""The vehicle's files beside a live daemon: none can hold it up, and a trial ends in time."""
+"""The vehicle's files with a live daemon: none can block it, and a trial ends in time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ahrsd.foreign_file import Contents
 
 
 class HangingDisk:
-    """A vehicle that writes its word again at each look, until the disk hangs for ever."""
+    """A vehicle that renews its permission at each look, until the disk hangs for ever."""
 
     def __init__(self) -> None:
         self.hangs = threading.Event()
@@ -39,7 +39,7 @@ def disk():
     made.let_go.set()
 
 
-def test_a_reader_that_hangs_for_ever_ends_the_trial_and_undoes_the_values(live, disk, tmp_path):
+def test_hanging_reader_ends_the_trial_and_undoes_the_values(live, disk, tmp_path):
     with live({"output": "imu"}, mode="stage") as daemon:
         word = InterlockFile(tmp_path / "safe", 1.0, read=disk.read)
         daemon.files.interlock = word
@@ -56,7 +56,7 @@ def test_a_reader_that_hangs_for_ever_ends_the_trial_and_undoes_the_values(live,
 
 @pytest.fixture
 def program(emulated, tmp_path):
-    """Starts `ahrsd run` beside an emulated device; yields (process, log) makers' result."""
+    """Starts `ahrsd run` with an emulated device; yields (process, log) of each start."""
     started = []
 
     def start(port, tables):
@@ -93,13 +93,17 @@ def until(process, condition):
     [
         ("terms", "a folder"),
         ("interlock", "a device"),
-        pytest.param("interlock", "a FIFO", marks=pytest.mark.slow),  # quick: test_hostile_files
+        pytest.param(
+            "interlock", "a FIFO", marks=pytest.mark.slow
+        ),  # short ones: test_hostile_files
         pytest.param("terms", "a FIFO", marks=pytest.mark.slow),
         pytest.param("interlock", "a folder", marks=pytest.mark.slow),
         pytest.param("terms", "a device", marks=pytest.mark.slow),
     ],
 )
-def test_the_daemon_runs_on_says_so_once_and_ends_at_once(emulated, program, tmp_path, kind, key):
+def test_daemon_continues_reports_the_file_once_and_stops_at_once(
+    emulated, program, tmp_path, kind, key
+):
     path = tmp_path / "word"
     if kind == "a FIFO":
         os.mkfifo(path)
@@ -120,7 +124,7 @@ def test_the_daemon_runs_on_says_so_once_and_ends_at_once(emulated, program, tmp
 
 
 @pytest.mark.parametrize("key", ["terms.model", "config"])
-def test_a_start_does_not_block_on_a_fifo(run, tmp_path, capsys, key):
+def test_start_does_not_block_on_a_fifo(run, tmp_path, capsys, key):
     os.mkfifo(tmp_path / "fifo")
     config = tmp_path / "a.toml"
     config.write_text(f'[device]\nport = "/dev/null"\n[terms]\nmodel = "{tmp_path / "fifo"}"\n')

@@ -1,4 +1,4 @@
-"""The samples of an earlier run: a run that was killed goes on where it was, or says why not."""
+"""Samples of an earlier run: a killed run continues from them, or reports why not."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ SCENE = Setup(
     baud=115200,
     motion=(("static", 12.0), ("tumble", 2000.0)),
 )
-HALF = replace(SCENE, rate_hz=25)  # for what drives for minutes
+HALF = replace(SCENE, rate_hz=25)  # for tests that drive for minutes
 DRIVEN_S, MORE_S = 270.0, 110.0
-VERDICT_S = 45.0  # between two verdicts, at most: a slot is held out
+VERDICT_S = 45.0  # maximum between two verdicts: a slot is held out
 UNIT = Unit("VN-100", 7, "2.0.0.0")
 FACTORY = {23: (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), 44: (0, 1, 5)}
 NOW = inputs.WallClock(0, 1.8e9, "boot", 5000.0)
@@ -53,7 +53,7 @@ def recorded(folder, scene=SCENE, **tables):
 
 
 def up_to(at_s, whole, folder):
-    """The run as it was then: its capture so far, and the device, to which nothing was written."""
+    """The run up to this time: its capture so far, and the device, which was not written."""
     run = recorded(folder, HALF)
     run.emulator.advance(at_s)
     run.now_s = at_s
@@ -69,7 +69,7 @@ def up_to(at_s, whole, folder):
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """One that goes on for `MORE_S` after `DRIVEN_S`, and one that is killed then."""
+    """A run that continues for `MORE_S` after `DRIVEN_S`, and one that is killed then."""
     whole = recorded(tmp_path_factory.mktemp("whole"), HALF)
     whole.run(DRIVEN_S + 2.0 + MORE_S)
     whole.writer.close()
@@ -80,7 +80,7 @@ def runs(tmp_path_factory):
     return whole, killed, whole.qualified_s - 1.0
 
 
-def test_a_run_that_was_killed_has_its_candidate_soon(runs):
+def test_killed_run_has_its_candidate_soon(runs):
     _, killed, cold_s = runs
     assert cold_s > 200.0
     warm_s = killed.qualified_s - killed.began_s
@@ -88,7 +88,7 @@ def test_a_run_that_was_killed_has_its_candidate_soon(runs):
     assert killed.core.warm.text.endswith("this run agrees")
 
 
-def test_it_decides_as_one_that_was_never_interrupted(runs):
+def test_killed_run_decides_as_an_uninterrupted_one(runs):
     whole, killed, _ = runs
     one, two = whole.core.calibrator.estimate, killed.core.calibrator.estimate
     assert one.converged
@@ -101,7 +101,7 @@ def test_it_decides_as_one_that_was_never_interrupted(runs):
     assert killed.core.writeback.state == whole.core.writeback.state == "QUALIFIED"
 
 
-def test_its_replay_decides_the_same(runs):
+def test_replay_of_a_warm_started_run_decides_the_same(runs):
     _, killed, _ = runs
     done = replay(killed.path, killed.config)
     assert done.core.decisions.sha256 == killed.core.decisions.sha256
@@ -109,7 +109,7 @@ def test_its_replay_decides_the_same(runs):
     assert done.core.warm.text == killed.core.warm.text
 
 
-def test_a_device_that_is_another_one_begins_with_nothing(tmp_path):
+def test_another_device_starts_without_earlier_samples(tmp_path):
     run = recorded(tmp_path)
     run.run(30.0)
     run.again(tell=False)
@@ -122,7 +122,7 @@ def test_a_device_that_is_another_one_begins_with_nothing(tmp_path):
     assert any("no warm start: they are of another device" in text for _, text in run.notes)
 
 
-# -- whose they are, and how old -------------------------------------------------------------------
+# -- device and age --------------------------------------------------------------------------------
 
 
 def block(first_s=100.0, rows=300):
@@ -184,7 +184,7 @@ def warmed(run=None, clock=NOW, limit_s=LIMIT_S):
         ({"why": "a.mcap: damaged"}, {}, {}, "a.mcap: damaged"),
     ],
 )
-def test_what_is_not_used_and_why(run, now, clock, words):
+def test_unused_samples_are_reported_with_a_reason(run, now, clock, words):
     warm = warmed(told(**run), replace(NOW, **clock))
     blocks, _ = warm.take_due(present(**now), 900.0)
     assert blocks == []
@@ -194,14 +194,14 @@ def test_what_is_not_used_and_why(run, now, clock, words):
 
 
 @pytest.mark.parametrize("wall_s", [0.0, 1.8e9, 1.8e9 - 90000.0])
-def test_a_wall_clock_that_lies_makes_nothing_young(wall_s):
+def test_wrong_wall_clock_does_not_make_samples_recent(wall_s):
     now = Stamp(wall_s, "boot", 5000.0)
     assert too_old(Stamp(1.8e9, "boot", 4400.0), now, 1800.0) == ""
     assert "min old" in too_old(Stamp(wall_s, "boot", 3000.0), now, 1800.0)
     assert too_old(Stamp(wall_s, "before", 4400.0), now, 1800.0)
 
 
-def test_other_quantities_wait_for_the_right_stream():
+def test_samples_of_other_quantities_wait_for_the_right_stream():
     warm = warmed()
     assert warm.take_due(present(compensated=(True, True)), 900.0) == ([], "")
     assert "same quantities" in warm.text
@@ -210,13 +210,13 @@ def test_other_quantities_wait_for_the_right_stream():
     assert "300 samples up to 10.0 min old, from a.mcap" in text
 
 
-def test_a_device_that_restarted_gets_them_before_its_first_sample():
+def test_samples_precede_the_first_sample_of_a_restarted_device():
     blocks, _ = warmed().take_due(present(at_s=3.0), 3.0)
     assert blocks[-1].time_s[-1] == pytest.approx(3.0 - 600.0 - 1.0)
 
 
 @pytest.mark.parametrize(("limit_s", "passive"), [(0.0, False), (1800.0, True)])
-def test_it_can_be_switched_off_and_is_in_passive(limit_s, passive):
+def test_warm_start_is_off_by_setting_and_in_passive(limit_s, passive):
     warm = WarmStart(limit_s, passive=passive)
     warm.add_samples(inputs.EarlierSamples(0, block()))
     assert warm.on_samples_complete(told()) == ""
@@ -244,11 +244,11 @@ def seen(warm, seconds, rate=0.2, field=(0.27, 0.27, 0.31)):
 
 
 def right():
-    """A raw field whose corrected size is that of `estimate`."""
+    """A raw field whose corrected magnitude is that of `estimate`."""
     return tuple(estimate().hard_iron_gauss + np.array([0.0, 0.0, estimate().field_gauss]))
 
 
-def test_a_minute_of_turning_that_agrees_frees_the_candidate():
+def test_minute_of_turning_in_agreement_releases_the_candidate():
     warm = used()
     assert not warm.confirms(estimate())
     seen(warm, 59.0, field=right())
@@ -263,14 +263,14 @@ def test_a_minute_of_turning_that_agrees_frees_the_candidate():
     ("rate", "field", "words"),
     [(0.0, right(), "90 deg of turning"), (0.2, (0.6, 0.0, 0.4), "does not agree")],
 )
-def test_rest_or_another_field_does_not(rate, field, words):
+def test_rest_or_another_field_does_not_release_the_candidate(rate, field, words):
     warm = used()
     seen(warm, 300.0, rate, field)
     assert not warm.confirms(estimate())
     assert words in warm.holds
 
 
-def test_a_doubt_begins_the_minute_anew():
+def test_doubt_restarts_the_minute_of_agreement():
     warm = used()
     seen(warm, 50.0, field=right())
     warm.restart_confirmation()
@@ -280,7 +280,7 @@ def test_a_doubt_begins_the_minute_anew():
     assert warm.confirms(estimate())
 
 
-def test_a_calibrator_that_began_anew_knows_nothing_of_them():
+def test_restarted_calibrator_has_no_earlier_samples():
     warm = used()
     warm.end("another device was here")
     assert warm.confirms(estimate())
@@ -292,7 +292,7 @@ def test_a_calibrator_that_began_anew_knows_nothing_of_them():
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
-    """A capture of 40 s, whose device is read every five."""
+    """A capture of 40 s, whose device is read every five seconds."""
     run = recorded(tmp_path_factory.mktemp("short"))
     run.run(40.0)
     run.writer.close()
@@ -300,7 +300,7 @@ def short(tmp_path_factory):
 
 
 def read_again(short, folder, data=None, later_s=1.0, **changes):
-    """What is read of a copy of the capture."""
+    """What is read from a copy of the capture."""
     (folder / "ahrsd-1.mcap").write_bytes(short.path.read_bytes() if data is None else data)
     then = short.stamp
     now = replace(then, boot_s=then.boot_s + later_s, wall_s=then.wall_s + later_s)
@@ -320,7 +320,7 @@ def test_samples_between_two_readings_of_the_device_are_used(short, tmp_path):
     assert run.boot_s == pytest.approx(last_s, abs=0.01)
 
 
-def test_earlier_samples_are_inputs_like_others(short, tmp_path):
+def test_earlier_samples_are_recorded_as_inputs(short, tmp_path):
     for item in read_again(short, tmp_path):
         again = capture.input_from_json(capture.input_to_json(item))
         assert capture.input_to_json(again) == capture.input_to_json(item)
@@ -328,14 +328,14 @@ def test_earlier_samples_are_inputs_like_others(short, tmp_path):
             assert again == item
 
 
-def test_a_capture_that_was_cut_off_by_a_kill_is_used(short, tmp_path):
+def test_capture_truncated_by_a_kill_is_used(short, tmp_path):
     whole = short.path.read_bytes()
     *samples, run = read_again(short, tmp_path, whole[: 2 * len(whole) // 3])
     assert run.why == ""
     assert samples
 
 
-def test_a_damaged_capture_is_not_used(short, tmp_path):
+def test_damaged_capture_is_not_used(short, tmp_path):
     data = bytearray(short.path.read_bytes())
     middle = len(data) // 2
     data[middle : middle + 40] = bytes(40)
@@ -343,14 +343,14 @@ def test_a_damaged_capture_is_not_used(short, tmp_path):
     assert "ahrsd-1.mcap: damaged: " in run.why
 
 
-def test_nor_one_of_another_boot_or_an_old_one(short, tmp_path):
+def test_capture_of_another_boot_or_an_old_one_is_not_used(short, tmp_path):
     (run,) = read_again(short, tmp_path, boot_id="another")
     assert "from before the computer was started" in run.why
     (run,) = read_again(short, tmp_path, later_s=LIMIT_S + 60.0)
     assert "min old, more than 30 min" in run.why or "no reading" in run.why
 
 
-def test_a_folder_without_a_capture_and_one_with_a_pipe(tmp_path):
+def test_folder_without_a_capture_or_with_a_pipe_is_reported(tmp_path):
     now = Stamp(1.8e9, "boot", 100.0)
     (run,) = earlier_inputs(tmp_path, None, now, LIMIT_S, 33.0)
     assert run.why == "there is no earlier capture"
@@ -363,13 +363,13 @@ def test_a_folder_without_a_capture_and_one_with_a_pipe(tmp_path):
     assert "is not a capture of ahrsd" in run.why
 
 
-def test_what_takes_too_long_is_left(short, tmp_path):
+def test_reading_that_takes_too_long_is_abandoned(short, tmp_path):
     (tmp_path / "ahrsd-1.mcap").write_bytes(short.path.read_bytes())
     (run,) = earlier_inputs(tmp_path, None, short.stamp, LIMIT_S, 33.0, lambda: False)
     assert "took too long" in run.why
 
 
-def test_a_failed_estimator_is_not_fed_the_same_again(tmp_path):
+def test_samples_that_made_the_estimator_fail_are_not_used_again(tmp_path):
     run = recorded(tmp_path)
     run.run(20.0)
     run.feed(inputs.Examined(run.now_ns, 1, "LinAlgError: Singular matrix"))
@@ -379,7 +379,7 @@ def test_a_failed_estimator_is_not_fed_the_same_again(tmp_path):
     assert "its estimator failed: LinAlgError" in told_.why
 
 
-def test_after_a_failure_no_older_run_is_read(tmp_path):
+def test_no_run_older_than_a_failure_is_read(tmp_path):
     run = recorded(tmp_path)
     run.run(20.0)
     run.again(tell=False)
@@ -393,7 +393,7 @@ def test_after_a_failure_no_older_run_is_read(tmp_path):
     assert samples[0].block.host_s[0] > 32.0
 
 
-def test_two_runs_of_one_device_are_put_together(tmp_path):
+def test_two_runs_of_one_device_are_joined(tmp_path):
     run = recorded(tmp_path)
     run.run(20.0)
     run.again(tell=False)
@@ -407,7 +407,7 @@ def test_two_runs_of_one_device_are_put_together(tmp_path):
     assert times[-1] > 30.0
 
 
-def test_nor_a_run_that_began_warm_and_was_cut_off_at_once(short, tmp_path):
+def test_warm_started_run_that_was_cut_off_at_once_is_not_used(short, tmp_path):
     run = recorded(tmp_path)
     run.run(20.0)
     run.again()
@@ -421,7 +421,7 @@ def test_nor_a_run_that_began_warm_and_was_cut_off_at_once(short, tmp_path):
     assert "began warm and was cut off at once" in told_.why
 
 
-def test_registers_that_were_written_end_what_was_collected(tmp_path):
+def test_register_write_ends_the_collected_samples(tmp_path):
     run = recorded(tmp_path)
     run.run(20.0)
     run.writer.write_sent(run.now_ns, b"$VNWRG,23,1,0,0,0,1,0,0,0,1,0.1,0,0*XX\r\n")
@@ -431,7 +431,7 @@ def test_registers_that_were_written_end_what_was_collected(tmp_path):
     assert "register 23 was written" in told_.why
 
 
-def test_the_thread_that_reads_never_ends_a_run():
+def test_exception_in_the_reading_thread_does_not_end_the_run():
     def broken(_go_on):
         raise RuntimeError("no such thing")
 
@@ -443,13 +443,13 @@ def test_the_thread_that_reads_never_ends_a_run():
     assert recall.take(6) is None
 
 
-def test_no_thread_where_it_is_of_no_use():
+def test_no_reading_thread_when_warm_start_is_off():
     assert Recall.of(check_config({"mode": "passive"}, "test"), None) is None
     assert Recall.of(check_config({"estimator": {"warm_start_s": 0.0}}, "test"), None) is None
 
 
-def test_samples_of_before_never_save(short):
-    """The flash gates of a verdict whose samples are of before the warm start are none."""
+def test_earlier_samples_alone_never_allow_a_save(short):
+    """A verdict whose samples are all from before the warm start has no flash gates."""
     core = short.core
     core.writeback.on_doubt("samples of an earlier run", short.now_s)
     core.writeback.on_verdict(
@@ -463,10 +463,10 @@ def test_samples_of_before_never_save(short):
     assert core.writeback._safe.flash_gates == ()
 
 
-# -- what a person sees ----------------------------------------------------------------------------
+# -- output for a person ---------------------------------------------------------------------------
 
 
-def test_status_and_explain_say_what_is_used_and_what_it_holds_back(tmp_path):
+def test_status_and_explain_report_the_warm_start_and_what_it_delays(tmp_path):
     run = recorded(tmp_path)
     run.run(30.0)
     run.again()

@@ -1,4 +1,4 @@
-"""Work beside the core: in order, bounded, and told where it breaks off or hangs."""
+"""Work next to the core: in order, bounded, and reported when it fails or hangs."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ def test_work_is_done_in_order_and_counted_once(worker):
     assert worker.take_done() == []
 
 
-def test_giving_never_waits_and_who_gives_too_much_is_told(worker):
+def test_giving_work_never_blocks_and_a_full_queue_is_reported(worker):
     gate = threading.Event()
     for _ in range(MOST_WAITING):
         assert not worker.full
         worker.put(lambda: gate.wait() and None)
     assert worker.full
-    worker.put(lambda: None)  # whoever gives all the same is not held up
+    worker.put(lambda: None)  # giving more anyway does not block
     worker.wait_for_room(0.05)
     assert worker.full
     gate.set()
@@ -76,7 +76,7 @@ def test_giving_never_waits_and_who_gives_too_much_is_told(worker):
     worker.wait_for_room(60.0)  # there is room: at once
 
 
-def test_one_that_lasts_is_called_stuck_and_holds_nobody_up(worker, monkeypatch):
+def test_long_work_is_reported_as_stuck_and_does_not_block(worker, monkeypatch):
     monkeypatch.setattr("ahrsd.daemon.core_runner._STUCK_S", 0.05)
     gate = threading.Event()
     assert not worker.stuck
@@ -84,12 +84,12 @@ def test_one_that_lasts_is_called_stuck_and_holds_nobody_up(worker, monkeypatch)
     wait(lambda: worker.stuck)
     for _ in range(2 * MOST_WAITING):
         worker.put(lambda: None)
-    assert not worker.full  # bytes are taken all the same: the service manager will end it
+    assert not worker.full  # bytes are still accepted: the service manager will end the process
     gate.set()
     wait(lambda: not worker.stuck)
 
 
-def test_a_thread_that_ended_is_told(worker, monkeypatch):
+def test_ended_thread_is_reported(worker, monkeypatch):
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
     worker.put(lambda: 1 / 0)
 
@@ -103,7 +103,7 @@ def test_a_thread_that_ended_is_told(worker, monkeypatch):
     wait(told)
 
 
-def test_the_watchdog_goes_hungry_where_the_estimator_is_stuck(live, monkeypatch):
+def test_watchdog_is_not_fed_while_the_estimator_is_stuck(live, monkeypatch):
     monkeypatch.setattr("ahrsd.daemon.core_runner._STUCK_S", 0.2)
     gate, fed = threading.Event(), []
     with live({"output": "imu"}) as daemon:
@@ -113,7 +113,7 @@ def test_the_watchdog_goes_hungry_where_the_estimator_is_stuck(live, monkeypatch
         daemon.until(lambda: len(fed) > 20)
         daemon.core.calibrator.take = lambda _: gate.wait(PATIENCE_S)
         daemon.until(lambda: daemon.shell.worker.stuck)
-        daemon.flowing()  # a turn that had begun before may end
+        daemon.flowing()  # a cycle that started before may end
         count = len(fed)
         daemon.flowing()
         daemon.flowing()
@@ -123,7 +123,7 @@ def test_the_watchdog_goes_hungry_where_the_estimator_is_stuck(live, monkeypatch
 
 
 class BesideRun(VirtualRun):
-    """The calibrator's work is done when `work` is called; `fed` is every input."""
+    """The calibrator's work is done when `work` is called; `fed` has every input."""
 
     def __init__(self, mode: Mode = Mode.OBSERVE) -> None:
         self.fed: list[Input] = []
@@ -153,7 +153,7 @@ class BesideRun(VirtualRun):
             self.waiting.append(event)
 
     def work(self) -> None:
-        """All that waits."""
+        """Does all waiting work."""
         done = len(self.waiting)
         while self.waiting:
             self.waiting.popleft().work()
@@ -168,7 +168,7 @@ def estimate() -> Estimate:
     )  # fmt: skip
 
 
-def test_the_same_findings_come_at_the_same_place_of_a_replay():
+def test_replay_has_the_same_decisions_at_the_same_place():
     run = BesideRun()
     for wait_s in (3.0, 0.5, 7.0, 1.0, 12.0, 2.0, 30.0):
         run.run(wait_s)
@@ -181,7 +181,7 @@ def test_the_same_findings_come_at_the_same_place_of_a_replay():
     assert again.decisions.sha256 == run.core.decisions.sha256
 
 
-def test_what_is_told_later_is_what_would_have_been_told_at_once():
+def test_delayed_reports_equal_immediate_ones():
     run = BesideRun()
     run.run(60.0)
     run.work()
@@ -197,7 +197,7 @@ def test_what_is_told_later_is_what_would_have_been_told_at_once():
 
 
 def candidate(run: BesideRun) -> BesideRun:
-    """Observing, with a candidate in what waits to be judged."""
+    """Observing, with a candidate among the results that wait to be judged."""
     assert run.until(lambda: run.core.writeback.state.value == "OBSERVING", 10.0), run.notes
     run.run(2.0)
     run.work()
@@ -207,13 +207,13 @@ def candidate(run: BesideRun) -> BesideRun:
     return run
 
 
-def test_a_verdict_that_comes_in_time_leads_to_a_write():
+def test_timely_verdict_leads_to_a_write():
     run = candidate(BesideRun(Mode.STAGE))
     run.work()
     assert run.until(lambda: run.writes > 0, 10.0), run.states
 
 
-def test_a_verdict_on_what_was_before_the_link_was_lost_writes_nothing():
+def test_verdict_from_before_a_lost_link_writes_nothing():
     run = candidate(BesideRun(Mode.STAGE))
     run.feed(LinkLost(run.now_ns, "pulled"))
     run.feed(LinkOpened(run.now_ns, "virtual", 115200))
@@ -223,7 +223,7 @@ def test_a_verdict_on_what_was_before_the_link_was_lost_writes_nothing():
     assert "QUALIFIED" not in run.states
 
 
-def test_a_verdict_on_registers_that_are_in_force_no_more_writes_nothing():
+def test_verdict_on_outdated_registers_writes_nothing():
     run = candidate(BesideRun(Mode.STAGE))
     run.core.set_registers_in_force(run.core.registers)
     run.work()
@@ -232,7 +232,7 @@ def test_a_verdict_on_registers_that_are_in_force_no_more_writes_nothing():
     assert "QUALIFIED" not in run.states
 
 
-# -- what breaks off -------------------------------------------------------------------------------
+# -- failures --------------------------------------------------------------------------------------
 
 
 def broken(*_):
@@ -247,7 +247,7 @@ def failures(run):
 
 
 def break_off(run: BesideRun) -> None:
-    """Let the next piece of the calibrator break off, and its successors work again."""
+    """Makes the next piece of work of the calibrator fail; its successors work again."""
     run.core.calibrator.take = broken
     run.run(1.0)
     done, failure = 0, None
@@ -261,7 +261,7 @@ def break_off(run: BesideRun) -> None:
     run.work()
 
 
-def test_what_breaks_off_is_a_state_and_the_estimator_begins_anew():
+def test_failure_is_a_state_and_the_estimator_restarts():
     run = BesideRun()
     run.run(5.0)
     run.work()
@@ -273,7 +273,7 @@ def test_what_breaks_off_is_a_state_and_the_estimator_begins_anew():
     assert len(failures(run)) == 1
     second, samples = run.core.calibrator, run.core.stream.facts.samples
     assert second is not first
-    run.run(3.0)  # the pause: samples go on
+    run.run(3.0)  # the pause: samples continue
     run.work()
     assert run.core.stream.facts.samples > samples
     assert not second.started
@@ -283,7 +283,7 @@ def test_what_breaks_off_is_a_state_and_the_estimator_begins_anew():
     assert second.started
 
 
-def test_a_replay_fails_at_the_same_place_without_failing_itself():
+def test_replay_contains_the_failure_at_the_same_place():
     run = BesideRun()
     run.run(5.0)
     run.work()
@@ -298,7 +298,7 @@ def test_a_replay_fails_at_the_same_place_without_failing_itself():
     assert again.estimation.state.failures == 1
 
 
-def test_soon_again_means_a_longer_pause():
+def test_repeated_failures_lengthen_the_pause():
     state = EstimatorState()
     pauses = []
     for _ in range(6):
@@ -318,7 +318,7 @@ def second() -> SampleBlock:
 
 
 @pytest.mark.parametrize("state", ["QUALIFIED", "TRIAL"])
-def test_nothing_is_written_from_an_estimator_that_failed(state):
+def test_failed_estimator_writes_nothing_and_ends_a_trial(state):
     run = candidate(BesideRun(Mode.STAGE if state == "TRIAL" else Mode.OBSERVE))
     run.work()
     if state == "TRIAL":
@@ -347,10 +347,10 @@ def fail_waiting(run: BesideRun) -> None:
     run.feed(Examined(run.now_ns, done, failure.reason))
 
 
-def test_the_worker_goes_on_after_what_broke_off_and_logs_it_once(worker, caplog):
+def test_worker_continues_after_a_failure_and_logs_it_once(worker, caplog):
     done = []
     for k in range(6):
-        one = SimpleNamespace(broken=False)  # a calibrator of its own
+        one = SimpleNamespace(broken=False)  # a separate calibrator
         piece = EstimationTask(one, broken if k in (1, 3) else lambda k=k: done.append(k))
         worker.put(piece.work)
     batches = []
@@ -362,7 +362,7 @@ def test_the_worker_goes_on_after_what_broke_off_and_logs_it_once(worker, caplog
     assert ["Traceback" in getattr(r, "trace", "") for r in caplog.records] == [True]
 
 
-def test_behind_a_piece_that_broke_off_its_calibrator_is_worked_no_more():
+def test_failed_calibrator_gets_no_further_work():
     done = []
     one, other = SimpleNamespace(broken=False), SimpleNamespace(broken=False)
     assert EstimationTask(one, broken).work().reason == REASON

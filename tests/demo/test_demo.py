@@ -42,7 +42,7 @@ def assert_kept(result, said=()):
     assert result.good, result.failures()
 
 
-def test_what_is_promised(done):
+def test_demo_keeps_the_figures_of_the_readme(done):
     _, result, said = done
     assert_kept(result, said)
     assert sum("operator approves" in line for line in said) == 1
@@ -72,7 +72,7 @@ def test_it_leaves_exactly_these_files(done):
     assert page.index("before and after") < page.index("Field strength")  # the picture comes first
 
 
-def test_the_journal_tells_the_whole_way(done):
+def test_journal_has_the_whole_write(done):
     records = [json.loads(r) for r in (done[0] / "journal.jsonl").read_text().splitlines()]
     assert [r["kind"] for r in records] == [
         "PREPARED", "RAM_VERIFIED", "PROVEN", "FLASH_SENT", "FLASH_ACKED", "CONFIRMED",
@@ -81,14 +81,14 @@ def test_the_journal_tells_the_whole_way(done):
     assert {*records[0]["new"]} == {"23", "84"}
 
 
-def test_a_replay_takes_the_same_decisions(done):
+def test_replay_decides_the_same(done):
     directory, result, *_ = done
     replayed = replay(directory / "capture.mcap", Config())
     assert replayed.core.decisions.sha256 == result.decision_sha256
     assert replayed.core.writeback.state.value == "CONFIRMED"
 
 
-def test_the_truth_stands_beside_the_estimate(done):
+def test_result_has_truth_and_estimate(done):
     result = done[1]
     text = "\n".join(lines(result))
     for axis in range(3):
@@ -103,7 +103,7 @@ def test_five_seeds_in_a_row(tmp_path, seed):
     assert_kept(run_demo(tmp_path, seed=seed, say=lambda _: None))
 
 
-def test_a_device_that_dies_ends_it(tmp_path, monkeypatch):
+def test_demo_ends_when_the_device_dies(tmp_path, monkeypatch):
     processes = []
 
     class Mortal(EmulatorProcess):
@@ -127,8 +127,8 @@ def test_a_device_that_dies_ends_it(tmp_path, monkeypatch):
     assert "\n" not in str(caught.value)
 
 
-def test_a_world_that_stands_still_ends_it(monkeypatch):
-    """Neither how long it takes nor how busy the machine is ends a demo, but no progress does."""
+def test_demo_ends_without_progress(monkeypatch):
+    """Neither a long duration nor a busy machine ends a demo; missing progress does."""
 
     class Frozen:
         alive = True
@@ -155,7 +155,7 @@ def test_a_world_that_stands_still_ends_it(monkeypatch):
         emulated.run_watched(Waiting(), Frozen(), 11.0)
 
 
-def test_the_report_promises_of_a_seed_only_what_it_keeps(done):
+def test_report_promises_only_what_the_seed_achieves(done):
     page = (done[0] / "report.html").read_text()
     assert "the same seed gives the same hidden truth, motion and noise" in page
     assert "the same run" not in page
@@ -193,7 +193,7 @@ def test_an_output_below_a_file_is_one_line(tmp_path, run, capsys):
 
 
 @pytest.mark.slow
-def test_a_demo_without_enough_time_says_no(tmp_path, run, capsys):
+def test_demo_without_enough_time_fails(tmp_path, run, capsys):
     assert run("demo", "--output", tmp_path, "--seconds", "60", "--seed", "3") == 1
     out = capsys.readouterr().out
     assert "The demo did not reach its goal: it ended in " in out

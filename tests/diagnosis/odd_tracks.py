@@ -1,4 +1,4 @@
-"""Tracks of a sensor that stands still, and of one that is turned and shaken by hand."""
+"""Tracks of a sensor at rest, and of one that is turned and shaken by hand."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import numpy as np
 from ahrsd import so3
 from ahrsd.diagnosis.track import Track
 
-#: of what stands
+#: of a track at rest
 COUNT, RATE_HZ = 6000, 10.0
-#: of what is shaken
+#: of a shaken track
 SIGMA_MAG, SIGMA_GYRO = 6e-4, 1e-3
 
 
 def standing(bias: np.ndarray, warmth: np.ndarray | None = None, seed: int = 4) -> Track:
-    """At rest for as long as bias (N, 3) rad/s has rows."""
+    """At rest for as many rows as bias (N, 3) rad/s has."""
     rng = np.random.default_rng(seed)
     count = len(bias)
     time_s = np.arange(count) / RATE_HZ
@@ -28,13 +28,13 @@ def standing(bias: np.ndarray, warmth: np.ndarray | None = None, seed: int = 4) 
 
 
 def warming(count: int = COUNT) -> np.ndarray:
-    """Degrees; ten minutes unless said otherwise."""
+    """Degrees Celsius; ten minutes by default."""
     passed = np.arange(count) / RATE_HZ
     return 8.0 + 7.0 * (1 - np.exp(-passed / 200.0)) + 1.5 * np.sin(passed / 60.0)
 
 
 def shaking(seed: int, *, jitter_rad_s: float = 0.05) -> Track:
-    """Five minutes of turning by hand, which trembles in three of four spells of six seconds."""
+    """Five minutes of turning by hand, with tremor in three of four intervals of six seconds."""
     rng = np.random.default_rng(seed)
     count, rate_hz = 12_000, 40.0
     time_s = np.arange(count) / rate_hz
@@ -48,7 +48,7 @@ def shaking(seed: int, *, jitter_rad_s: float = 0.05) -> Track:
 
 
 def wobbling(sigma_gyro: float) -> Track:
-    """Five minutes of slow turns that wobble by .2 rad/s, a little less than once a second."""
+    """Five minutes of slow turns that wobble by 0.2 rad/s, a little less than once a second."""
     rng, rate_hz = np.random.default_rng(5), 40.0
     time_s = np.arange(12_000) / rate_hz
     phase = 2 * np.pi * np.outer(time_s, [0.73, 0.81, 0.9])
@@ -59,7 +59,7 @@ def wobbling(sigma_gyro: float) -> Track:
 def measured(
     rate: np.ndarray, rate_hz: float, rng: np.random.Generator, sigma_gyro: float = SIGMA_GYRO
 ) -> Track:
-    """What a sensor reads that turns by rate (N, 3) rad/s."""
+    """Readings of a sensor that turns by rate (N, 3) rad/s."""
     count = len(rate)
     time_s = np.arange(count) / rate_hz
     turn = so3.exp(rate / rate_hz)
@@ -76,7 +76,7 @@ def measured(
 
 
 def without_rows(track: Track, keep: np.ndarray, *, restamp: bool) -> Track:
-    """The track without rows; restamped: the time stamps do not show it."""
+    """The track without some rows; restamped, the time stamps do not show it."""
     time_s = track.time_s[: len(keep)] if restamp else track.time_s[keep]
     assert track.accel_b_m_s2 is not None
     return Track(

@@ -1,4 +1,4 @@
-"""`ahrsd diagnose` as a stranger uses it: answers, files, bad input."""
+"""`ahrsd diagnose` from the command line: answers, files and bad input."""
 
 import json
 import math
@@ -21,7 +21,7 @@ def _settings(scenario, seed):
 
 @pytest.fixture(scope="module")
 def clean():
-    """Columns of a clean recording with all attitudes."""
+    """Columns of a recording without faults in all attitudes."""
     made = simulate(_settings("wam", 5)).samples
     columns = {"time_s": made.time_s}
     for k, axis in enumerate("xyz"):
@@ -45,7 +45,7 @@ def saved(tmp_path):
 PER_AMPERE = np.array([2e-3, -1e-3, 1.5e-3])
 
 
-def beside_a_current(clean):
+def with_a_current(clean):
     """The first 1800 rows with a motor's current and its field."""
     changed = {name: values[:1800] for name, values in clean.items()}
     time_s = changed["time_s"]
@@ -55,10 +55,10 @@ def beside_a_current(clean):
     return changed | {"motor_current_a": current}
 
 
-def test_a_current_is_named_and_all_files_are_written(run, saved, clean, tmp_path, capsys):
+def test_current_is_found_and_all_files_are_written(run, saved, clean, tmp_path, capsys):
     folder = tmp_path / "report"
     answer = tmp_path / "answer.json"
-    path = saved(beside_a_current(clean))
+    path = saved(with_a_current(clean))
     assert run("diagnose", str(path), "--json", str(answer), "--report", str(folder)) == 0
     body = json.loads(answer.read_text())
     assert body["schema"] == "ahrsd.diagnosis/1"
@@ -80,9 +80,9 @@ def test_a_current_is_named_and_all_files_are_written(run, saved, clean, tmp_pat
 
 
 @pytest.mark.slow
-def test_what_the_repaired_model_says_has_the_current(run, saved, clean, tmp_path):
+def test_simulation_of_the_repaired_model_contains_the_current(run, saved, clean, tmp_path):
     folder, again, found = tmp_path / "report", tmp_path / "again.csv", tmp_path / "found.json"
-    path = saved(beside_a_current(clean))
+    path = saved(with_a_current(clean))
     assert run("diagnose", str(path), "--report", str(folder)) == 0
     model = ("--model", str(folder / "model.json"), "--along", str(path))
     assert run("simulate", *model, "-o", str(again)) == 0
@@ -92,7 +92,7 @@ def test_what_the_repaired_model_says_has_the_current(run, saved, clean, tmp_pat
 
 
 class Pictures(HTMLParser):
-    """Collects what a page loads."""
+    """Collects the sources that a page loads."""
 
     def __init__(self):
         super().__init__()
@@ -104,7 +104,7 @@ class Pictures(HTMLParser):
             self.sources.append(values.get("src") or values.get("href") or "")
 
 
-def test_nothing_wrong_says_what_would_have_been_seen(run, saved, clean, capsys):
+def test_clean_recording_agrees_and_its_sensitivity_is_printed(run, saved, clean, capsys):
     assert run("diagnose", str(saved(clean))) == 0
     said = capsys.readouterr().out
     assert "recording and model agree" in said
@@ -120,7 +120,9 @@ def test_nothing_wrong_says_what_would_have_been_seen(run, saved, clean, capsys)
         (lambda c: {**c, "mag_x_gauss": np.full(len(c["time_s"]), math.nan)}, "mag_x_gauss"),
     ],
 )
-def test_recordings_that_cannot_be_diagnosed(run, saved, clean, capsys, change, words):
+def test_recording_that_cannot_be_diagnosed_is_refused_in_one_line(
+    run, saved, clean, capsys, change, words
+):
     code = run("diagnose", str(saved(change(clean))))
     err = capsys.readouterr().err
     assert code == 2
@@ -128,7 +130,7 @@ def test_recordings_that_cannot_be_diagnosed(run, saved, clean, capsys, change, 
     assert err.count("\n") == 1
 
 
-def test_a_fit_without_an_end_is_one_line_for_a_person(run, saved, clean, capsys, monkeypatch):
+def test_diverging_fit_is_reported_in_one_line(run, saved, clean, capsys, monkeypatch):
     def diverging(*_, **__):
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
@@ -140,7 +142,7 @@ def test_a_fit_without_an_end_is_one_line_for_a_person(run, saved, clean, capsys
     assert told.count("\n") == 1
 
 
-def test_a_column_that_cannot_be_used_is_said_and_the_rest_is_answered(run, saved, clean, capsys):
+def test_unusable_column_is_noted_and_the_diagnosis_continues(run, saved, clean, capsys):
     rows = len(clean["time_s"])
     broken = np.full(rows, math.nan)
     broken[:10] = 3.0
@@ -151,7 +153,7 @@ def test_a_column_that_cannot_be_used_is_said_and_the_rest_is_answered(run, save
 
 
 @pytest.mark.slow
-def test_a_recording_at_rest_names_nothing(run, saved, clean, capsys):
+def test_recording_at_rest_has_no_finding(run, saved, clean, capsys):
     rng = np.random.default_rng(3)
     rows = len(clean["time_s"])
     still = {"time_s": clean["time_s"]}
@@ -162,7 +164,7 @@ def test_a_recording_at_rest_names_nothing(run, saved, clean, capsys):
     assert "1 effect" not in capsys.readouterr().out
 
 
-def test_a_simulation_with_the_same_effect_leaves_nothing_to_name(saved, clean):
+def test_simulation_with_a_shifted_clock_is_aligned(saved, clean):
     real, _ = load_track(saved(clean))
     shifted = {**clean, "time_s": clean["time_s"] + 1.2}
     simulated, _ = load_track(saved(shifted, "simulation.csv"))
@@ -173,8 +175,8 @@ def test_a_simulation_with_the_same_effect_leaves_nothing_to_name(saved, clean):
 
 
 @pytest.mark.parametrize("shift_s", [0.0, 1.2])
-def test_a_simulation_of_a_part_is_laid_where_it_belongs(saved, clean, shift_s):
-    """A part has another mean rate than the whole; that must not move it."""
+def test_simulation_of_a_part_is_aligned_with_that_part(saved, clean, shift_s):
+    """The mean rate of a part differs from that of the whole; this must not shift it."""
     real, _ = load_track(saved(clean))
     part = {name: values[400:1150] for name, values in clean.items()}
     part["time_s"] = part["time_s"] + shift_s
@@ -186,7 +188,7 @@ def test_a_simulation_of_a_part_is_laid_where_it_belongs(saved, clean, shift_s):
     assert any("was moved" in note for note in overlap.notes) == (shift_s > 0)
 
 
-def test_a_simulation_in_other_axes_is_laid_by_its_speed(saved, clean):
+def test_simulation_in_other_axes_is_aligned_by_the_magnitude_of_its_rate(saved, clean):
     real, _ = load_track(saved(clean))
     turned = {**clean, "time_s": clean["time_s"] + 0.8}
     turned["gyro_x_rad_s"], turned["gyro_y_rad_s"] = clean["gyro_y_rad_s"], -clean["gyro_x_rad_s"]
@@ -195,7 +197,7 @@ def test_a_simulation_in_other_axes_is_laid_by_its_speed(saved, clean):
     assert overlap.simulated.time_s[0] == pytest.approx(clean["time_s"][0], abs=0.021)
 
 
-def test_simulations_that_are_something_else_are_refused(run, saved, clean, capsys):
+def test_simulation_of_another_time_or_motion_is_refused(run, saved, clean, capsys):
     real = saved(clean)
     far = saved({**clean, "time_s": clean["time_s"] + 1000.0}, "far.csv")
     assert run("diagnose", str(real), "--simulation", str(far)) == 2
@@ -219,7 +221,7 @@ def test_simulations_that_are_something_else_are_refused(run, saved, clean, caps
         ('{"field_gauss": true}', "must be a positive number"),
     ],
 )
-def test_a_spec_that_is_wrong_is_one_line(tmp_path, text, words):
+def test_wrong_spec_is_refused(tmp_path, text, words):
     path = tmp_path / "spec.json"
     path.write_text(text)
     with pytest.raises(AhrsdError, match=words):
@@ -227,14 +229,14 @@ def test_a_spec_that_is_wrong_is_one_line(tmp_path, text, words):
 
 
 @pytest.mark.parametrize(("ratio", "lines"), [(1.03, 0), (0.98, 0), (1.2, 1), (0.04, 1)])
-def test_a_spec_of_another_rate_than_the_time_stamps_is_said(saved, clean, ratio, lines):
+def test_spec_rate_that_differs_from_the_time_stamps_is_noted(saved, clean, ratio, lines):
     rate_hz = 1.0 / float(np.median(np.diff(clean["time_s"])))
     _, notes = load_track(saved(clean), spec=Spec(rate_hz=ratio * rate_hz))
     assert len([note for note in notes if "the stamps are used" in note]) == lines
     assert not any("--rate" in note for note in notes)
 
 
-def test_a_recording_that_is_missing(tmp_path):
+def test_missing_recording_is_refused(tmp_path):
     with pytest.raises(RecordingError, match="does not exist"):
         load_track(tmp_path / "none.csv")
 
@@ -252,7 +254,7 @@ def test_a_recording_that_is_missing(tmp_path):
         ('{"field_gauss": 48000}', "field_gauss = 48000 was left out"),
     ],
 )
-def test_an_entry_of_a_spec_that_is_not_used_is_said(tmp_path, text, words):
+def test_unused_entry_of_a_spec_is_noted(tmp_path, text, words):
     path = tmp_path / "spec.json"
     path.write_text(text)
     spec, (note,) = load_spec(path)
@@ -264,7 +266,7 @@ def test_an_entry_of_a_spec_that_is_not_used_is_said(tmp_path, text, words):
     ("factor", "words"),
     [(0.0, "it is 0 throughout, not even gravity"), (1 / 9.80665, "the acceleration was in g")],
 )
-def test_an_acceleration_that_is_none_or_in_g_is_said(saved, clean, factor, words):
+def test_acceleration_of_zero_or_in_g_is_noted(saved, clean, factor, words):
     made = simulate(_settings("wam", 5)).samples
     more = {f"accel_{a}_m_s2": factor * v for a, v in zip("xyz", made.accel_b_m_s2.T, strict=True)}
     track, notes = load_track(saved({**clean, **more}))
@@ -275,7 +277,7 @@ def test_an_acceleration_that_is_none_or_in_g_is_said(saved, clean, factor, word
         assert track.accel_b_m_s2 is None
 
 
-def test_a_row_without_acceleration_is_filled(saved, clean):
+def test_row_without_acceleration_is_interpolated(saved, clean):
     made = simulate(_settings("wam", 5)).samples
     accel = made.accel_b_m_s2.copy()
     accel[100] = math.nan

@@ -1,4 +1,6 @@
-"""Steps of hard iron and gyro bias beside the running estimator: told once, rightly, or not."""
+"""Steps of hard iron and gyro bias during the running estimate: reported once, correctly, or not
+at all.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,7 @@ SIGMA = np.r_[np.full(6, 1e-3), np.full(3, 5e-4), np.full(3, 1e-4)]
 
 
 def estimate_of(made: Experiment, seed: int = 0, *, converged: bool = True) -> Estimate:
-    """An estimate off the truth by what its covariance says."""
+    """An estimate that differs from the truth by a draw from its covariance."""
     truth, off = made.truth, np.random.default_rng(seed).standard_normal(12) * SIGMA
     A = truth.soft_iron.copy()
     upper = np.triu_indices(3)
@@ -69,7 +71,7 @@ def estimate_of(made: Experiment, seed: int = 0, *, converged: bool = True) -> E
 def stepped(
     made: Experiment, at_s: float, mag: Array | float = 0.0, gyro: Array | float = 0.0
 ) -> Experiment:
-    """The recording with a step of hard iron or gyro bias put in."""
+    """The recording with a step of hard iron or gyro bias added."""
     s = made.samples
     on = (s.time_s > at_s)[:, None]
     return replace(
@@ -81,7 +83,7 @@ def stepped(
 
 
 def parked(made: Experiment, row: int, rest: int, seed: int = 9) -> Experiment:
-    """The same motion with `rest` samples of standing still put in after a row."""
+    """The same motion with `rest` samples of standing still inserted after a row."""
     rng, s, truth = np.random.default_rng(seed), made.samples, made.truth
     step_s = float(s.time_s[1] - s.time_s[0])
     still = made.field_b[row] @ truth.soft_iron.T + truth.hard_iron_gauss
@@ -108,7 +110,7 @@ def parked(made: Experiment, row: int, rest: int, seed: int = 9) -> Experiment:
 def watched(
     blocks: Iterable[SampleBlock], estimate: Estimate, detector: StepDetector | None = None
 ) -> Step | None:
-    """What a detector says about a stream, with one estimate all the time."""
+    """The step that a detector reports in a stream, with one constant estimate."""
     detector = detector or StepDetector()
     found = [step for block in blocks if (step := detector.add(block, estimate)) is not None]
     assert len(found) <= 1
@@ -117,20 +119,20 @@ def watched(
 
 @pytest.mark.parametrize("scenario", ["wam", "mam", "lam"])
 @pytest.mark.parametrize("at_s", [150.0, 203.7])
-def test_a_magnet_that_is_put_on_is_told_with_time_and_size(scenario, at_s):
+def test_added_magnet_is_reported_with_time_and_size(scenario, at_s):
     made = stepped(experiment(scenario, samples=7500, seed=3), at_s, MAGNET)
     step = watched(made.blocks(25), estimate_of(made))
     assert step is not None
     assert (step.what, step.frame, step.unit) == ("hard iron", "sensor", "gauss")
     assert step.at_s == pytest.approx(at_s, abs=1.0)
-    assert step.told_s - at_s < 3 * BLOCK_S + 0.1  # the one in which it came, and two more
+    assert step.told_s - at_s < 3 * BLOCK_S + 0.1  # the block in which it was added, and two more
     assert np.all(np.abs(step.size - MAGNET) < 4 * step.sigma + 1e-3)
     assert np.all(step.sigma < 3e-3)
     assert step.words.startswith(f"the hard iron changed by ({step.size[0] * 1e3:+.1f}, ")
     assert f" mG at {step.at_s:.0f} s: the calibration in force is void" in step.words
 
 
-def test_a_gyro_bias_step_is_told_as_one():
+def test_gyro_bias_step_is_reported_as_such():
     jump = np.array([0.0, 0.004, -0.006])
     made = stepped(experiment("mam", samples=7500, seed=4), 160.0, gyro=jump)
     step = watched(made.blocks(25), estimate_of(made))
@@ -150,7 +152,7 @@ def test_a_gyro_bias_step_is_told_as_one():
         ),
     ],
 )
-def test_an_hour_without_a_change_is_silent(scenario, seed):
+def test_no_step_is_reported_in_an_hour_without_a_change(scenario, seed):
     made = experiment(scenario, samples=45000, rate_hz=12.5, seed=seed)
     detector = StepDetector()
     assert watched(made.blocks(512), estimate_of(made, seed), detector) is None
@@ -159,9 +161,12 @@ def test_an_hour_without_a_change_is_silent(scenario, seed):
 
 
 def turning(seed: int, wrong: Array) -> tuple[SampleBlock, Estimate, Estimate, Estimate]:
-    """Circles to one side and then to the other, and a gyro that is wrong by this matrix; what is
-    known of it, what whoever took it for perfect found in the first circles: another bias, and
-    what one says to whom they do not tell a bias from a matrix."""
+    """Circles in one sense and then the other, with the gyro distorted by this matrix.
+
+    Three estimates: one that knows the matrix; one that assumed a perfect gyro in the first circles
+    and so found another bias; and the latter with the covariance of someone who cannot separate
+    bias and matrix.
+    """
     made = pieces.drive((("circles", 300.0), ("roll", 60.0), ("circles", 300.0)), seed)
     rate = made.rate_b_rad_s
     gyro = made.block.gyro_b_rad_s + rate @ (wrong - np.eye(3)).T
@@ -187,7 +192,7 @@ def turning(seed: int, wrong: Array) -> tuple[SampleBlock, Estimate, Estimate, E
     perfect = replace(
         known, gyro_correction=np.eye(3), gyro_bias_rad_s=known.gyro_bias_rad_s + passes
     )
-    # of bias and matrix only the sum at that rate is known
+    # only the sum of bias and matrix at that rate is known
     own = np.r_[np.full(3, 0.02), np.full(6, 0.01)] ** 2
     spread = np.vstack([np.zeros((9, 9)), (GYRO_BASIS @ mean).T, np.eye(9)])
     covariance = spread @ np.diag(own) @ spread.T
@@ -196,8 +201,8 @@ def turning(seed: int, wrong: Array) -> tuple[SampleBlock, Estimate, Estimate, E
     return replace(made.block, gyro_b_rad_s=gyro), known, perfect, doubting
 
 
-def test_a_wrong_scale_that_the_estimator_took_out_is_no_step_of_the_bias():
-    """Where the sense of turning changes, a scale of 1 % is another bias."""
+def test_gyro_scale_known_to_the_estimator_is_not_a_bias_step():
+    """When the sense of rotation changes, an unknown scale error of 1 % looks like another bias."""
     wrong = np.eye(3) + np.array([[0.004, 0.0, 0.01], [0.0, -0.006, 0.0], [0.0, 0.005, 0.01]])
     jump = np.array([0.0, 0.004, -0.006])
     told = 0
@@ -218,7 +223,7 @@ def test_a_wrong_scale_that_the_estimator_took_out_is_no_step_of_the_bias():
     assert told == 2
 
 
-def test_heavy_tails_colour_and_a_lag_are_no_steps():
+def test_no_step_is_reported_for_heavy_tails_colour_and_a_delay():
     made = experiment("mam", samples=45000, rate_hz=12.5, seed=3)
     rng, raw = np.random.default_rng(3), made.samples.raw_b_gauss.copy()
     raw += 1e-3 * np.clip(rng.standard_t(3, raw.shape), -15, 15)
@@ -234,7 +239,7 @@ def test_heavy_tails_colour_and_a_lag_are_no_steps():
     assert detector.scored == 45000 // 128
 
 
-def test_a_magnet_put_on_at_rest_is_told_after_the_next_turns_and_dated_to_the_rest():
+def test_magnet_added_at_rest_is_reported_after_the_next_turns_with_its_time():
     plain = parked(experiment("mam", samples=7500, seed=5), 5000, 1000)
     at_s = float(plain.samples.time_s[5500])
     made = stepped(plain, at_s, MAGNET)
@@ -246,11 +251,11 @@ def test_a_magnet_put_on_at_rest_is_told_after_the_next_turns_and_dated_to_the_r
     assert np.all(np.abs(step.size - MAGNET) < 4 * step.sigma + 1e-3)
 
 
-def test_standing_still_and_a_field_that_jumps_in_the_world_are_silent():
+def test_no_step_is_reported_at_rest_and_for_a_step_of_the_world_field():
     made = parked(experiment("mam", samples=7500, seed=6), 4000, 3000)
     s = made.samples
     car = np.einsum("nji,j->ni", made.R_nb, np.array([0.03, 0.02, -0.02]))
-    for at in (3500, 5000):  # while it moves, and beside it while it stands
+    for at in (3500, 5000):  # while it moves, and while it stands
         on = (np.arange(len(s)) > at)[:, None]
         raw = s.raw_b_gauss + on * car @ made.truth.soft_iron.T
         other = replace(made, samples=replace(s, raw_b_gauss=raw))
@@ -258,7 +263,7 @@ def test_standing_still_and_a_field_that_jumps_in_the_world_are_silent():
 
 
 def broken(made: Experiment) -> Iterator[SampleBlock]:
-    """Blocks with gaps, a restart of the device and a change of registers between them."""
+    """Blocks with gaps, a device restart and a register change between them."""
     for number, block in enumerate(made.blocks(25)):
         if number % 37 == 5:
             continue
@@ -270,7 +275,7 @@ def broken(made: Experiment) -> Iterator[SampleBlock]:
         )
 
 
-def test_gaps_restarts_and_register_changes_are_silent_and_a_step_between_them_is_not():
+def test_step_is_reported_and_gaps_restarts_and_register_changes_are_not():
     made = experiment("mam", samples=12000, seed=7)
     detector = StepDetector()
     assert watched(broken(made), estimate_of(made), detector) is None
@@ -280,7 +285,7 @@ def test_gaps_restarts_and_register_changes_are_silent_and_a_step_between_them_i
     assert np.all(np.abs(step.size - MAGNET) < 4 * step.sigma + 1e-3)
 
 
-def test_it_is_deterministic_and_does_not_care_how_the_stream_is_cut():
+def test_step_does_not_depend_on_the_block_size():
     made = stepped(experiment("lam", samples=7500, seed=8), 170.0, MAGNET)
     steps = [watched(made.blocks(rows), estimate_of(made)) for rows in (1, 10, 10, 400)]
     assert steps[0] is not None
@@ -288,7 +293,7 @@ def test_it_is_deterministic_and_does_not_care_how_the_stream_is_cut():
     assert all(step is not None and np.array_equal(step.size, steps[0].size) for step in steps)
 
 
-def test_bad_numbers_cost_their_block_only():
+def test_bad_readings_invalidate_only_their_block():
     made = stepped(experiment("mam", samples=7500, seed=3), 150.0, MAGNET)
     raw = made.samples.raw_b_gauss.copy()
     raw[1000], raw[2000] = np.nan, 1e30
@@ -298,7 +303,7 @@ def test_bad_numbers_cost_their_block_only():
     assert detector.scored == round(detector.found.told_s / BLOCK_S) - 2
 
 
-def test_nothing_is_said_before_there_is_a_converged_estimate_and_memory_is_bounded():
+def test_no_step_before_a_converged_estimate_and_memory_is_bounded():
     made = stepped(experiment("mam", samples=20000, rate_hz=12.5, seed=3), 700.0, MAGNET)
     detector = StepDetector()
     assert watched(made.blocks(64), estimate_of(made, converged=False), detector) is None
@@ -311,8 +316,8 @@ def test_nothing_is_said_before_there_is_a_converged_estimate_and_memory_is_boun
     assert detector._builder._count < 128
 
 
-def test_a_block_says_what_the_model_says():
-    """Columns against finite differences: score and information predict what a change does."""
+def test_score_and_information_of_a_block_predict_a_change_of_the_parameters():
+    """Columns compared with finite differences."""
     made = experiment("mam", samples=400, seed=2)
     s = made.samples
     angle = np.cumsum(s.gyro_b_rad_s * np.nan_to_num(s.dt_s)[:, None], axis=0)
@@ -339,7 +344,7 @@ def test_a_block_says_what_the_model_says():
     assert np.allclose(found, expected, atol=0.02 * np.abs(expected).max())
 
 
-def test_rotations_are_carried_along():
+def test_rotations_are_accumulated():
     turns = np.linalg.qr(np.random.default_rng(0).standard_normal((37, 3, 3)))[0]
     expected = np.eye(3)
     for turn, one in zip(turns, accumulate_rotations(turns), strict=True):
@@ -355,7 +360,7 @@ def test_rotations_are_carried_along():
     ],
 )
 @pytest.mark.recordings
-def test_real_motion_is_silent_and_an_injected_step_is_told(name):
+def test_injected_step_in_a_real_recording_is_reported_and_nothing_without_it(name):
     path = RECORDINGS / "broad" / f"{name}.csv.gz"
     if not path.exists():
         pytest.skip(f"{path.name} is not here")
@@ -416,8 +421,8 @@ def gate_of(calibrator: Calibrator) -> bool:
     return gates["stationarity.step"]
 
 
-def test_a_step_shuts_the_gate_until_the_estimate_is_made_anew(monkeypatch):
-    """An estimator that does not begin anew by itself, here kept from it: it is begun anew."""
+def test_step_closes_the_gate_until_the_estimator_has_restarted(monkeypatch):
+    """The estimator is prevented from restarting by itself, so that the calibrator restarts it."""
     monkeypatch.setattr("ahrsd.core.estimation._PATIENCE_S", 20.0)
     monkeypatch.setattr("ahrsd.estimator.online._CHANGED_EPOCHS", 1_000)
     made = stepped(experiment("mam", samples=18000, rate_hz=40.0, seed=5), 300.0, 0.27 * MAGNET)
@@ -441,7 +446,7 @@ def test_a_step_shuts_the_gate_until_the_estimate_is_made_anew(monkeypatch):
     assert np.all(np.abs(estimate.hard_iron_gauss - truth) < 5 * estimate.sigma[6:9])
 
 
-def test_the_warning_goes_through_the_core_to_log_status_and_explain():
+def test_step_warning_reaches_log_status_and_explain():
     made = stepped(experiment("mam", samples=16000, rate_hz=40.0, seed=5), 300.0, MAGNET)
     core = Core(core_settings(Config(), policy=WriteBackPolicy(mode=Mode.PASSIVE)))
     warnings: list[Noted] = []
@@ -461,7 +466,9 @@ def test_the_warning_goes_through_the_core_to_log_status_and_explain():
     told = core.calibrator.step
     assert told is not None
     assert warnings[0].text == told.words
-    assert warnings[1].text.endswith("calibrated anew from there")  # the estimator's own
+    assert warnings[1].text.endswith(
+        "calibrated anew from there"
+    )  # the restart by the estimator itself
     assert len(warnings) == 2
     assert shut
     assert said["mismatch"]["open"] is True

@@ -1,4 +1,4 @@
-"""The report of a diagnosis in a real browser, and its words."""
+"""The report of a diagnosis in a real browser, and its text."""
 
 import inspect
 import re
@@ -40,7 +40,7 @@ from ahrsd.viewer.diagnosis import write_rrd
 
 
 def diagnosis(**changes):
-    """A diagnosis with one of everything; text that HTML must not take for its own."""
+    """A diagnosis with one of everything, and text that HTML must escape."""
     rng = np.random.default_rng(1)
     time_s = np.arange(4000) / 12.0
     finding = Finding(
@@ -105,7 +105,7 @@ def diagnosis(**changes):
     return Diagnosis(**(fields | changes))
 
 
-def test_the_words_of_a_diagnosis():
+def test_text_of_a_diagnosis():
     assert answer_lines(diagnosis())[:13] == [
         "dive <7>.csv: MISMATCH: 1 effect left out and an unknown cause (p = 1e-09)",
         "",
@@ -124,7 +124,7 @@ def test_the_words_of_a_diagnosis():
     ]
 
 
-def test_one_line_where_before_and_after_are_the_same():
+def test_residual_figure_has_one_curve_when_nothing_changed():
     found = diagnosis()
     drawn = found.drawn
     assert drawn is not None
@@ -145,25 +145,25 @@ def page_of(found, folder):
 
 @pytest.fixture(scope="module")
 def usual(tmp_path_factory):
-    """The page of `diagnosis()`, made once: its pictures take seconds."""
+    """The page of `diagnosis()`, made once: its figures take seconds."""
     folder = tmp_path_factory.mktemp("usual")
     page_of(diagnosis(), folder)
     return folder / "report.html"
 
 
 @pytest.fixture
-def unprinted(monkeypatch):
-    """Pictures are drawn and not printed, which takes a page seconds: of its words only."""
+def without_figures(monkeypatch):
+    """Figures are drawn but not encoded, which takes seconds per page."""
     monkeypatch.setattr("ahrsd.report.figures.as_data_uri", lambda draw: draw() and "data:,")
 
 
-def test_the_page_tells_how_an_effect_was_read(usual):
+def test_page_reports_the_setting_of_an_effect(usual):
     text = usual.read_text()
     assert "by the column motor_&lt;1&gt;_a; logged 0.25 s late; each value the mean of" in text
 
 
-@pytest.mark.usefixtures("unprinted")
-def test_a_spectrum_that_is_worse_after_says_so(tmp_path):
+@pytest.mark.usefixtures("without_figures")
+def test_page_reports_a_spectrum_that_is_worse_after(tmp_path):
     found = diagnosis()
     drawn = found.drawn
     worse = replace(drawn, after=10.0 * drawn.before)
@@ -179,7 +179,7 @@ def test_a_spectrum_that_is_worse_after_says_so(tmp_path):
     assert "farther from 1" not in page_of(replace(found, drawn=better), tmp_path)
 
 
-@pytest.mark.usefixtures("unprinted")
+@pytest.mark.usefixtures("without_figures")
 def test_a_longer_grey_bar_is_explained(usual, tmp_path):
     found = diagnosis()
     assert "A longer grey bar" not in usual.read_text()
@@ -189,9 +189,9 @@ def test_a_longer_grey_bar_is_explained(usual, tmp_path):
     )
 
 
-@pytest.mark.usefixtures("unprinted")
+@pytest.mark.usefixtures("without_figures")
 @pytest.mark.parametrize(("size", "real"), [(0.5e-3, False), (5e-3, True)])
-def test_what_stays_in_its_own_band_is_not_called_real(tmp_path, size, real):
+def test_time_course_within_its_own_band_is_not_called_real(tmp_path, size, real):
     edges = tuple(np.linspace(0.0, 333.0, 11))
     course = np.zeros((10, 3))
     course[4] = size
@@ -206,21 +206,21 @@ def test_what_stays_in_its_own_band_is_not_called_real(tmp_path, size, real):
     assert ("at no moment does it exceed its own" in text) is not real
 
 
-def test_statistics_are_named_in_words(usual):
+def test_statistics_are_described_in_words(usual):
     text = usual.read_text()
     assert "autocorrelation of the innovations" in text
     assert "mean square of the innovations (1: as the noise level predicts)" in text
     assert ">autocorrelation<" not in text
 
 
-def test_every_statistic_that_is_compared_has_its_words():
+def test_every_compared_statistic_has_a_description():
     source = inspect.getsource(predictive_checks.residual_statistics)
     compared = set(re.findall(r'"([a-z_]+)"[:\]]', source))
     assert compared == set(_STATISTICS)
 
 
 @pytest.mark.parametrize("draw", ["residual", "spectrum", "contribution"])
-def test_no_legend_lies_on_the_curves(draw):
+def test_legends_do_not_cover_the_curves(draw):
     found = diagnosis()
     drawn = found.drawn
     figure = {
@@ -235,7 +235,7 @@ def test_no_legend_lies_on_the_curves(draw):
     assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)
 
 
-def test_labels_of_the_map_do_not_overlap():
+def test_labels_of_the_regime_map_do_not_overlap():
     row = diagnosis().regime_map[0]
     figure = diagnosis_page.regime_map((row,) * 10)
     FigureCanvasAgg(figure).draw()
@@ -245,7 +245,7 @@ def test_labels_of_the_map_do_not_overlap():
         assert not any(one.overlaps(other) for one, other in pairwise(boxes))
 
 
-def test_where_nothing_is_found_and_the_checks_fail_nobody_says_that_all_agrees():
+def test_verdict_is_not_agreement_when_nothing_is_found_and_checks_fail():
     checks = {
         "line": Check(9.0, (1.0, 3.0), False, False),
         "tail": Check(1.0, (0.0, 3.0), True, True),
@@ -257,7 +257,7 @@ def test_where_nothing_is_found_and_the_checks_fail_nobody_says_that_all_agrees(
     )
 
 
-def test_nothing_found_says_what_would_have_been_seen():
+def test_sensitivity_is_reported_when_nothing_is_found():
     limits = (
         Limit("mag_time_lag", "lag", 1.5e-3, "s"),
         Limit("gyro_scale", "scale_x", None, "1"),
@@ -278,19 +278,19 @@ def test_nothing_found_says_what_would_have_been_seen():
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
 @pytest.mark.parametrize("width_px", [360, 1000])
-def test_the_page_in_a_browser(tmp_path, usual, width_px):
+def test_page_is_complete_in_a_browser(tmp_path, usual, width_px):
     seen = look_at(usual, width_px, tmp_path)
     assert seen["errors"] == []
     assert len(seen["pictures"]) == 6
     assert all(complete and width > 0 for _, width, complete in seen["pictures"])
     assert seen["window"] == width_px
     assert seen["width"] <= width_px
-    assert seen["cut"] == []  # no table that has to be pushed aside to be read
+    assert seen["cut"] == []  # no table that has to be scrolled sideways
     assert "Unknown, here" in seen["headings"]
     assert "<b>throttle" not in usual.read_text()
 
 
-def test_the_rerun_recording_is_written(tmp_path):
+def test_rerun_recording_is_written(tmp_path):
     write_rrd(tmp_path / "d.rrd", diagnosis())
     assert (tmp_path / "d.rrd").stat().st_size > 10_000
 
@@ -299,8 +299,8 @@ NAMES = ("$x_{", "a$b$c", "two\nlines\x1b[31m", "\\frac{$", "n" * 1_000_000)
 
 
 @pytest.mark.parametrize("name", NAMES, ids=lambda name: name[:6].encode().hex())
-def test_whatever_a_file_calls_its_columns_it_is_shown_in_one_short_line(name):
-    """No formula of matplotlib's, no control character."""
+def test_any_column_name_is_shown_in_one_short_line(name):
+    """No matplotlib formula, and no control character."""
     maps = (RegimeMap(name, (0.0, 6.0, 27.0), (0.5, 400.0), (1.0, 2.0)),)
     figure = diagnosis_page.regime_map(maps)
     figure.draw_without_rendering()
@@ -312,7 +312,7 @@ def test_whatever_a_file_calls_its_columns_it_is_shown_in_one_short_line(name):
     assert max(map(len, told)) < 300
 
 
-def test_a_long_name_makes_no_large_page(tmp_path):
+def test_long_column_name_does_not_enlarge_the_page(tmp_path):
     left = replace(diagnosis().unexplained, follows=(Suspect(NAMES[-1], 0.9, 0.01),))
     page = tmp_path / "report.html"
     write_diagnosis_report(page, diagnosis(unexplained=left, drawn=None), "ahrsd diagnose x")
@@ -321,7 +321,7 @@ def test_a_long_name_makes_no_large_page(tmp_path):
     assert escape(label(NAMES[-1])) in text
 
 
-def test_a_long_name_keeps_its_beginning_and_its_end():
+def test_long_column_name_keeps_its_beginning_and_end():
     assert label("motor_current_a") == "motor_current_a"
     assert label("a\tb") == "a\\tb"
     long = label("begin" + "x" * 100 + "_a")

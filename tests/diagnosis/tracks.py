@@ -1,4 +1,4 @@
-"""Tracks for the tests of the mismatch engine: simulated nulls, and the real recordings."""
+"""Tracks for the tests of the diagnosis: simulated nulls, and the real recordings."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def experiment(
     sigma_gyro: float = 5e-4,
     motion: str = "rov",
 ) -> Experiment:
-    """A simulated null; VN-100 class noise unless said otherwise."""
+    """A simulated null with VN-100 class noise by default."""
     return simulate(
         ScenarioSettings(scenario, motion, seed, samples, rate_hz, sigma_mag, sigma_gyro)
     )
@@ -41,7 +41,7 @@ def track_of(made: Experiment) -> Track:
 
 
 def true_model(made: Experiment) -> NullModel:
-    """The truth with trace 3."""
+    """The true model, normalised to trace 3."""
     truth = made.truth
     return NullModel(
         truth.soft_iron * 3 / np.trace(truth.soft_iron),
@@ -53,7 +53,7 @@ def true_model(made: Experiment) -> NullModel:
 
 
 def moved_model(model: NullModel, direction: np.ndarray) -> NullModel:
-    """The model with its 11 parameters moved, in the order of `nuisance_columns`."""
+    """The model with its 11 parameters changed, in the order of `nuisance_columns`."""
     from ahrsd.estimator.locked import TRACELESS
 
     return replace(
@@ -65,7 +65,7 @@ def moved_model(model: NullModel, direction: np.ndarray) -> NullModel:
 
 
 def recorded(name: str) -> Track:
-    """A real recording by its path below the recordings; skips where they are absent."""
+    """A real recording by its path below the recordings; the test is skipped without it."""
     path = RECORDINGS / f"{name}.csv.gz"
     if not path.exists():
         pytest.skip(f"the real recordings are not here: {path.name}")
@@ -86,7 +86,9 @@ def coloured(
     band_hz: tuple[float, float],
     rate_hz: float = 25.0,
 ) -> Array:
-    """Noise along the first axis between two frequencies, of unit deviation and no mean."""
+    """Noise along the first axis between two frequencies, with unit standard deviation and zero
+    mean.
+    """
     spectrum = np.fft.rfft(rng.normal(size=shape), axis=0)
     hertz = np.fft.rfftfreq(shape[0], 1 / rate_hz)
     spectrum[(hertz < band_hz[0]) | (hertz > band_hz[1])] = 0.0

@@ -1,4 +1,4 @@
-"""Noise of an epoch whose borders began at the direction of one noisy field."""
+"""Noise of epochs whose border directions started from one noisy field reading."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def _stream(seconds, rests, seed):
     )
 
 
-def _asked(block, every_s=10.0):
-    """Estimates of a stream that is asked at every epoch."""
+def _estimates(block, every_s=10.0):
+    """The estimates of a stream, one at every epoch."""
     estimator, out = Estimator(), []
     edges = np.searchsorted(block.time_s, np.arange(0.0, block.time_s[-1], every_s))
     for a, b in zip(edges, [*edges[1:], len(block)], strict=True):
@@ -56,8 +56,8 @@ def _asked(block, every_s=10.0):
 
 
 @pytest.mark.slow
-def test_noise_and_sigma_of_a_stream_do_not_grow_with_epochs_that_are_linearised_once():
-    found = _asked(_stream(300.0, ((120.0, 170.0),), seed=5))
+def test_noise_and_sigma_do_not_grow_when_epochs_are_linearised_once():
+    found = _estimates(_stream(300.0, ((120.0, 170.0),), seed=5))
     late = [e for e in found if e is not None and e.duration_s > 100.0]
     assert len(late) > 15
     assert [e.noise_mag_gauss for e in late] == pytest.approx([MAG_GAUSS] * len(late), rel=0.05)

@@ -1,4 +1,4 @@
-"""One epoch: every derivative against differences, elimination against dense algebra."""
+"""One epoch: derivatives compared with differences, elimination with dense algebra."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def case(request):
     return replace(data, **CASES[request.param]), u, x, bias
 
 
-def test_derivatives_of_the_residuals(case):
+def test_derivatives_of_the_residuals_agree_with_differences(case):
     data, u, x, bias = case
     rows = chain.Rows.of([chain.Chain(data, u, bias, NOISE)])
     field, motion = chain.field_and_motion(rows, x)
@@ -153,8 +153,8 @@ def test_weights_scale_the_field_residuals():
     np.testing.assert_allclose(q.g, g, atol=2e-7 * np.abs(g).max())
 
 
-def test_cost_is_that_of_the_best_interior():
-    """Half the sum of squares after the interior's own step, borders fixed, to first order."""
+def test_cost_is_that_of_the_optimal_interior():
+    """To first order, half the sum of squares after the interior's step with fixed borders."""
     data, u, x, bias = epoch()
     q = chain.linearise(data, u, x, bias, NOISE)
     r, J = dense(data, u, x, bias)
@@ -165,7 +165,7 @@ def test_cost_is_that_of_the_best_interior():
 
 
 def test_gauss_newton_finds_the_minimum():
-    """Iterating over all of an epoch ends where the gradient is zero and recovers the truth."""
+    """Iterating over a whole epoch ends at zero gradient and recovers the truth."""
     data, u, x, bias = epoch(200, seed=4)
     for _ in range(8):
         q = chain.linearise(data, u, x, bias, NOISE)
@@ -178,8 +178,8 @@ def test_gauss_newton_finds_the_minimum():
     assert np.all(np.abs(error) < 4 * np.sqrt(np.diag(covariance)[6:12]))
 
 
-def test_several_epochs_at_once_are_each_as_by_itself():
-    """Of different lengths, biases, noises and weights, grouped and with a cut."""
+def test_several_epochs_at_once_equal_each_by_itself():
+    """Epochs of different length, bias, noise and weights, grouped and with a cut."""
     chains = []
     for seed, count in enumerate((12, 40, 7)):
         data, u, x, bias = epoch(count, seed, measures_first=seed != 1)
@@ -202,7 +202,7 @@ def test_several_epochs_at_once_are_each_as_by_itself():
             assert getattr(q, name) == pytest.approx(getattr(alone, name), rel=1e-9)
 
 
-def test_weights_of_outliers_are_those_of_the_residuals_there():
+def test_outlier_weights_follow_from_their_residuals():
     data, u, x, bias = epoch()
     data.field_b_gauss[5] += 0.1
     q = chain.linearise_all([chain.Chain(data, u, bias, NOISE)], x, outlier_sigma=4.6)[0]
@@ -213,7 +213,7 @@ def test_weights_of_outliers_are_those_of_the_residuals_there():
     np.testing.assert_allclose(q.H, given.H, rtol=1e-12)
 
 
-def test_symmetric_and_its_columns():
+def test_symmetric_matrix_and_its_columns():
     m6 = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     M = chain.symmetric(m6)
     np.testing.assert_array_equal(M, [[1, 2, 3], [2, 4, 5], [3, 5, 6]])
@@ -222,12 +222,12 @@ def test_symmetric_and_its_columns():
     np.testing.assert_allclose(chain.symmetric_columns(u) @ m6, u @ M)
 
 
-def test_robust_weights():
+def test_robust_weights_have_their_closed_form():
     residual = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [0.0, 20.0, 0.0]])
     np.testing.assert_allclose(chain.robust_weights(residual.T, 10.0), [1.0, 1.0, 0.25])
 
 
-def test_directions_that_nothing_determines_are_an_error():
+def test_undetermined_directions_raise_an_error():
     data, u, x, bias = epoch()
     data = replace(data, linked=np.zeros(len(u)))
     with pytest.raises(np.linalg.LinAlgError, match="not determined"):

@@ -1,4 +1,4 @@
-"""The misfit: what it is for a right model, and how far it goes by chance."""
+"""The misfit: its value for a correct model, and its spread by chance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ EPOCHS = 20
 
 
 def _misfit(rng, louder=1.0):
-    """Of epochs whose gradients have `louder` times the sigma that their information says."""
+    """Misfit of epochs whose gradients have `louder` times the sigma of their information."""
     node = Node.at(np.zeros(3), np.array([0.0, 0.6, 0.8]))
     point, factors = LinearisationPoint(np.zeros(9), node, node), []
     for k in range(EPOCHS):
@@ -27,7 +27,7 @@ def _misfit(rng, louder=1.0):
     return Misfit().value(factors, misfit_scores(factors), graph, still)
 
 
-def test_sigma_of_the_misfit_by_chance():
+def test_misfit_of_a_correct_model_has_the_predicted_mean_and_spread():
     rng = np.random.default_rng(0)
     found = np.array([_misfit(rng) for _ in range(150)])
     freedom = 12 * EPOCHS
@@ -35,7 +35,7 @@ def test_sigma_of_the_misfit_by_chance():
     assert found[:, 0].std() == pytest.approx(found[0, 1], rel=0.2)
 
 
-def test_epochs_that_disagree():
+def test_misfit_shows_epochs_that_disagree():
     figure, chance = _misfit(np.random.default_rng(1), louder=2.0)
     assert figure == pytest.approx(4.2, rel=0.3)
     assert figure > 1.0 + 10 * chance

@@ -1,4 +1,6 @@
-"""Samples to steps and epochs: any split gives the same. Where down is on a vehicle that turns."""
+"""From samples to steps and epochs, independent of the block size; the direction of gravity in a
+turn.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ DT = 0.005
 
 
 def rows(count, seed=0):
-    """Samples (count, 11) of a violent motion."""
+    """Samples (count, 11) of fast motion."""
     rng = np.random.default_rng(seed)
     dt = DT * (1 + 0.1 * rng.uniform(-1, 1, count))
     return np.column_stack([np.cumsum(dt), dt, rng.normal(size=(count, 9)) * 2.0])
@@ -58,7 +60,7 @@ def test_samples_per_step_is_odd_and_keeps_the_rate(rate, expected):
     assert expected == 1 or rate / expected >= 33.0
 
 
-def test_steps_are_the_exact_composition():
+def test_steps_are_exact_compositions_of_rotations():
     samples, n = rows(60), 5
     steps = StepAverager(n).add(samples)
     assert len(steps) == 12
@@ -74,7 +76,7 @@ def test_steps_are_the_exact_composition():
 
 @settings(deadline=None)
 @given(st.sampled_from([1, 3, 5]), st.lists(st.integers(1, 99), max_size=12))
-def test_any_split_gives_the_same_steps(n, cuts):
+def test_steps_do_not_depend_on_the_block_size(n, cuts):
     samples = rows(100)
     whole = StepAverager(n).add(samples)
     averager = StepAverager(n)
@@ -85,7 +87,7 @@ def test_any_split_gives_the_same_steps(n, cuts):
         np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
 
 
-def test_split_is_undone_by_join():
+def test_join_reverses_split():
     steps = StepAverager(3).add(rows(99))
     front, back = split_steps(steps, 7)
     assert (len(front), len(back)) == (7, 26)
@@ -94,8 +96,8 @@ def test_split_is_undone_by_join():
 
 @settings(deadline=None)
 @given(st.lists(st.integers(1, 999), max_size=20))
-def test_any_split_gives_the_same_epochs(cuts):
-    """The rate too is measured on the same samples, one-sample blocks included."""
+def test_epochs_do_not_depend_on_the_block_size(cuts):
+    """The rate is measured on the same samples as well, including blocks of one sample."""
     samples = rows(1000)
     parameters = EstimatorParameters(epoch_steps=64)
     epochs = []
@@ -111,7 +113,7 @@ def test_any_split_gives_the_same_epochs(cuts):
         np.testing.assert_array_equal(a.down_b, b.down_b)
 
 
-def test_samples_one_by_one_give_the_same_epochs():
+def test_epochs_are_the_same_for_single_samples():
     samples = rows(400)
     gates = [EpochBuilder(EstimatorParameters(epoch_steps=64)) for _ in range(2)]
     (whole,) = gates[0].add(block(samples, gap=True))
@@ -119,17 +121,17 @@ def test_samples_one_by_one_give_the_same_epochs():
     np.testing.assert_array_equal(found[0].angle_b_rad, whole.angle_b_rad)
 
 
-def test_a_gap_ends_the_epoch_and_starts_afresh():
+def test_gap_ends_the_epoch_and_starts_a_new_one():
     gate = EpochBuilder(EstimatorParameters(epoch_steps=128))
     (first,) = gate.add(block(rows(1000), gap=True))
     assert (first.measures_first, len(first)) == (True, 129)
-    rest = gate.interrupt()  # 200 steps of 5 samples: 71 are left
+    rest = gate.interrupt()  # 200 steps of 5 samples: 71 remain
     assert (rest.measures_first, len(rest)) == (False, 71)
     assert gate.interrupt() is None
     assert gate.add(block(rows(1000), gap=True))[0].measures_first
 
 
-def test_a_piece_too_short_for_an_epoch_is_dropped():
+def test_piece_too_short_for_an_epoch_is_dropped():
     gate = EpochBuilder(EstimatorParameters(epoch_steps=128))
     assert gate.add(block(rows(319), gap=True)) == []
     assert gate.interrupt() is None
@@ -153,20 +155,20 @@ def good():
         (1, np.inf, "dt_s of row 4"),
     ],
 )
-def test_bad_samples_are_named(good, column, value, text):
+def test_error_names_the_bad_sample(good, column, value, text):
     good[4, column] = value
     with pytest.raises(ValueError, match=text):
         check_samples(block(good, gap=True))
 
 
-def test_an_unknown_step_is_allowed_after_a_gap_only(good):
+def test_unknown_time_step_is_allowed_only_after_a_gap(good):
     check_samples(block(good, gap=True))
     with pytest.raises(ValueError, match="dt_s of row 0"):
         good[0, 1] = np.nan
         check_samples(block(good, gap=False))
 
 
-def test_missing_specific_force_is_no_error(good):
+def test_missing_specific_force_is_accepted(good):
     good[:, 8:11] = np.nan
     check_samples(block(good, gap=True))
 
@@ -192,7 +194,7 @@ RATE_HZ, N = 33.0, 600
 
 
 def circling(rate_rad_s, sideways_m_s2):
-    """A level vehicle on a circle: the force of the bend is constant in its own frame."""
+    """A level vehicle on a circle: the centripetal force is constant in the vehicle's frame."""
     dt = np.full(N, 1 / RATE_HZ)
     dt[0] = np.nan
     time_s = np.arange(N) / RATE_HZ
@@ -212,14 +214,14 @@ def tilts_deg(block):
     return np.degrees(np.arccos(data.down_b[:, 2]))
 
 
-def test_a_bend_is_no_tilt():
+def test_centripetal_force_is_not_taken_for_tilt():
     turns_per_epoch = 3
     rate = turns_per_epoch * 2 * np.pi * RATE_HZ / 512
     assert np.max(tilts_deg(circling(rate, 3.0))) < 0.3
     assert tilts_deg(circling(0.0, 3.0)) == pytest.approx(np.degrees(np.arctan2(3.0, 9.81)))
 
 
-def test_a_gyro_bias_cancels_in_the_middle():
+def test_effect_of_gyro_bias_on_tilt_cancels_in_the_middle_of_the_epoch():
     block = circling(0.0, 0.0)
     biased = replace(block, gyro_b_rad_s=np.tile([5e-3, 0.0, 0.0], (N, 1)))
     tilt = tilts_deg(biased)
@@ -227,7 +229,7 @@ def test_a_gyro_bias_cancels_in_the_middle():
     assert tilt[0] > 1.0
 
 
-def test_without_an_accelerometer_nothing_is_down():
+def test_gravity_direction_is_nan_without_an_accelerometer():
     block = circling(0.1, 0.0)
     silent = replace(block, accel_b_m_s2=np.full((N, 3), np.nan))
     (data,) = EpochBuilder(EstimatorParameters()).add(silent)

@@ -1,4 +1,6 @@
-"""The epoch as a factor: its error is the likelihood, its derivatives are right."""
+"""The epoch as a factor: its error is the negative log likelihood, and its derivatives are
+correct.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ APART, JOINED = EpochKeys(C(0), B(0)), EpochKeys(C(0), B(0), U(0), U(1))
 
 
 def made(seed=0, rows=30, scenario="mam"):
-    """A short, fast experiment: 5 Hz, so that the direction turns visibly between readings."""
+    """A short, fast experiment at 5 Hz, so that the direction turns visibly between readings."""
     return simulate(ScenarioSettings(scenario, "rov", seed=seed, samples=rows, rate_hz=5.0))
 
 
@@ -46,7 +48,7 @@ def calibration(truth):
 
 
 def near_truth(experiment, joined, size, seed=0, last=-1):
-    """The true values, off by `size` of what matters."""
+    """The true values, with an error of `size` standard scales."""
     rng, truth = np.random.default_rng(seed), experiment.truth
     c = calibration(truth) + size * rng.standard_normal(9)
     bias = truth.gyro_bias_rad_s + size * rng.standard_normal(3)
@@ -58,9 +60,10 @@ def near_truth(experiment, joined, size, seed=0, last=-1):
 
 
 def likelihood(experiment, point):
-    """Minus its logarithm, by a search over all directions with SciPy: nothing shared with ours.
+    """Negative log likelihood by a SciPy search over all directions, sharing no code with the
+    project.
 
-    Directions as free vectors that are normalised; the gyro's residual as a cross product.
+    Directions are free vectors that are normalised, and the gyro's residual is a cross product.
     """
     s, c = experiment.samples, point.calibration
     M = np.zeros((3, 3))
@@ -85,7 +88,7 @@ def likelihood(experiment, point):
 
 @pytest.mark.parametrize("keys", [APART, JOINED], ids=["apart", "joined"])
 @pytest.mark.parametrize("size", [1e-4, 5e-3])
-def test_the_error_is_the_likelihood(keys, size):
+def test_error_of_the_factor_is_the_negative_log_likelihood(keys, size):
     experiment = made()
     point = near_truth(experiment, keys.first is not None, size)
     factor = epoch_factor(part(experiment, slice(None)), keys)
@@ -105,7 +108,7 @@ def moved(values, keys, delta):
 
 
 def gradient(linear, keys):
-    """Of a Gaussian factor, in the order of the keys: its gradient at zero is minus A^T b."""
+    """Gradient of a Gaussian factor in the order of the keys: at zero it is minus A^T b."""
     found = gtsam.GaussianFactorGraph()
     found.push_back(linear)
     at_zero = found.gradientAtZero()
@@ -114,7 +117,7 @@ def gradient(linear, keys):
 
 @pytest.mark.parametrize("keys", [APART, JOINED], ids=["apart", "joined"])
 @pytest.mark.parametrize("size", [1e-4, 3e-3])
-def test_jacobian_beside_numeric_differences(keys, size):
+def test_jacobian_agrees_with_numeric_differences(keys, size):
     experiment = made()
     values = near_truth(experiment, keys.first is not None, size).values(keys)
     factor = epoch_factor(part(experiment, slice(None)), keys)
@@ -134,7 +137,7 @@ def test_jacobian_beside_numeric_differences(keys, size):
 
 
 @pytest.mark.parametrize("keys", [APART, JOINED], ids=["apart", "joined"])
-def test_a_summary_is_the_factor_to_second_order(keys):
+def test_summary_equals_the_factor_to_second_order(keys):
     experiment = made()
     epoch = part(experiment, slice(None))
     point = near_truth(experiment, keys.first is not None, 1e-4)
@@ -149,8 +152,8 @@ def test_a_summary_is_the_factor_to_second_order(keys):
         assert frozen.error(there) - summary.cost == pytest.approx(rise, abs=0.02)
 
 
-def test_the_information_is_the_fisher_matrix():
-    """With the truth as the point, the inverse is the Cramer-Rao bound, which shares no code."""
+def test_information_at_the_truth_is_the_fisher_matrix():
+    """The inverse is the Cramer-Rao bound, which is computed by separate code."""
     experiment = simulate(ScenarioSettings("wam", "rov", seed=3, samples=2000, rate_hz=5.0))
     truth = experiment.truth
     u = experiment.field_b / truth.field_gauss
@@ -168,7 +171,7 @@ def test_the_information_is_the_fisher_matrix():
     assert np.sqrt(np.trace(covariance[9:, 9:])) == pytest.approx(bound.gyro_bias_rad_s, rel=0.02)
 
 
-def test_joined_epochs_say_what_one_long_epoch_says():
+def test_joined_epochs_equal_one_long_epoch():
     experiment = made(rows=60)
     truth = experiment.truth
     start = calibration(truth)
@@ -197,7 +200,7 @@ def test_joined_epochs_say_what_one_long_epoch_says():
     assert np.sqrt(np.diag(P_3)) == pytest.approx(sigma, rel=0.01)
 
 
-def test_where_no_calibration_can_be_the_error_is_infinite():
+def test_error_is_infinite_for_an_impossible_calibration():
     factor = epoch_factor(part(made(), slice(None)), APART)
     values = Point(np.zeros(9), np.zeros(3)).values(APART)
     assert factor.error(values) == np.inf
@@ -206,7 +209,7 @@ def test_where_no_calibration_can_be_the_error_is_infinite():
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"field": np.nan}, "field_b_gauss of row 2 cannot be used"),
         ({"gyro": np.inf}, "gyro_b_rad_s of row 2 cannot be used"),
@@ -216,17 +219,17 @@ def test_where_no_calibration_can_be_the_error_is_infinite():
         ({"rows": 3}, "3 readings: an epoch has at least 4"),
     ],
 )
-def test_bad_readings_are_named(change, said):
+def test_error_names_the_bad_reading(change, message):
     rows = change.get("rows", 10)
     field, gyro, dt = np.ones((rows, 3)), np.zeros((rows, 3)), np.full(rows, 0.1)
     for array, name in ((field, "field"), (gyro, "gyro"), (dt, "dt")):
         if name in change:
             array[2] = change[name]
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         Epoch.of(field, gyro, dt, change.get("noise", NOISE))
 
 
-def test_both_ends_or_neither():
+def test_border_directions_are_variables_at_both_ends_or_at_neither():
     with pytest.raises(ValueError, match="at both ends or at neither"):
         EpochKeys(C(0), B(0), U(0))
     summary = summarise(part(made(), slice(None)), near_truth(made(), False, 1e-4))
@@ -234,7 +237,7 @@ def test_both_ends_or_neither():
         summary.factor(JOINED)
 
 
-def test_the_example_recovers_calibration_map_and_attitude(capsys):
+def test_example_recovers_calibration_map_and_attitude(capsys):
     spec = importlib.util.spec_from_file_location("smoothing_with_epochs", EXAMPLE)
     example = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = example
@@ -259,7 +262,7 @@ def test_the_example_recovers_calibration_map_and_attitude(capsys):
     assert "hard iron b, mG" in "\n".join(example.report(result, experiment))
 
 
-def test_the_example_is_a_program(capsys):
+def test_example_runs_as_a_program(capsys):
     spec = importlib.util.spec_from_file_location("smoothing_with_epochs", EXAMPLE)
     example = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = example

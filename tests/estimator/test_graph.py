@@ -1,4 +1,6 @@
-"""Factors and their graph against dense algebra, what GTSAM must never see, finite steps."""
+"""Factors and graph compared with dense algebra, values that GTSAM must never see, and finite
+steps.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ SIGMA = np.r_[np.full(6, 0.3), np.full(3, 0.5)]
 
 
 def random_graph(nodes=6, seed=0, *, rank=12):
-    """A linear graph: factors linearised at the present values, so that nothing is approximate."""
+    """A linear graph: its factors are linearised at the present values, so that nothing is
+    approximate.
+    """
     rng = np.random.default_rng(seed)
     c = rng.normal(size=9)
     directions = rng.normal(size=(nodes, 3))
@@ -78,7 +82,7 @@ def test_step_and_covariance_equal_dense_algebra():
 
 
 @pytest.mark.parametrize("folds", [1, 3, 4])
-def test_folding_changes_no_posterior(folds):
+def test_folding_does_not_change_the_posterior(folds):
     whole, folded = random_graph(), random_graph()
     for _ in range(folds):
         folded.fold_oldest()
@@ -87,8 +91,8 @@ def test_folding_changes_no_posterior(folds):
     np.testing.assert_allclose(folded.covariance(), whole.covariance(), rtol=1e-6)
 
 
-def test_folding_late_equals_folding_early():
-    """A fold keeps what it says when the values move on."""
+def test_order_of_folding_and_moving_does_not_matter():
+    """A folded epoch keeps its information when the values change."""
     early, late = random_graph(), random_graph()
     early.fold_oldest()
     step = np.linspace(-0.2, 0.2, 9)
@@ -98,8 +102,8 @@ def test_folding_late_equals_folding_early():
     np.testing.assert_allclose(early.step()[0], late.step()[0], rtol=1e-6)
 
 
-def test_moving_to_the_solution_leaves_no_step():
-    """Tangents change with the nodes; a second step must see the same minimum, to second order."""
+def test_second_step_after_moving_to_the_solution_is_of_second_order():
+    """Tangents change with the nodes. A second step must find the same minimum to second order."""
     graph = random_graph()
     for factor in graph.factors:
         factor.g[:] *= 1e-4
@@ -112,7 +116,7 @@ def test_moving_to_the_solution_leaves_no_step():
     assert np.abs(second[0]).max() < np.abs(first[0]).max() * sizes[0]
 
 
-def test_chart_change_of_a_node():
+def test_chart_change_of_a_node_and_its_derivative():
     """z and its derivative are the old coordinates of the present direction and tangents."""
     u = np.array([0.6, 0.0, 0.8])
     old = Node.at(np.zeros(3), u)
@@ -150,9 +154,9 @@ def test_rise_integrates_the_gradient():
     assert sides[0] - sides[1] == pytest.approx(2 * g @ h, rel=1e-5)
 
 
-def test_an_epoch_that_does_not_calibrate_speaks_of_the_bias_only():
-    """Its marginal over the borders at the present c, across the field; a token on the borders,
-    which draws the ones that nothing else moves to where the epoch wants them.
+def test_epoch_that_does_not_calibrate_informs_only_the_bias():
+    """Its marginal over the borders at the present c, across the field. A token weight on the
+    borders moves those that nothing else determines to the epoch's own solution.
     """
     rng = np.random.default_rng(0)
     J = rng.normal(size=(40, 16)) * 100
@@ -183,14 +187,14 @@ def test_an_epoch_that_does_not_calibrate_speaks_of_the_bias_only():
     np.testing.assert_array_equal(drawn.H, factor.H)
 
 
-def test_chain_step_picks_the_numbers_of_an_epoch():
+def test_chain_step_selects_the_variables_of_an_epoch():
     z = np.arange(19.0)
     np.testing.assert_array_equal(chain_step(z), np.r_[0:12, 12:14, 17:19])
     bias_only = np.r_[np.zeros(9), 9.0, 10.0, 11.0, np.zeros(4)]
     np.testing.assert_array_equal(chain_step(z, calibrates=False), bias_only)
 
 
-def test_a_gap_links_nothing_but_the_bias():
+def test_gap_links_only_the_bias():
     node = Node.at(np.zeros(3), np.array([0.0, 0.6, 0.8]))
     other = Node.at(np.array([1e-3, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
     gap = gap_factor(0, np.zeros(9), node, other, 4.0)
@@ -202,9 +206,13 @@ def test_a_gap_links_nothing_but_the_bias():
     np.testing.assert_allclose(g[[9, 14]], [-4e-3, 4e-3])
 
 
-def test_held_directions_stay_and_move_no_other():
-    """What the data do not determine goes to the prior's mean; the rest is as without holding."""
-    graph = random_graph(nodes=2, rank=10)  # 10 rows for c (9) and two nodes: c is half blind
+def test_held_directions_stay_at_the_prior_and_do_not_change_others():
+    """Directions that the data do not determine go to the mean of the prior; the others are as
+    without holding.
+    """
+    graph = random_graph(
+        nodes=2, rank=10
+    )  # 10 rows for c (9) and two nodes: half of c is undetermined
     free_dc, _ = graph.step()
     covariance = graph.covariance()[:9, :9]
     graph.hold_undetermined(0.5, covariance)
@@ -218,7 +226,7 @@ def test_held_directions_stay_and_move_no_other():
     np.testing.assert_allclose(moved[~blind], (vectors.T @ (free_dc / SIGMA))[~blind], rtol=1e-6)
 
 
-def test_tempering_multiplies_the_prior_only():
+def test_tempering_scales_only_the_prior():
     graph = random_graph()
     graph.temper = 50.0
     H, g = dense(graph)
@@ -226,7 +234,7 @@ def test_tempering_multiplies_the_prior_only():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_what_is_not_finite_never_reaches_gtsam(bad):
+def test_non_finite_values_never_reach_gtsam(bad):
     graph = random_graph()
     graph.factors[1].H[3, 3] = bad
     for call in (graph.step, graph.covariance):
@@ -238,8 +246,8 @@ def test_what_is_not_finite_never_reaches_gtsam(bad):
         graph.step()
 
 
-def test_an_undetermined_direction_is_a_typed_error():
-    """The border's direction has no prior: without field nor gyro it is free."""
+def test_undetermined_direction_raises_a_typed_error():
+    """The border direction has no prior: without field and gyro it is free."""
     graph = random_graph(nodes=3)
     graph.factors[1].H[:] = 0.0
     with pytest.raises(SingularError, match="determin"):
@@ -247,8 +255,10 @@ def test_an_undetermined_direction_is_a_typed_error():
 
 
 @pytest.mark.parametrize("strong", [1e4, 1e8, 1e11])
-def test_weakly_known_directions_are_not_called_singular(strong):
-    """Pivots 2^12 apart are a rank deficiency to GTSAM; here they are an ordinary planar turn."""
+def test_weakly_determined_directions_are_not_singular(strong):
+    """GTSAM calls pivots with a ratio of 2^12 rank deficient. Here they are those of an ordinary
+    planar turn.
+    """
     graph = random_graph(nodes=3, rank=30)
     for factor in graph.factors:
         factor.H[:9, :] = factor.H[:, :9] = 0.0
@@ -268,8 +278,10 @@ def test_node_moves_on_the_sphere():
     np.testing.assert_allclose(moved.tangent, so3.tangent_basis(moved.direction[None])[0])
 
 
-def test_belief_counts_only_where_the_data_know_little():
-    """In sigmas of the prior, of the directions of which the data say nearly nothing."""
+def test_distance_from_prior_counts_only_weakly_determined_directions():
+    """In standard deviations of the prior, over the directions on which the data have nearly no
+    information.
+    """
     graph = random_graph(nodes=2, rank=10)
     variances, directions = np.full(9, 1e-3), np.linalg.qr(np.arange(81).reshape(9, 9) ** 0.5)[0]
     variances[:2] = 0.5
@@ -303,9 +315,10 @@ def test_small_steps_are_additive():
 
 
 @pytest.mark.parametrize("shift", [-0.3, 0.2, 0.9])
-def test_the_valley_of_a_planar_turn_is_followed_to_any_distance(shift):
-    """Tangent of the valley: u -> u + shift z, less what is radial. All of its way explains the
-    field: what is corrected stays on the unit sphere, at another height.
+def test_valley_of_a_planar_turn_is_followed_to_any_distance(shift):
+    """The tangent of the valley is u -> u + shift z, without its radial part. Everywhere on this
+    path the field is explained: the corrected field stays on the unit sphere, at another
+    height.
     """
     u, moments = planar(0.3)
     field = u @ M + B
@@ -320,19 +333,19 @@ def test_the_valley_of_a_planar_turn_is_followed_to_any_distance(shift):
     assert abs(np.linalg.norm(straight, axis=0).mean() - 1) > 0.1 * shift**2
 
 
-def test_where_the_matrix_would_not_stay_positive_the_step_is_plain():
+def test_valley_step_is_plain_when_the_matrix_would_not_stay_positive():
     _, moments = planar(0.6)
     dc = np.r_[chain.upper_triangle(1.5 * M), np.zeros(3)]
     np.testing.assert_array_equal(retract(C9, dc, moments), C9 + dc)
 
 
-def test_without_data_the_scale_is_left_alone():
+def test_scale_is_unchanged_without_data():
     dc = np.r_[np.zeros(6), 0.01, 0.0, 0.0]
     np.testing.assert_allclose(retract(C9, dc, Moments()), C9 + dc, atol=1e-12)
 
 
-def test_curvature_is_what_the_straight_covariance_misses():
-    """Along the valley of a planar turn, against moves of a standard normal size."""
+def test_curvature_equals_the_error_of_the_linear_covariance():
+    """Along the valley of a planar turn, compared with moves of standard normal size."""
     _, moments = planar(0.3)
     step = 0.05 * np.r_[chain.upper_triangle(0.3 * M), -M[:, 2]]
     t = np.random.default_rng(0).normal(size=4000)
@@ -344,7 +357,7 @@ def test_curvature_is_what_the_straight_covariance_misses():
 
 
 @pytest.mark.parametrize("height", [0.0, 0.3, 0.8])
-def test_the_way_to_a_calibration_is_the_step_that_leads_there(height):
+def test_valley_step_is_inverted_by_its_path(height):
     _, moments = planar(height)
     rng = np.random.default_rng(4)
     for size in (1e-3, 0.05, 0.15):
@@ -353,8 +366,10 @@ def test_the_way_to_a_calibration_is_the_step_that_leads_there(height):
         assert np.allclose(valley_step(C9, there, moments), dc, atol=1e-10)
 
 
-def test_calibrations_along_the_valley_are_as_near_as_the_data_say():
-    """Two that explain a planar turn alike: the plain difference is far across the valley."""
+def test_calibrations_along_the_valley_are_near_in_the_metric_of_the_data():
+    """Two calibrations that explain a planar turn equally well: their plain difference is far
+    across the valley.
+    """
     u, moments = planar(0.3)
     dc = np.r_[chain.upper_triangle(0.3 * 0.9 * M), -0.9 * M[:, 2]]
     there = retract(C9, dc, moments)
@@ -365,7 +380,7 @@ def test_calibrations_along_the_valley_are_as_near_as_the_data_say():
     assert straight > 0.1
 
 
-def test_no_way_leads_to_the_other_side():
+def test_no_path_leads_to_the_other_side():
     _, moments = planar(0.3)
     beyond = np.r_[-C9[:6], C9[6:]]
     np.testing.assert_array_equal(valley_step(C9, beyond, moments), beyond - C9)

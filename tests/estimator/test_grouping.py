@@ -1,4 +1,6 @@
-"""Groups of steps: exact without noise, never over a gap, nothing lost but what is said."""
+"""Groups of steps: exact without noise, never across a gap, and no information lost beyond the
+stated amount.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ NOISE = chain.Noise(2e-3, 5e-3)
 
 
 def epoch(n=60, *, cut=None, noise=0.0, speed=0.03):
-    """A turning chain with its true directions; `cut`: the row that nothing leads to."""
+    """A turning chain with its true directions; `cut`: the row to which no step leads."""
     rng = np.random.default_rng(0)
     t = np.arange(n)
     angle = speed * np.column_stack([np.sin(0.05 * t), np.cos(0.07 * t), np.sin(0.03 * t + 1)])
@@ -40,8 +42,8 @@ def epoch(n=60, *, cut=None, noise=0.0, speed=0.03):
 
 @pytest.mark.parametrize("cut", [None, 1, 2, 23, 58, 59])
 @pytest.mark.parametrize("size", [3, 5, 7])
-def test_without_noise_nothing_is_left_over(cut, size):
-    """The true directions at the groups' middles explain mean field and turns exactly."""
+def test_groups_are_exact_without_noise(cut, size):
+    """The true directions at the middles of the groups explain mean field and turns exactly."""
     data, u = epoch(cut=cut)
     small = group_steps([data], [size])[0]
     rows = np.searchsorted(data.time_s, small.time_s)
@@ -54,8 +56,8 @@ def test_without_noise_nothing_is_left_over(cut, size):
     assert cuts == (0 if cut is None else 1)
 
 
-def test_derivatives_of_a_group():
-    """Gradient of the cost at fixed directions, against differences, and that H is its slope."""
+def test_gradient_and_hessian_of_a_group_agree_with_differences():
+    """The gradient of the cost at fixed directions, and H as its slope."""
     data, u = epoch(noise=2e-3)
     small = group_steps([data], [5])[0]
     rows = np.searchsorted(data.time_s, small.time_s)
@@ -70,7 +72,7 @@ def test_derivatives_of_a_group():
     assert curved == pytest.approx(step @ q.H[:12, :12] @ step, rel=0.05)
 
 
-def test_the_information_of_a_group_is_that_of_its_steps():
+def test_information_of_a_group_equals_that_of_its_steps():
     data, u = epoch(n=500)
     small = group_steps([data], [5])[0]
     rows = np.searchsorted(data.time_s, small.time_s)
@@ -87,15 +89,15 @@ def test_the_information_of_a_group_is_that_of_its_steps():
     [
         (chain.Noise(2e-3, 2e-3), 0.01, 7),
         (chain.Noise(2e-3, 0.02), 0.01, 3),
-        (chain.Noise(2e-3, 0.2), 0.01, 1),  # the gyro is poor
-        (chain.Noise(2e-3, 2e-3), 0.2, 1),  # it turns fast
+        (chain.Noise(2e-3, 0.2), 0.01, 1),  # a poor gyro
+        (chain.Noise(2e-3, 2e-3), 0.2, 1),  # fast turns
     ],
 )
-def test_the_size_of_a_group(noise, speed, expected):
+def test_group_size_follows_from_noise_and_speed(noise, speed, expected):
     assert group_size(epoch(speed=speed)[0], noise, 0.5) == expected
 
 
-def test_what_repeats_with_the_attitude_counts_once_per_cell():
+def test_errors_that_repeat_with_the_attitude_count_once_per_cell():
     ring = np.linspace(0, 2 * np.pi, 1200, endpoint=False)
     level = np.column_stack([np.cos(ring), np.sin(ring), np.full(1200, 0.05)])
     cells = DirectionCells.of(level, 5.0) + DirectionCells.of(level, 5.0)
@@ -109,7 +111,7 @@ def test_what_repeats_with_the_attitude_counts_once_per_cell():
     assert smooth == pytest.approx(2000 * (1 - 1.5e-2))
 
 
-def test_several_epochs_at_once_are_grouped_as_each_by_itself():
+def test_several_epochs_are_grouped_as_each_by_itself():
     epochs = [epoch(n=n, cut=cut, noise=2e-3)[0] for n, cut in ((60, 23), (3, None), (41, None))]
     for few, data in zip(group_steps(epochs, [5, 3, 7]), epochs, strict=True):
         alone = group_steps([data], [5 if len(data) == 60 else 7])[0]

@@ -1,4 +1,4 @@
-"""A magnetometer that is read more slowly than the gyro: its readings count once."""
+"""A magnetometer that is read more slowly than the gyro: each reading counts once."""
 
 from __future__ import annotations
 
@@ -51,18 +51,18 @@ def pieces(rows, size):
 @pytest.mark.parametrize(
     ("rate_hz", "hold"), [(100.0, 10), (100.0, 20), (200.0, 40), (100.0, 2), (50.0, 5), (400.0, 8)]
 )
-def test_how_long_a_reading_is_held_is_told_by_the_first_rows(rate_hz, hold):
+def test_hold_length_is_found_from_the_first_rows(rate_hz, hold):
     rows = recorded(rate_hz, hold, seconds=20.0)
     found = [rows_per_reading(rows[:n], 33) for n in (20, 512, 2000)]
     assert found == [None, hold, hold]
 
 
-def test_each_row_its_own_reading_is_told_by_as_many_rows_as_the_rate_needs():
+def test_absence_of_held_readings_is_found_after_the_rows_that_the_rate_needs():
     rows = recorded(100.0, 1, seconds=5.0)
     assert [rows_per_reading(rows[:n], 33) for n in (32, 33, 500)] == [None, 1, 1]
 
 
-def test_coarse_numbers_at_rest_are_no_held_readings():
+def test_coarse_values_at_rest_are_not_held_readings():
     draw = np.random.default_rng(3)
     rows = recorded(40.0, 1, seconds=60.0)
     coarse = np.round(np.array([0.2, 0.0, 0.4]) + 4e-4 * draw.normal(size=(len(rows), 3)), 3)
@@ -70,7 +70,7 @@ def test_coarse_numbers_at_rest_are_no_held_readings():
     assert rows_per_reading(rows, 33) == 1
 
 
-def test_a_stuck_reading_is_not_waited_for():
+def test_stuck_reading_does_not_delay_the_decision_for_ever():
     rows = recorded(100.0, 1, seconds=20.0)
     rows[:, 2:5] = rows[0, 2:5]
     assert rows_per_reading(rows[:511], 33) is None
@@ -90,7 +90,7 @@ def test_rotations_are_composed_and_time_adds_up():
     np.testing.assert_allclose(so3.exp(thin[1:, 5:8] * 0.1), step, atol=1e-12)
 
 
-def test_any_split_gives_the_same_rows():
+def test_rows_do_not_depend_on_the_block_size():
     rows = recorded(100.0, 10, seconds=30.0)
     whole = HeldReadings(10).merge_rows(rows)
     for size in (1, 7, 10, 333):
@@ -99,7 +99,7 @@ def test_any_split_gives_the_same_rows():
         np.testing.assert_array_equal(np.vstack(parts), whole)
 
 
-def test_a_reading_that_stays_for_long_counts_again():
+def test_reading_that_stays_for_long_counts_again():
     rows = recorded(100.0, 10, seconds=30.0)
     rows[1000:2000, 2:5] = rows[1000, 2:5]
     thin = HeldReadings(10).merge_rows(rows)
@@ -114,7 +114,7 @@ def test_a_reading_that_stays_for_long_counts_again():
         pytest.param(50.0, 2, marks=pytest.mark.slow),
     ],
 )
-def test_held_readings_are_no_magnet_and_the_answer_is_right(rate_hz, hold):
+def test_held_readings_cause_no_warning_and_a_correct_estimate(rate_hz, hold):
     estimator = Estimator()
     for piece in pieces(recorded(rate_hz, hold, seconds=150.0), 500):
         estimator.add(piece)
@@ -126,7 +126,7 @@ def test_held_readings_are_no_magnet_and_the_answer_is_right(rate_hz, hold):
     np.testing.assert_allclose(found.gyro_bias_rad_s, BIAS, atol=6e-4)
 
 
-def test_held_readings_with_gaps_and_any_split():
+def test_held_readings_with_gaps_do_not_depend_on_the_block_size():
     rows = recorded(100.0, 10, seconds=60.0)
     found = []
     for size in (50, 177):

@@ -1,6 +1,6 @@
-"""Answers where the instrument is not the model's: sigmas that hold, at little price where it is.
+"""Estimates from imperfect instruments: sigmas that hold, and little loss for a perfect one.
 
-The trouble is put into the gyro's readings, so iron and bias of the truth stay.
+The errors are added to the gyro's readings, so that iron and bias of the truth are unchanged.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from ahrsd.montecarlo import nuisances
 from ahrsd.montecarlo.cramer_rao import Trajectory
 from ahrsd.simulation import ScenarioSettings, simulate
 
-#: rolls, pitches and turns at once, as a diver does
+#: rolls, pitches and turns at once, as a diver makes them
 RICH = (("circles", 40.0), ("roll", 30.0), ("pitch", 30.0), ("circles", 40.0), ("roll", 30.0))
 LEVEL = (("circles", 120.0), ("roll", 40.0))
 
@@ -48,7 +48,7 @@ def answer(made, gyro=None, parameters=None):
 
 
 def troubled(made, matrix):
-    """The gyro's readings with this matrix (3, 3) on the true rate."""
+    """The gyro's readings with this matrix (3, 3) applied to the true rate."""
     noise = made.block.gyro_b_rad_s - made.rate_b_rad_s - pieces.GYRO_BIAS_RAD_S
     return made.rate_b_rad_s @ np.asarray(matrix).T + noise + pieces.GYRO_BIAS_RAD_S
 
@@ -68,7 +68,7 @@ def turned(seed):
 
 
 def beyond(made, found):
-    """Largest error of the hard iron, in its sigmas."""
+    """Largest error of the hard iron in units of its sigma."""
     return float(np.max(np.abs(made.errors(found)[6:9]) / found.sigma[6:9]))
 
 
@@ -84,11 +84,11 @@ def beyond(made, found):
         pytest.param(turned, LEVEL, id="turned-level"),
     ],
 )
-def test_what_the_instrument_has_is_within_the_sigmas(trouble, motion, seeds):
-    """Taken for perfect, it makes answers that are wrong by many of their sigmas.
+def test_errors_with_an_imperfect_instrument_are_within_the_sigmas(trouble, motion, seeds):
+    """If the instrument is assumed perfect, errors are many sigmas.
 
-    Not in each: scales that the motion cannot tell from a hard iron stay unseen, and that an
-    instrument as its maker calibrated it has none of that size is believed then.
+    Not in every run: scale errors that the motion does not separate from a hard iron are not found,
+    and the prior then says that a factory-calibrated instrument has none of that size.
     """
     perfect, known = [], []
     for seed in range(seeds):
@@ -109,9 +109,10 @@ def test_what_the_instrument_has_is_within_the_sigmas(trouble, motion, seeds):
     ],
     ids=["roll", "roll, circles", "circles, pitch"],
 )
-def test_wrong_scales_that_the_motion_hardly_tells(motion):
-    """The gyro's axes are at right angles, which the motion does tell: that says nothing of its
-    scales. When both were of one size, the worst of these were 4.4, 8.5 and 10 sigmas off."""
+def test_scale_errors_that_the_motion_hardly_determines_are_within_the_sigmas(motion):
+    """The motion shows that the gyro's axes are orthogonal, which has no information on the
+    scales. With one common size for both, the worst errors were 4.4, 8.5 and 10 sigmas.
+    """
     off = []
     for seed in range(12):
         made = pieces.drive(motion, seed)
@@ -119,8 +120,8 @@ def test_wrong_scales_that_the_motion_hardly_tells(motion):
     assert max(off) < 3.5
 
 
-def test_a_gyro_that_nothing_is_known_of_is_of_the_worst_kind():
-    """Sigmas of scale and angle of each gyro that may be, and how likely it is before the data."""
+def test_unknown_gyro_has_the_prior_of_the_worst_kind():
+    """Prior sigmas of scale and angle for each possible kind of gyro, and its prior probability."""
     gyros, places = possible_instruments((AS_SPECIFIED, ASSEMBLED), PLACES), 4
     shares = np.exp(gyros.log_prior) / np.sum(np.exp(gyros.log_prior))
     found = {}
@@ -139,16 +140,16 @@ def test_a_gyro_that_nothing_is_known_of_is_of_the_worst_kind():
 
 
 @pytest.mark.parametrize("after", ["rest", "circles"])
-def test_level_turns_of_a_perfect_instrument_are_of_use_still(after):
-    """They tell one scale of three; what the others may be widens the heading, by how much."""
+def test_level_turns_of_a_perfect_instrument_still_converge(after):
+    """They determine one scale of three. The others widen the heading by their prior."""
     for seed in range(3):
         found = answer(pieces.drive((("circles", 80.0), (after, 60.0)), seed))
         assert found.converged
         assert 0.02 < found.heading_sigma_deg < 0.5
 
 
-def test_axes_that_are_turned_and_nothing_else():
-    """A sensor mounted askew that is neither late nor wrong in scale, in level circles."""
+def test_misalignment_alone_is_within_the_sigmas():
+    """A misaligned sensor without delay or scale error, in level circles."""
     perfect, known = [], []
     for seed in range(6):
         made = pieces.drive((("circles", 160.0),), seed)
@@ -159,8 +160,10 @@ def test_axes_that_are_turned_and_nothing_else():
     assert max(known) < 3.0
 
 
-def test_what_is_wrong_with_a_gyro_is_taken_out_of_its_angles():
-    """The answer is as good as with a perfect gyro; taken for perfect, it is wrong by far more."""
+def test_gyro_error_is_removed_from_its_angles():
+    """The estimate is as good as with a perfect gyro. Assuming a perfect gyro gives much larger
+    errors.
+    """
     matrix = turned(3) @ scales(3) @ shears(3)
     for seed in range(3):
         made = pieces.drive(RICH, seed)
@@ -173,8 +176,10 @@ def test_what_is_wrong_with_a_gyro_is_taken_out_of_its_angles():
         assert perfect > 5.0 * ours
 
 
-def test_a_field_that_differs_by_attitude_is_no_gyro():
-    """It asks for scales and turned axes, and is not explained by them: nothing is taken out."""
+def test_field_that_depends_on_attitude_is_not_a_gyro_error():
+    """It would need scale errors and misalignments that do not explain it, so nothing is
+    removed.
+    """
     made = pieces.drive(RICH, 1)
     field = made.block.raw_b_gauss + 0.02 * np.sin(3.0 * made.block.raw_b_gauss / 0.1)
     found = answer(replace(made, block=replace(made.block, raw_b_gauss=field)))
@@ -186,8 +191,10 @@ def test_a_field_that_differs_by_attitude_is_no_gyro():
 
 
 @pytest.mark.parametrize("noise_rad_s", [pytest.param(5e-3, marks=pytest.mark.slow), 1e-2])
-def test_noise_of_the_gyro_asks_for_no_scale(noise_rad_s):
-    """On slow motion it is large beside the rates: each axis' scale, over its announced sigma."""
+def test_gyro_noise_is_not_taken_for_a_scale_error(noise_rad_s):
+    """In slow motion the noise is large compared with the rates. Tested: each axis' scale
+    divided by its sigma.
+    """
     found = []
     for seed in range(4):
         run = simulate(ScenarioSettings("lam", "rov", seed, noise_gyro_rad_s=noise_rad_s))
@@ -201,7 +208,7 @@ def test_noise_of_the_gyro_asks_for_no_scale(noise_rad_s):
     assert np.max(np.abs(found)) < 3.5
 
 
-def test_what_makes_the_most_of_the_sigma_is_named_with_what_would_shrink_it():
+def test_largest_contribution_to_sigma_is_named_with_advice():
     short = pieces.drive((("circles", 40.0), ("rest", 30.0)), 1)
     found = answer(short, parameters=EstimatorParameters(imperfections=(ASSEMBLED,)))
     assert found.heading_sigma_deg > 0.5
@@ -216,24 +223,26 @@ def test_what_makes_the_most_of_the_sigma_is_named_with_what_would_shrink_it():
     assert "run `ahrsd diagnose` on the recording to find the cause" in place.widened_by
 
 
-def test_axes_that_are_turned_count_as_what_they_make_of_the_heading():
-    """Taken out of the gyro's angles, they are still in the heading of a sensor that is askew."""
+def test_misalignment_counts_by_its_effect_on_the_heading():
+    """It is removed from the gyro's angles, but remains in the heading of a misaligned sensor."""
     made = pieces.drive(RICH, 1)
     found = answer(made, troubled(made, turned(1)))
     assert 0.7 < found.heading_sigma_deg < 3.0
     assert "axes are turned against the gyro's: mount them alike" in found.widened_by
 
 
-def test_a_turn_about_down_is_an_error_of_the_heading():
+def test_rotation_about_the_vertical_is_an_equal_heading_error():
     down = np.array([[0.0, 0.0, 1.0]])
     about_down = misalignment_heading_deg(np.radians([0.0, 0.0, 1.0]), down, np.radians(60.0))
     assert about_down == pytest.approx(1.0)
     across = misalignment_heading_deg(np.radians([1.0, 0.0, 0.0]), down, np.radians(60.0))
-    assert across == pytest.approx(np.tan(np.radians(60.0)), rel=0.01)  # of the steep field
+    assert across == pytest.approx(np.tan(np.radians(60.0)), rel=0.01)  # for a steep field
 
 
 def wandering(made, size_gauss):
-    """With a field that is another at every place, a new one each 9 s, straight in between."""
+    """The drive in a field that differs between places: a new value every 9 s, linear in
+    between.
+    """
     time_s, period_s = made.block.time_s, 9.0
     knots_s = np.arange(0.0, time_s[-1] + 2 * period_s, period_s)
     at_knots = np.random.default_rng(0).normal(0.0, size_gauss, (len(knots_s), 3))
@@ -241,8 +250,10 @@ def wandering(made, size_gauss):
     return replace(made, block=replace(made.block, raw_b_gauss=made.block.raw_b_gauss + course))
 
 
-def test_what_no_motion_has_told_is_not_blamed_on_the_field():
-    """A field that differs by place hides little there: on another motion it is what counts."""
+def test_sigma_due_to_missing_motion_is_not_attributed_to_the_field():
+    """A field that differs between places contributes little here; with another motion it
+    dominates.
+    """
     names = {}
     for name, motion in (("level", "circles"), ("straight", "straight"), ("rolling", "roll")):
         found = answer(wandering(pieces.drive(((motion, 160.0),), 3), 0.01))
@@ -254,7 +265,7 @@ def test_what_no_motion_has_told_is_not_blamed_on_the_field():
 
 
 def slowly_noisy(made, size_gauss, forgets_s, *, at_rest):
-    """With noise of the magnetometer that forgets, one of its own on each axis."""
+    """The drive with correlated magnetometer noise, independent on each axis."""
     time_s = made.block.time_s
     keep = np.exp(-np.median(np.diff(time_s)) / forgets_s)
     drawn = np.random.default_rng(2).normal(0.0, size_gauss, (len(time_s), 3))
@@ -267,8 +278,10 @@ def slowly_noisy(made, size_gauss, forgets_s, *, at_rest):
 PAUSED = (("circles", 60.0), ("roll", 40.0), ("rest", 60.0), ("pitch", 40.0), ("roll", 60.0))
 
 
-def test_noise_that_is_not_white_is_no_place():
-    """It goes on at rest, where no place is passed by; what stops there may be one."""
+def test_coloured_noise_is_not_attributed_to_places():
+    """It continues at rest, where no place is passed. A disturbance that stops at rest may be a
+    place.
+    """
     noisy = answer(slowly_noisy(pieces.drive(PAUSED, 1), 0.006, 1.0, at_rest=True))
     assert noisy.heading_sigma_deg > 0.5
     assert "the magnetometer's noise is not white" in noisy.widened_by
@@ -279,9 +292,11 @@ def test_noise_that_is_not_white_is_no_place():
     assert "a minute at rest shows which" in moving.widened_by
 
 
-def test_shares_of_motion_and_misfit_by_hand():
-    """Twelve numbers with a prior of 1: two are known to .1, one of them by a field that wanders;
-    a third is left at the prior, and was known to .3 had the model explained the data."""
+def test_shares_of_motion_and_misfit_in_a_small_example():
+    """Twelve parameters with a prior of 1: two are known to 0.1, one of them limited by a
+    varying field. A third is left at its prior, and would be known to 0.3 if the model
+    explained the data.
+    """
     plain, found = np.full(12, 1e-4), np.full(12, 1e-4)
     plain[:3], found[:3] = (0.01, 1e-4, 0.09), (0.01, 0.01, 0.9)
     shares = motion_and_misfit(np.diag(plain), np.diag(found), np.eye(12))
@@ -290,29 +305,28 @@ def test_shares_of_motion_and_misfit_by_hand():
 
 
 LEVEL_IRON = np.eye(12)[6]
-UNSEEN_LEVEL = np.eye(12)[5] - np.sin(np.radians(60.0)) * np.eye(12)[8]  # M zz against b z
+UNSEEN_LEVEL = np.eye(12)[5] - np.sin(np.radians(60.0)) * np.eye(12)[8]  # M zz and b z
 
 
 @pytest.mark.parametrize(
-    ("unknown", "asked"),
+    ("unknown", "manoeuvre"),
     [(LEVEL_IRON, "turn through all headings"), (UNSEEN_LEVEL, " by 30 deg both ways")],
 )
-def test_the_manoeuvre_that_is_asked_for_tells_what_is_not_known(unknown, asked):
-    """The second moves no reading of a level turn at a dip of 60 deg."""
+def test_advised_manoeuvre_determines_the_unknown_direction(unknown, manoeuvre):
+    """The second direction changes no reading of a level turn at a dip of 60 deg."""
     c = np.r_[0.5 * np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0]), np.zeros(3)]
     down = np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 0.87], [0.5, 0.0, 0.87]])
     advice = HeadingAdvice(c, down, np.radians(60.0), 1e-3)
     covariance = 1e-8 * np.eye(12) + 0.1**2 * np.outer(unknown, unknown)
-    assert asked in advice.best_manoeuvre(covariance)
+    assert manoeuvre in advice.best_manoeuvre(covariance)
 
 
 @pytest.mark.parametrize(
     "motion", [pytest.param(RICH, marks=pytest.mark.slow), LEVEL], ids=["rich", "level"]
 )
-def test_a_gyro_that_warms_up_is_followed_to_the_end(motion):
-    """Its bias goes by a tenth of a degree per second; the answer is that of the end.
-
-    Taken for one that stays, it is the mean of the drift, and misfit says so.
+def test_estimate_of_a_drifting_gyro_bias_is_that_of_the_end(motion):
+    """The bias changes by a tenth of a degree per second. If it is assumed constant, the
+    estimate is the mean of the drift, and the misfit shows it.
     """
     errors, sigmas = {}, {}
     for name, parameters in (("stays", pieces.IDEAL), ("follows", None)):
@@ -331,8 +345,8 @@ def test_a_gyro_that_warms_up_is_followed_to_the_end(motion):
     assert errors["follows"] < 0.7 * errors["stays"]
 
 
-def test_a_drift_is_told_from_the_epochs_times():
-    """Epochs know nothing but the bias they want: what is left of the drift until the last."""
+def test_bias_drift_is_fitted_from_the_times_of_the_epochs():
+    """Epochs only contain the bias that fits them: the remaining drift until the last epoch."""
     wanted = np.array([1e-3, 2e-3, -1e-3])
     times_s = np.array([0.0, 10.0, 25.0])
     H, g = np.zeros((3, 22, 22)), np.zeros((3, 22))
@@ -346,7 +360,7 @@ def test_a_drift_is_told_from_the_epochs_times():
 
 
 @pytest.mark.parametrize("motion", ["slow", "rov"])
-def test_the_price_where_the_instrument_is_perfect_and_the_motion_rich(motion):
+def test_sigmas_grow_little_with_a_perfect_instrument_and_rich_motion(motion):
     run = simulate(ScenarioSettings("wam", motion, seed=3))
     found = []
     for parameters in (pieces.IDEAL, None):
@@ -355,13 +369,13 @@ def test_the_price_where_the_instrument_is_perfect_and_the_motion_rich(motion):
             estimator.add(block)
         found.append(estimator.finish())
     ideal, ours = found
-    assert np.array_equal(ideal.hard_iron_gauss, ours.hard_iron_gauss)  # the answer is the same
+    assert np.array_equal(ideal.hard_iron_gauss, ours.hard_iron_gauss)  # the estimate is the same
     ratio = ours.sigma / ideal.sigma
     assert ratio.min() >= 1.0 - 1e-9
     assert np.median(ratio) <= 1.03
 
 
-def test_the_widening_is_a_covariance():
+def test_widening_is_positive_semidefinite():
     made = pieces.drive(LEVEL, 5)
     added = answer(made).covariance - answer(made, parameters=pieces.IDEAL).covariance
     size = np.sqrt(np.diag(answer(made).covariance))
@@ -369,7 +383,7 @@ def test_the_widening_is_a_covariance():
     assert values.min() > -1e-7 * values.max()
 
 
-def test_the_worse_the_kind_of_instrument_the_wider_the_answer():
+def test_sigmas_grow_with_the_imperfections_of_the_instrument():
     made = pieces.drive(LEVEL, 6)
     sigmas = [
         answer(made, parameters=EstimatorParameters(imperfections=kinds)).sigma[6:9]
@@ -380,8 +394,8 @@ def test_the_worse_the_kind_of_instrument_the_wider_the_answer():
     assert sigmas[3].max() > 2.0 * sigmas[1].max()
 
 
-def test_what_left_the_window_counts():
-    """Motion that told the instrument's imperfections, and is folded by now, still does."""
+def test_folded_epochs_still_inform_the_imperfections():
+    """Motion that determined the instrument's imperfections and is folded by now still counts."""
     made = pieces.drive((*RICH, ("circles", 400.0)), 7, rate_hz=20.0)
     parameters = EstimatorParameters(window_steps=1024, epoch_steps=256)
     folded = answer(made, parameters=parameters)
@@ -390,7 +404,7 @@ def test_what_left_the_window_counts():
 
 
 def at_a_place(made, seed, size_gauss):
-    """The same drive where the field differs with the heading: six numbers of this size."""
+    """The same drive in a field that depends on the heading: six coefficients of this size."""
     G = np.random.default_rng([seed, 5]).normal(0.0, size_gauss, (3, 2))
     attitude = nuisances.attitude(
         Trajectory(made.field_b_gauss, made.rate_b_rad_s, made.block.dt_s)
@@ -411,8 +425,8 @@ CIRCLES = (("circles", 160.0),)
     [CIRCLES, pytest.param(LEVEL, marks=pytest.mark.slow), LEVEL_AND_LEANING],
     ids=["c", "l", "ll"],
 )
-def test_a_field_that_differs_with_the_heading_is_within_the_sigmas(motion, seeds):
-    """What of it is the same on all headings is taken for hard iron, and no fit shows that."""
+def test_errors_with_a_field_by_heading_are_within_the_sigmas(motion, seeds):
+    """The part that is equal on all headings is taken for hard iron, and no fit shows it."""
     off = []
     for seed in range(seeds):
         made = at_a_place(pieces.drive(motion, seed), seed, 5e-3)
@@ -423,29 +437,29 @@ def test_a_field_that_differs_with_the_heading_is_within_the_sigmas(motion, seed
 
 
 @pytest.mark.parametrize("motion", [LEVEL, LEVEL_AND_LEANING], ids=["l", "ll"])
-def test_where_the_field_is_the_same_everywhere_the_data_say_so(motion):
+def test_uniform_field_is_recognised_from_the_data(motion):
     for seed in range(4):
         found = answer(pieces.drive(motion, seed))
         assert found.place_gauss < 2e-4
 
 
-def test_a_field_that_differs_otherwise_than_with_the_heading_is_misfit_and_counts_as_a_place():
-    """In degrees of heading: nothing where the field is the same everywhere."""
+def test_field_that_varies_otherwise_is_misfit_and_counts_as_places():
+    """In degrees of heading; zero in a uniform field."""
     made = pieces.drive(LEVEL_AND_LEANING, 2)
     assert answer(made).place_deg < 0.01
     found = answer(wandering(made, 2e-3))
     assert 0.1 < found.place_deg < found.heading_sigma_deg
 
 
-def test_what_no_motion_tells_of_a_place_is_as_large_as_places_are():
-    """Without gravity nobody knows where the sensor heads."""
+def test_effect_of_places_has_its_prior_size_when_the_motion_does_not_determine_it():
+    """Without gravity the heading of the sensor is not known."""
     made = pieces.drive(LEVEL, 1)
     nowhere = replace(made.block, accel_b_m_s2=np.full_like(made.block.accel_b_m_s2, np.nan))
     found = answer(replace(made, block=nowhere))
     assert found.place_gauss == pytest.approx(np.sqrt(np.mean(np.square(PLACES))), rel=1e-3)
 
 
-def test_the_price_of_places_where_the_motion_is_rich():
+def test_places_widen_the_sigmas_little_with_rich_motion():
     run = simulate(ScenarioSettings("wam", "rov", seed=3))
     sigmas = []
     for places in ((1e-6,), PLACES):
@@ -456,8 +470,10 @@ def test_the_price_of_places_where_the_motion_is_rich():
     assert np.max(sigmas[1] / sigmas[0]) < 1.03
 
 
-def test_places_are_as_large_as_real_recordings_say():
-    """Of what differs by place or attitude: the middle is among them, and what is small as well."""
+def test_prior_sizes_of_places_cover_those_of_real_recordings():
+    """Of the field's variation by place or attitude: the median is within the sizes, and so is
+    the least.
+    """
     for name in ("world_course", "by_direction"):
         size = ORDINARY[name]
         least = size.median / np.exp(1.645 * size.spread)

@@ -1,4 +1,6 @@
-"""A magnetometer that is late against the gyro: found, taken out; none found where none is."""
+"""A magnetometer that is delayed relative to the gyro: the delay is found and removed, and none
+is found otherwise.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,8 @@ def bench(monkeypatch):
     return importlib.import_module("bench_estimator")
 
 
-def late(run, lag_s):
-    """The run with its field as it was `lag_s` before; the same noise."""
+def delayed(run, lag_s):
+    """The run with its field delayed by `lag_s`, with the same noise."""
     before = np.einsum("kij,kj->ki", so3.exp(lag_s * run.rate_b_rad_s), run.field_b_gauss)
     moved = (before - run.field_b_gauss) @ run.soft_iron
     return replace(run, block=replace(run.block, raw_b_gauss=run.block.raw_b_gauss + moved))
@@ -46,9 +48,9 @@ def answer(bench, run):
     ("kind", "lag_s"),
     [("wam", 0.03), pytest.param("mam", 0.012, marks=pytest.mark.slow), ("wam", -0.02)],
 )
-def test_a_lag_is_found_and_taken_out(bench, kind, lag_s):
+def test_delay_is_found_and_removed(bench, kind, lag_s):
     run = bench.simulate(kind, "rov", 5, samples=6000)
-    found = answer(bench, late(run, lag_s))
+    found = answer(bench, delayed(run, lag_s))
     assert found.mag_lag_s == pytest.approx(lag_s, abs=4e-3)
     error = np.r_[
         (found.soft_iron - run.soft_iron)[UPPER],
@@ -60,7 +62,7 @@ def test_a_lag_is_found_and_taken_out(bench, kind, lag_s):
 
 
 @pytest.mark.parametrize("seeds", [1, pytest.param(3, marks=pytest.mark.slow)])
-def test_where_there_is_no_lag_none_is_found(bench, seeds):
+def test_no_delay_is_found_when_there_is_none(bench, seeds):
     lags = [
         answer(bench, bench.simulate(kind, "rov", seed, samples=4000)).mag_lag_s
         for kind in ("wam", "lam")
@@ -71,7 +73,7 @@ def test_where_there_is_no_lag_none_is_found(bench, seeds):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.75, 1.1])
-def test_times_or_units_that_are_wrong_are_no_answer(bench, factor):
+def test_wrong_time_or_unit_prevents_convergence(bench, factor):
     run = bench.simulate("mam", "rov", 2, samples=3500)
     gyro = run.block.gyro_b_rad_s * factor
     found = answer(bench, replace(run, block=replace(run.block, gyro_b_rad_s=gyro)))
@@ -85,14 +87,14 @@ def test_times_or_units_that_are_wrong_are_no_answer(bench, factor):
 
 @pytest.mark.slow
 @pytest.mark.recordings
-def test_a_rate_that_lost_messages_made_wrong_is_no_answer():
+def test_wrong_rate_due_to_lost_messages_prevents_convergence():
     assert calibrate(WALK, Config(), rate_hz=40.0).estimate.gyro_misscaled == 0.0
     found = calibrate(WALK, Config(), rate_hz=30.0).estimate
     assert not found.converged
     assert found.gyro_misscaled == pytest.approx(30 / 40 - 1, abs=0.08)
 
 
-def test_delay_turns_what_the_field_is_the_image_of():
+def test_delay_rotates_the_undistorted_field():
     rate = np.array([0.0, 0.0, 2.0])
     dt = np.full(5, 0.05)
     data = chain.EpochData(
@@ -100,13 +102,13 @@ def test_delay_turns_what_the_field_is_the_image_of():
     )
     np.testing.assert_allclose(row_rates(data), np.tile(rate, (5, 1)))
     seen = with_lag(data, 0.1).field_directions(np.tile([1.0, 0.0, 0.0], (5, 1)))
-    # u turns against the sensor, so 0.1 s before it was 0.2 rad ahead
+    # u turns opposite to the sensor, so 0.1 s earlier it was 0.2 rad ahead
     np.testing.assert_allclose(seen, np.tile([np.cos(0.2), np.sin(0.2), 0.0], (5, 1)))
     back = with_lag(with_lag(data, 0.1), -0.1).field_directions(np.tile([1.0, 0.0, 0.0], (5, 1)))
     np.testing.assert_allclose(back, np.tile([1.0, 0.0, 0.0], (5, 1)), atol=1e-15)
 
 
-def test_a_rate_across_a_cut_is_that_of_the_side_that_is_linked():
+def test_rate_across_a_cut_is_that_of_the_linked_side():
     angle = np.array([[0.0, 0, 0], [0.1, 0, 0], [9.0, 0, 0], [0.3, 0, 0]])
     data = chain.EpochData(
         np.ones((4, 3)), angle, np.full(4, 0.1), np.ones((4, 3)), np.arange(4.0),
@@ -124,7 +126,7 @@ def test_a_rate_across_a_cut_is_that_of_the_side_that_is_linked():
         "21_undisturbed_fast_combined",
     ],
 )
-def test_the_lag_of_a_real_instrument(name):
+def test_delay_of_a_real_instrument(name):
     found = calibrate(BROAD / f"{name}.csv.gz", Config()).estimate
-    # optics say 11.5 ms; half a step of its 286 Hz more, because its rate is sampled
+    # 11.5 ms by the optical reference, plus half a step at 286 Hz because its rate is sampled
     assert 0.011 < found.mag_lag_s < 0.0155

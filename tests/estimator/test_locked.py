@@ -1,4 +1,4 @@
-"""What is left over and follows attitude, rate or time: seen, named, and in the sigmas."""
+"""Residuals that follow attitude, rate or time are found, named, and included in the sigmas."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SEEDS = range(700, 706)
 
 
 def answer(made, more=0.0):
-    """With this much more on the field, (n, 3) gauss."""
+    """Estimate with this field (n, 3) gauss added."""
     estimator = Estimator(at_once=WHOLE)
     block = replace(made.block, raw_b_gauss=made.block.raw_b_gauss + more)
     for a in range(0, len(block), 400):
@@ -35,25 +35,25 @@ def by_attitude(made, seed, size_gauss):
 
 
 def by_rate(made, seed, size_gauss):
-    """The field by the rate, `size_gauss` in all."""
+    """A field proportional to the rate, of size `size_gauss`."""
     more = made.rate_b_rad_s @ np.random.default_rng(seed).normal(size=(3, 3))
     return more * size_gauss / np.std(more)
 
 
 def by_time(made, seed, size_gauss):
-    """A hard iron that goes away and comes back, once and a half, `size_gauss` in all."""
+    """A hard iron that disappears and returns, one and a half times, of size `size_gauss`."""
     course = locked.cosine_modes(made.block.time_s, 3)[:, 2:]
     way = np.random.default_rng(seed).normal(size=3)
     return size_gauss * np.sqrt(3.0) * course * way / np.linalg.norm(way)
 
 
 def beyond(made, found):
-    """Largest error of any number, in its sigmas."""
+    """Largest error of any parameter in units of its sigma."""
     return float(np.max(np.abs(made.errors(found) / found.sigma)))
 
 
 def named_mg(found):
-    """What the answer's only warning says: what is followed, and the size in mG."""
+    """Cause and size in mG from the only warning of the estimate."""
     (text,) = found.warnings
     head, tail = text.split(": ")
     assert tail.endswith(" mG; run `ahrsd diagnose` on the recording")
@@ -70,8 +70,8 @@ def named_mg(found):
         for motion, quick in ((LEVEL, True), (RICH, trouble is by_attitude))
     ],
 )  # fmt: skip
-def test_what_is_left_is_named_and_within_the_sigmas(motion, trouble, follows):
-    """A milligauss; what passes for iron of it is not seen."""
+def test_remaining_residual_is_named_and_errors_are_within_the_sigmas(motion, trouble, follows):
+    """One milligauss. The part that looks like iron is not seen."""
     for seed in SEEDS[:3]:
         made = pieces.drive(motion, seed)
         found = answer(made, trouble(made, seed, 1e-3))
@@ -84,8 +84,8 @@ def test_what_is_left_is_named_and_within_the_sigmas(motion, trouble, follows):
 @pytest.mark.parametrize(
     "motion", [pytest.param(RICH, marks=pytest.mark.slow), LEVEL], ids=["rich", "level"]
 )
-def test_a_little_that_follows_the_attitude_holds_the_gate_for_flash(motion):
-    """Half of the magnetometer's noise: it makes more of the heading than may be saved."""
+def test_small_residual_by_attitude_closes_the_flash_gate(motion):
+    """Half of the magnetometer's noise: its effect on the heading is more than may be saved."""
     for seed in SEEDS:
         made = pieces.drive(motion, seed)
         found = answer(made, by_attitude(made, seed, 5e-4))
@@ -96,15 +96,17 @@ def test_a_little_that_follows_the_attitude_holds_the_gate_for_flash(motion):
 @pytest.mark.parametrize(
     "motion", [pytest.param(RICH, marks=pytest.mark.slow), LEVEL], ids=["rich", "level"]
 )
-def test_nothing_is_named_where_nothing_is_left(motion):
+def test_no_residual_is_named_when_there_is_none(motion):
     for seed in SEEDS:
         found = answer(pieces.drive(motion, seed))
         assert found.warnings == ()
         assert found.place_deg < 0.05
 
 
-def test_noise_that_is_slow_follows_nothing():
-    """Forgotten after two seconds and as large as the white noise: no visit is like the other."""
+def test_slow_noise_is_not_named_as_a_residual():
+    """Correlated over two seconds and as large as the white noise: it differs at each visit of
+    an attitude.
+    """
     for seed in SEEDS:
         made = pieces.drive(RICH, seed)
         kept = np.exp(-1.0 / (40.0 * 2.0))
@@ -113,7 +115,7 @@ def test_noise_that_is_slow_follows_nothing():
         assert answer(made, pieces.MAG_GAUSS * slow).warnings == ()
 
 
-def test_a_stream_names_it_as_a_recording_does():
+def test_stream_and_recording_name_the_same_residual():
     made = pieces.drive(RICH, 700)
     block = made.block
     block = replace(block, raw_b_gauss=block.raw_b_gauss + by_attitude(made, 700, 1e-3))
@@ -123,12 +125,12 @@ def test_a_stream_names_it_as_a_recording_does():
             found = estimator.estimate()
             said.append(bool(found.warnings))
     assert said[-1]
-    assert not any(said[:2])  # of directions that were seen once nobody can tell
+    assert not any(said[:2])  # not decidable for directions that were seen only once
     assert named_mg(estimator.finish())[0] == "the residual follows the attitude"
 
 
-def test_an_answer_is_no_less_wide_than_what_is_left_makes_it():
-    """By hand: what misfit makes already counts, and what is more is added."""
+def test_covariance_is_widened_to_the_effect_of_the_residual():
+    """A small example: the effect of the misfit counts already, and only the excess is added."""
     plain, tempered = np.eye(12), 3.0 * np.eye(12)
     added = np.diag([*[1.0] * 6, *[7.0] * 6])
     left = ResidualComponent("attitude", 20.0, 1e-3, added)
@@ -141,7 +143,7 @@ def test_an_answer_is_no_less_wide_than_what_is_left_makes_it():
     assert replace(left, nats=11.0).words == ""
 
 
-def test_columns_by_hand():
+def test_residual_columns_in_a_small_example():
     change = np.array([[0.1, -0.2, 0.3]])
     by_change = locked.change_columns(change)[0]
     np.testing.assert_allclose(by_change[:, 0], [0.1, 0.0, -0.3])  # xx - zz

@@ -1,4 +1,4 @@
-"""What contradicts the model: iron that changed, a magnetometer that is turned against the gyro."""
+"""Contradictions of the model: iron that changed, and a misaligned magnetometer."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def answer(bench, run):
 @pytest.mark.parametrize(
     ("kind", "seed"), [pytest.param("mam", 3, marks=pytest.mark.slow), ("lam", 4)]
 )
-def test_a_magnet_put_on_early(bench, kind, seed):
+def test_estimator_restarts_after_a_magnet_was_added_early(bench, kind, seed):
     run = bench.simulate(kind, "rov", seed, samples=5000)
     field = run.block.raw_b_gauss + STEP_GAUSS * (run.block.time_s > 50.0)[:, None]
     estimator, found = answer(bench, replace(run, block=replace(run.block, raw_b_gauss=field)))
@@ -51,13 +51,13 @@ def test_a_magnet_put_on_early(bench, kind, seed):
 @pytest.mark.parametrize(
     "kind", ["wam", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("mam", "lam"))]
 )
-def test_iron_that_stays_is_not_divided(bench, kind):
+def test_constant_iron_causes_no_restart(bench, kind):
     for seed in range(3):
         run = bench.simulate(kind, "slow", seed, samples=4000)
         assert answer(bench, run)[0].restarted_s is None
 
 
-@pytest.mark.slow  # one of them, quick: the next test
+@pytest.mark.slow  # a short one of them: the next test
 @pytest.mark.recordings
 @pytest.mark.parametrize(
     "name",
@@ -67,16 +67,16 @@ def test_iron_that_stays_is_not_divided(bench, kind):
         "34_disturbed_attached_magnet_3cm",
     ],
 )
-def test_a_magnet_that_was_taken_off_again(name):
+def test_estimate_after_a_temporary_magnet_is_without_it(name):
     found = calibrate(BROAD / f"{name}.csv.gz", Config()).estimate
-    # 0.58, 0.135 and 0.06 G from about 40 to 97 s; without it the sensor has next to none
+    # 0.58, 0.135 and 0.06 G from about 40 to 97 s; without it the hard iron is near zero
     assert found.converged
     assert np.linalg.norm(found.hard_iron_gauss) < 0.02
 
 
 @pytest.mark.recordings
-def test_a_magnet_that_was_taken_off_again_in_one_go():
-    """All epochs of the recording at once: that it is settled shows only at the very end."""
+def test_estimate_after_a_temporary_magnet_is_without_it_in_one_batch():
+    """All epochs of the recording at once: convergence shows only at the very end."""
     estimator = Estimator(at_once=WHOLE)
     for block in read_table(BROAD / "34_disturbed_attached_magnet_3cm.csv.gz").blocks():
         estimator.add(block)
@@ -86,14 +86,14 @@ def test_a_magnet_that_was_taken_off_again_in_one_go():
 
 
 def _with_magnet(bench, seed, samples, near):
-    """A stream with a step of the hard iron where `near` (time in s) says so."""
+    """A stream with a step of the hard iron where `near` (time in s) is true."""
     run = bench.simulate("mam", "rov", seed, samples=samples)
     field = run.block.raw_b_gauss + STEP_GAUSS * near(run.block.time_s)[:, None]
     return run, replace(run.block, raw_b_gauss=field)
 
 
-def test_what_the_newest_motion_contradicts_is_in_doubt_until_motion_agrees_again(bench):
-    """Epochs are 20.48 s long: the field is another in the ninth alone."""
+def test_estimate_is_in_doubt_from_a_contradiction_until_agreement(bench):
+    """Epochs are 20.48 s long; only the ninth has another field."""
     run, block = _with_magnet(bench, 3, 5800, lambda t: (t > 163.8) & (t < 184.3))
     estimator, seen = Estimator(), []
     for start in range(0, len(block), 500):
@@ -112,7 +112,7 @@ def test_what_the_newest_motion_contradicts_is_in_doubt_until_motion_agrees_agai
     assert np.max(np.abs(error) / found.sigma[6:9]) < 4.0
 
 
-def test_iron_that_changed_at_the_end_of_a_recording_is_in_doubt(bench):
+def test_estimate_is_in_doubt_when_the_iron_changes_at_the_end(bench):
     _, block = _with_magnet(bench, 3, 5000, lambda t: t > 184.4)
     estimator = Estimator()
     bench.feed(estimator, block, 500)
@@ -122,8 +122,8 @@ def test_iron_that_changed_at_the_end_of_a_recording_is_in_doubt(bench):
 
 
 @pytest.mark.parametrize(("step_sigma", "parted"), [(0.0, 1.0), (20.0, 5.4)])
-def test_two_parts_that_differ_amid_other_trouble_make_the_answer_as_uncertain(step_sigma, parted):
-    """24 epochs that disagree by 7 sigma among themselves anyway; the later half by more."""
+def test_difference_of_two_parts_widens_the_estimate_amid_other_misfit(step_sigma, parted):
+    """24 epochs that disagree by 7 sigma among themselves; the second half differs by more."""
     rng = np.random.default_rng(1)
     graph = SimpleNamespace(
         temper=49.0, hold=0.0, c=np.r_[0.5, 0, 0, 0.5, 0, 0.5, np.zeros(3)],
@@ -145,7 +145,7 @@ def misalignment_of(bench, run):
 
 
 @pytest.mark.parametrize("kind", [pytest.param("wam", marks=pytest.mark.slow), "mam"])
-def test_a_turned_magnetometer_is_found(bench, kind):
+def test_misaligned_magnetometer_is_found(bench, kind):
     theta = np.array([0.012, -0.02, 0.009])
     run = bench.simulate(kind, "rov", 7)
     R = so3.exp(theta[None])[0]  # from the gyro's axes to the magnetometer's
@@ -161,7 +161,7 @@ def test_a_turned_magnetometer_is_found(bench, kind):
 
 
 @pytest.mark.parametrize("seeds", [2, pytest.param(5, marks=pytest.mark.slow)])
-def test_no_misalignment_is_no_evidence(bench, seeds):
+def test_no_misalignment_is_found_when_there_is_none(bench, seeds):
     answers = [
         misalignment_of(bench, bench.simulate("mam", "rov", seed, samples=5000))
         for seed in range(seeds)
@@ -170,5 +170,5 @@ def test_no_misalignment_is_no_evidence(bench, seeds):
     assert 0.2 < np.mean([answer.chi2 for answer in answers]) / 3 < 3.0
 
 
-def test_nothing_is_said_before_there_is_an_answer(bench):
+def test_no_misalignment_is_reported_before_an_estimate(bench):
     assert Estimator().misalignment() is None

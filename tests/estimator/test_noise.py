@@ -1,4 +1,4 @@
-"""Noise levels from data with known noise."""
+"""Noise levels estimated from data with known noise."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def epochs(count, seed=0):
 
 
 def residuals_at(data, used):
-    """Of an epoch at its own best directions, calibration known."""
+    """Residuals of an epoch at its optimal directions, with known calibration."""
     x = np.r_[chain.upper_triangle(M), np.zeros(3)]
     u = chain.start_directions(M, np.zeros(3), data.field_b_gauss)
     for _ in range(3):
@@ -59,7 +59,7 @@ def test_both_sigmas_are_recovered_from_any_start(wrong):
     assert used.gyro_rad_s == pytest.approx(TRUE.gyro_rad_s, rel=0.03)
 
 
-def test_first_guess_of_white_noise_on_a_smooth_motion():
+def test_first_guess_of_white_noise_is_right_on_smooth_motion():
     guesses = [noise.first_guess(d, EstimatorParameters()) for d in epochs(10)]
     middle = noise.median_noise(guesses)
     assert middle.mag_gauss == pytest.approx(TRUE.mag_gauss, rel=0.05)
@@ -73,7 +73,7 @@ def test_differences_ignore_a_ramp_and_outliers():
     assert noise.noise_of_differences(values) == pytest.approx(0.2, rel=0.06)
 
 
-def test_pooling_leaves_out_disturbed_epochs():
+def test_pooled_noise_excludes_disturbed_epochs():
     quiet = [noise.Residuals(1e-6 * 1000, 1000.0, 25e-6 * 50, 50.0)] * 9
     loud = noise.Residuals(1e-2 * 1000, 1000.0, 25e-6 * 50, 50.0)
     found = noise.pool_noise([*quiet, loud], chain.Noise(1.0, 1.0), EstimatorParameters())
@@ -81,13 +81,13 @@ def test_pooling_leaves_out_disturbed_epochs():
     assert found.gyro_rad_s == pytest.approx(5e-3)
 
 
-def test_gyro_noise_is_held_near_its_first_guess():
+def test_gyro_noise_is_limited_to_the_vicinity_of_its_first_guess():
     found = [noise.Residuals(1e-3, 1000.0, 1.0, 50.0)]
     guess = chain.Noise(1e-3, 4e-3)
     assert noise.pool_noise(found, guess, EstimatorParameters()).gyro_rad_s == pytest.approx(6e-3)
 
 
-def test_a_disturbed_epoch_loses_weight_by_itself():
+def test_disturbed_epoch_has_a_higher_noise_level_of_its_own():
     usual = chain.Noise(1e-3, 5e-3)
     loud = noise.Residuals(1e-4 * 1500, 1500.0, 25e-6 * 40, 40.0)
     own = noise.shrink_noise(loud, usual, EstimatorParameters())
@@ -95,7 +95,7 @@ def test_a_disturbed_epoch_loses_weight_by_itself():
     assert own.gyro_rad_s == pytest.approx(5e-3)
 
 
-def test_noise_is_never_believed_below_its_floor():
+def test_noise_estimate_has_a_floor():
     still = noise.Residuals(0.0, 1500.0, 0.0, 40.0)
     found = noise.pool_noise([still], chain.Noise(1e-3, 1e-3), EstimatorParameters())
     assert found == chain.Noise(1e-5, 1e-6)
@@ -110,6 +110,6 @@ def test_noise_is_never_believed_below_its_floor():
         ({"prior_soft_iron": float("nan")}, "prior_soft_iron is nan"),
     ],
 )
-def test_settings_out_of_range_are_named(setting, text):
+def test_error_names_the_setting_out_of_range(setting, text):
     with pytest.raises(ValueError, match=text):
         EstimatorParameters(**setting)

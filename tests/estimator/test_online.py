@@ -1,4 +1,4 @@
-"""The estimator as its users see it: accuracy, honesty, streaming, gaps, faults, cost."""
+"""The estimator from outside: accuracy, sigmas, streaming, gaps, faults and cost."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.estimator.parameters import EstimatorParameters
 from ahrsd.recording.table import read_table
 
-#: the simulated instrument has no imperfections, and the bound knows of none
+#: neither the simulated instrument nor the bound has imperfections
 IDEAL = EstimatorParameters(imperfections=())
 SMALL = EstimatorParameters(epoch_steps=128)
 
@@ -43,8 +43,8 @@ def calibrated(run, estimator=None, size=50):
     return estimator.finish(), history
 
 
-def unasked(estimator, block, size=1000):
-    """What it says at the end, when nobody asked before."""
+def finished(estimator, block, size=1000):
+    """The final estimate, if no estimate was requested before."""
     for start in range(0, len(block), size):
         estimator.add(bench.piece(block, start, start + size))
     return estimator.finish()
@@ -57,7 +57,7 @@ def same(a, b):
     )
 
 
-# -- accuracy and honesty ------------------------------------------------------------------------
+# -- accuracy and sigmas -------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -72,7 +72,7 @@ def same(a, b):
         ("wam", "slow"),
     ],
 )
-def test_errors_are_of_the_size_of_the_bound_and_of_the_covariance(kind, motion):
+def test_errors_agree_with_the_bound_and_the_covariance(kind, motion):
     """The short form; `benchmarks/estimator/bench_estimator.py --runs 100` is the full one."""
     scores, excess = [], []
     for seed in range(3):
@@ -90,7 +90,7 @@ def test_errors_are_of_the_size_of_the_bound_and_of_the_covariance(kind, motion)
     assert np.all(np.mean(excess, axis=0) < 4.0)
 
 
-def test_noise_levels_and_counts():
+def test_estimate_has_noise_levels_misfit_and_counts():
     estimate, _ = calibrated(bench.simulate("wam", "rov", 0))
     assert estimate.noise_mag_gauss == pytest.approx(1e-3, rel=0.03)
     assert estimate.noise_gyro_rad_s == pytest.approx(5e-3, rel=0.08)
@@ -101,8 +101,8 @@ def test_noise_levels_and_counts():
     assert np.linalg.det(estimate.soft_iron) == pytest.approx(1.0)
 
 
-def test_heading_sigma_is_an_honest_one_sigma():
-    """Of the worst heading: the rms over runs of the error there is what was announced."""
+def test_heading_sigma_equals_the_rms_error_of_the_worst_heading():
+    """The rms over runs of the error at the worst heading equals the announced sigma."""
     ratios = []
     for seed in range(8):
         run = bench.simulate("mam", "rov", seed, samples=4000)
@@ -131,7 +131,7 @@ def _heading_errors(run, estimate):
 
 
 def _worst_heading_sigma(run, estimate):
-    """By differences of the heading itself, level; the driven tilts (5, 45 deg) make it larger."""
+    """By differences of the level heading; the driven tilts (5, 45 deg) make it larger."""
     J = np.empty((36, 9))
     for j in range(9):
         sides = []
@@ -150,7 +150,9 @@ def _worst_heading_sigma(run, estimate):
 
 
 def _tilted_over_level(run, estimate):
-    """The estimator's own figure at the driven tilts over that at level, same covariance."""
+    """Ratio of the estimator's heading sigma at the driven tilts to that at level, same
+    covariance.
+    """
     from ahrsd.estimator import chain
 
     size = np.linalg.norm(bench.FIELD_N_GAUSS)
@@ -164,8 +166,8 @@ def _tilted_over_level(run, estimate):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("runs", [2, 4])
-def test_a_planar_turn_is_not_converged_and_its_sigmas_say_so(runs):
-    """What is known to no better than half of what is believed is named: the vertical, in most."""
+def test_planar_turn_does_not_converge_and_has_large_sigmas(runs):
+    """A direction whose sigma is above half of the prior's is named: the vertical, in most runs."""
     named = 0
     for seed in range(runs):
         run = bench.simulate("planar", "", seed, samples=6000)
@@ -181,7 +183,7 @@ def test_a_planar_turn_is_not_converged_and_its_sigmas_say_so(runs):
     assert named >= runs / 2
 
 
-def test_rest_leaves_everything_where_the_device_has_it():
+def test_rest_keeps_the_values_of_the_device():
     rng = np.random.default_rng(0)
     block = bench.simulate("wam", "rov", 0, samples=6000).block
     rest = replace(
@@ -195,12 +197,14 @@ def test_rest_leaves_everything_where_the_device_has_it():
     bench.feed(estimator, rest)
     estimate = estimator.finish()
     assert not estimate.converged
-    assert len(estimate.observability.unobservable) == 10  # the tenth: gyro bias along the field
+    assert (
+        len(estimate.observability.unobservable) == 10
+    )  # the tenth is the gyro bias along the field
     np.testing.assert_allclose(estimate.hard_iron_gauss, present.offset, atol=1e-6)
     expected = np.linalg.inv(C) * np.cbrt(np.linalg.det(C))
     np.testing.assert_allclose(estimate.soft_iron, expected, atol=1e-6)
     np.testing.assert_allclose(estimate.sigma[6:9], 0.5, rtol=0.01)
-    # the gyro's bias is known across the field, and along it not at all
+    # the gyro bias is determined across the field and undetermined along it
     along = present.apply(np.array([0.1, 0.25, -0.33]))
     along /= np.linalg.norm(along)
     error = estimate.gyro_bias_rad_s - [1e-3, 2e-3, -1e-3]
@@ -211,7 +215,7 @@ def test_rest_leaves_everything_where_the_device_has_it():
 
 
 @pytest.mark.slow
-def test_moving_after_a_long_rest_is_as_good_as_moving_at_once():
+def test_estimate_after_a_long_rest_is_as_good_as_without():
     run = bench.simulate("wam", "rov", 3)
     rng = np.random.default_rng(0)
     n = 16_000
@@ -241,7 +245,7 @@ def test_moving_after_a_long_rest_is_as_good_as_moving_at_once():
 # -- streaming -----------------------------------------------------------------------------------
 
 
-def test_blocks_of_any_size_give_bit_identical_estimates():
+def test_estimates_are_bit_identical_for_any_block_size():
     run = bench.simulate("mam", "rov", 1, samples=1500)
     whole, _ = calibrated(run, Estimator(SMALL), size=1500)
     for size in (1, 7, 333):
@@ -252,14 +256,14 @@ def test_blocks_of_any_size_give_bit_identical_estimates():
 @pytest.mark.parametrize(
     ("kind", "motion"), [("mam", "rov"), pytest.param("lam", "slow", marks=pytest.mark.slow)]
 )
-def test_many_epochs_at_once_give_the_answer_of_a_stream(kind, motion):
-    """Whether all fit into the window or not, and whatever the size of the blocks."""
+def test_batch_of_epochs_gives_the_estimate_of_a_stream(kind, motion):
+    """Whether or not all fit into the window, and for any block size."""
     run = bench.simulate(kind, motion, 1)
     small = EstimatorParameters(window_steps=4096, imperfections=())
     for parameters, far in ((IDEAL, 0.2), (small, 0.3)):
-        one = unasked(Estimator(parameters), run.block)
+        one = finished(Estimator(parameters), run.block)
         whole, other = (
-            unasked(Estimator(parameters, at_once=8), run.block, size) for size in (1000, 333)
+            finished(Estimator(parameters, at_once=8), run.block, size) for size in (1000, 333)
         )
         assert same(whole, other)
         assert one.converged
@@ -270,24 +274,24 @@ def test_many_epochs_at_once_give_the_answer_of_a_stream(kind, motion):
         np.testing.assert_allclose(whole.sigma, one.sigma, rtol=0.1)
 
 
-def test_what_waits_for_others_counts_when_asked():
+def test_waiting_epochs_are_included_when_an_estimate_is_requested():
     run = bench.simulate("mam", "rov", 1, samples=1300)
     estimator = Estimator(SMALL, at_once=8)
     assert estimator.add(bench.piece(run.block, 0, 700))
     early = estimator.estimate()
     assert early.samples == 700
     estimator.add(bench.piece(run.block, 700, 1300))
-    assert same(estimator.finish(), unasked(Estimator(SMALL, at_once=8), run.block))
+    assert same(estimator.finish(), finished(Estimator(SMALL, at_once=8), run.block))
 
 
-def test_averaged_streams_too():
+def test_averaged_streams_are_bit_identical_for_any_block_size():
     run = bench.simulate("mam", "rov", 1, samples=9000, rate_hz=100.0)
     estimates = [calibrated(run, Estimator(SMALL), size=size)[0] for size in (9000, 61)]
     assert same(*estimates)
     assert estimates[0].noise_mag_gauss == pytest.approx(1e-3, rel=0.05)
 
 
-def test_add_tells_when_there_is_news():
+def test_add_returns_whether_there_is_a_new_estimate():
     run = bench.simulate("mam", "rov", 1, samples=400)
     estimator = Estimator(SMALL)
     assert estimator.estimate() is None
@@ -298,7 +302,7 @@ def test_add_tells_when_there_is_news():
     assert estimator.add(bench.piece(run.block, 129, 400))
 
 
-def test_an_empty_stream_has_no_estimate():
+def test_empty_stream_has_no_estimate():
     assert Estimator().finish() is None
     assert not Estimator().interrupt()
     estimator = Estimator()
@@ -306,7 +310,7 @@ def test_an_empty_stream_has_no_estimate():
     assert estimator.finish() is None
 
 
-def test_bad_samples_are_refused_and_leave_no_trace():
+def test_bad_samples_are_refused_without_side_effects():
     run = bench.simulate("mam", "rov", 1, samples=600)
     clean, _ = calibrated(run, Estimator(SMALL), size=100)
     estimator = Estimator(SMALL)
@@ -321,7 +325,7 @@ def test_bad_samples_are_refused_and_leave_no_trace():
 
 
 def test_gaps_are_never_bridged():
-    """Unseen turns between the pieces: bridging one would wreck the answer."""
+    """The vehicle turns unseen between the pieces: bridging one gap would spoil the estimate."""
     run = bench.simulate("wam", "rov", 5)
     pieces = [bench.piece(run.block, k, k + 900) for k in range(0, 10_000, 1000)]
     estimator = Estimator()
@@ -336,7 +340,7 @@ def test_gaps_are_never_bridged():
     assert estimate.duration_s == pytest.approx(10 * 899 / 25)
 
 
-def test_a_magnet_passing_by_does_not_move_the_answer():
+def test_passing_magnet_hardly_changes_the_estimate():
     run = bench.simulate("wam", "rov", 2)
     clean, _ = calibrated(run)
     t = run.block.time_s
@@ -348,7 +352,7 @@ def test_a_magnet_passing_by_does_not_move_the_answer():
     assert not estimate.warnings
 
 
-def test_single_wild_samples_do_not_move_the_answer():
+def test_single_outliers_hardly_change_the_estimate():
     run = bench.simulate("wam", "rov", 2)
     clean, _ = calibrated(run)
     raw = run.block.raw_b_gauss.copy()
@@ -366,8 +370,8 @@ def test_single_wild_samples_do_not_move_the_answer():
         for j, at_once in enumerate((1, 5, WHOLE))
     ],
 )
-def test_a_magnet_that_stays_starts_the_calibration_anew(step_gauss, at_once):
-    """Body-fixed from 200 s on: what follows is as good as if nothing had been before."""
+def test_permanent_magnet_restarts_the_calibration(step_gauss, at_once):
+    """Fixed to the vehicle from 200 s on: the later estimate is as good as without earlier data."""
     run = bench.simulate("wam", "rov", 4)
     change = step_gauss * np.array([0.6, -0.48, 0.64])
     late = run.block.time_s > 200.0
@@ -379,7 +383,7 @@ def test_a_magnet_that_stays_starts_the_calibration_anew(step_gauss, at_once):
         assert not any(e.warnings for t, e in history if t < 205.0)
         estimate = estimator.finish()
     else:
-        estimate = unasked(estimator, block)
+        estimate = finished(estimator, block)
     assert len(estimate.warnings) == 1
     said_s = float(estimate.warnings[0].split(" s:")[0].split()[-1])
     assert 175.0 < said_s < 225.0
@@ -391,10 +395,10 @@ def test_a_magnet_that_stays_starts_the_calibration_anew(step_gauss, at_once):
 # -- cost ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow  # the cost alone: test_long; what a daemon keeps: benchmarks/daemon/test_soak
+@pytest.mark.slow  # the cost alone: test_long; memory of a daemon: benchmarks/daemon/test_soak
 @pytest.mark.parametrize("kind", ["wam", "planar"])
 def test_cost_and_memory_do_not_grow_with_the_run(kind):
-    """Calls and memory: the last 4,500 samples of 10,500 cost what the 4,500 before do.
+    """Calls and memory: the last 4,500 samples of 10,500 cost as much as the 4,500 before.
 
     In seconds, over more samples: `benchmarks/estimator/bench_long.py`.
     """
@@ -420,7 +424,9 @@ def test_cost_and_memory_do_not_grow_with_the_run(kind):
 
 @pytest.fixture(params=[pytest.param(1, marks=pytest.mark.slow), WHOLE])
 def replayed(request, recordings):
-    """By epochs, as in the daemon, whose replays are in offline/test_replay_recordings; at once."""
+    """By epochs as in the daemon, whose replays are in offline/test_replay_recordings, or all at
+    once.
+    """
     return lambda name: replay_of(recordings / "vn100" / f"{name}.csv.gz", request.param)
 
 
@@ -439,9 +445,9 @@ def replay_of(path, at_once):
     return estimate, calls / estimate.samples
 
 
-def test_the_two_punch_recordings_give_the_same_hard_iron(replayed):
-    """The same sensor on two fists, which turned about x: x is held near the device's value and
-    says so; what remains repeats.
+def test_two_recordings_of_one_sensor_give_the_same_hard_iron(replayed):
+    """The same sensor on two fists, which turned about x. The x axis is held near the device's
+    value and reported as unobservable; the others repeat.
     """
     (first, _), (second, _) = replayed("punch_2024_shaked"), replayed("punch_2024_satish")
     difference = np.abs(first.hard_iron_gauss - second.hard_iron_gauss)
@@ -454,7 +460,7 @@ def test_the_two_punch_recordings_give_the_same_hard_iron(replayed):
         assert abs(estimate.hard_iron_gauss[0] - 0.24) < 2.5 * estimate.sigma[6]
 
 
-def test_a_real_sensor_at_rest_is_told_apart(replayed):
+def test_real_sensor_at_rest_does_not_converge(replayed):
     estimate, calls = replayed("static_2025_kiran_5min")
     assert not estimate.converged
     names = " ".join(estimate.observability.unobservable)
@@ -466,7 +472,7 @@ def test_a_real_sensor_at_rest_is_told_apart(replayed):
 
 
 @pytest.mark.parametrize("name", ["circles_2022_rahul", "drive_2022_rahul", "circles_2024_liu"])
-def test_what_a_car_cannot_know_stays_where_the_device_has_it(replayed, name):
+def test_directions_unobservable_in_a_car_keep_the_values_of_the_device(replayed, name):
     estimate, calls = replayed(name)
     assert "soft iron zz" in " ".join(estimate.observability.unobservable)
     assert abs(estimate.hard_iron_gauss[2]) < 0.1
@@ -474,20 +480,22 @@ def test_what_a_car_cannot_know_stays_where_the_device_has_it(replayed, name):
     assert calls < 120
 
 
-def test_circles_calibrate_the_drive_that_follows(replayed, request):
-    """The hard iron in the plane of the turn, of the same car minutes apart."""
+def test_hard_iron_from_circles_agrees_with_that_of_the_next_drive(replayed, request):
+    """The hard iron in the plane of the turn, for the same car minutes apart."""
     (circles, _), (drive, _) = replayed("circles_2022_rahul"), replayed("drive_2022_rahul")
     spread = np.sqrt(circles.sigma[6:8] ** 2 + drive.sigma[6:8] ** 2)
     difference = np.abs(circles.hard_iron_gauss - drive.hard_iron_gauss)[:2]
     assert np.all(difference < 2.5 * spread)
     assert np.all(difference < 0.07)
     streamed = request.node.callspec.params["replayed"] == 1
-    # something is left over by the attitude: without it 0.15 and 0.18
+    # a residual follows the attitude: without it 0.15 and 0.18
     assert np.all(spread < (0.19 if streamed else 0.24))
 
 
-def test_a_misfit_within_chance_leaves_the_sigmas_as_they_are():
-    """It is as often below 1, where it counts as 1: else sigmas were always too large."""
+def test_misfit_within_chance_does_not_widen_the_sigmas():
+    """It is as often below 1, where it counts as 1, so sigmas would otherwise always be too
+    large.
+    """
     run = bench.simulate("mam", "rov", 5, samples=4000)
     estimator = Estimator(IDEAL, at_once=WHOLE)
     estimator.add(run.block)
@@ -497,8 +505,8 @@ def test_a_misfit_within_chance_leaves_the_sigmas_as_they_are():
     assert np.all(of_bound[6:] < 1.06)
 
 
-def test_names_of_what_is_not_seen_do_not_hang_on_the_basis():
-    """Equal eigenvalues leave the basis open: another processor has another one."""
+def test_names_of_undetermined_directions_do_not_depend_on_the_basis():
+    """Equal eigenvalues leave the basis open, and it differs between processors."""
     rng = np.random.default_rng(5)
     V = np.linalg.qr(rng.normal(size=(12, 9)))[0]
     names = online.undetermined_names(V)

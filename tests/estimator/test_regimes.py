@@ -1,4 +1,4 @@
-"""Sigmas over changes of regime: what is announced at the end is what the whole data determine.
+"""Sigmas over changes of the motion: the final sigmas are those that all data determine.
 
 The long form is tests/benchmarks/estimator/bench_regimes.py.
 """
@@ -48,10 +48,11 @@ def part(block: SampleBlock, a: int, b: int) -> SampleBlock:
         for rate_hz in (10.0, 40.0)
     ],
 )
-def test_a_change_of_regime_leaves_the_sigmas_at_the_bound(name, rate_hz, seeds):
-    """Several noises, half of them with a field that is late.
+def test_sigmas_stay_at_the_bound_after_a_change_of_motion(name, rate_hz, seeds):
+    """Several noise levels, half of the runs with a delayed field.
 
-    A minute or two at 10 Hz tell so little of the gyro's noise that sigmas follow its chance.
+    A minute or two at 10 Hz determine the gyro's noise so poorly that the sigmas follow its chance
+    error.
     """
     least = 0.8 if rate_hz > 10 else 0.6
     for seed in range(seeds):
@@ -69,7 +70,7 @@ def test_a_change_of_regime_leaves_the_sigmas_at_the_bound(name, rate_hz, seeds)
 @pytest.mark.parametrize(
     "name", ["circles-roll", pytest.param("rest-circles-pitch", marks=pytest.mark.slow)]
 )
-def test_fast_rows_and_readings_that_are_held_do_no_harm(name, hold):
+def test_sigmas_stay_at_the_bound_with_fast_rows_and_held_readings(name, hold):
     made = pieces.drive(REGIMES[name], 1, rate_hz=100.0, lag_s=LAG_S, hold=hold)
     found = pieces.answer(made)
     assert found.converged
@@ -78,8 +79,8 @@ def test_fast_rows_and_readings_that_are_held_do_no_harm(name, hold):
 
 
 @pytest.mark.parametrize("count", [20, pytest.param(30, marks=pytest.mark.slow)])
-def test_motions_put_together_from_pieces(monkeypatch, count):
-    """Numbers of the iron: hardly one below 0.9 times its bound, and rarely one above 1.5."""
+def test_sigmas_of_random_motions_are_near_the_bound(monkeypatch, count):
+    """Sigmas of the iron: hardly any below 0.9 of its bound, and few above 1.5."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     bench = importlib.import_module("bench_regimes")
     runs = [bench.run(seed, at_once=32) for seed in range(200, 200 + count)]
@@ -92,12 +93,12 @@ def test_motions_put_together_from_pieces(monkeypatch, count):
 
 
 @pytest.mark.slow  # a shorter form: test_imperfections
-def test_an_instrument_with_imperfections_is_known_as_well_as_the_motion_allows(monkeypatch):
-    """Turned axes, a lag, wrong scales, a bias that drifts: beside the bound that has them too.
+def test_sigmas_with_an_imperfect_instrument_are_near_its_bound(monkeypatch):
+    """Misalignment, delay, scale errors and bias drift, compared with a bound that has them too.
 
-    The long form is `bench_regimes.py --instrument iron-still`; what is wanted is none below 0.9
-    and one in twenty above 1.5 (docs/design/estimator.md). Axes that are turned by some degrees
-    may make more of the heading than counts as converged: iron is judged all the same.
+    The long form is `bench_regimes.py --instrument iron-still`. The target is none below 0.9 and
+    one in twenty above 1.5 (docs/design/estimator.md). A misalignment of some degrees may have a
+    larger effect on the heading than counts as converged; the iron is tested all the same.
     """
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     bench = importlib.import_module("bench_regimes")
@@ -114,10 +115,11 @@ def test_an_instrument_with_imperfections_is_known_as_well_as_the_motion_allows(
     assert np.mean([r.nees for r in sure]) < 1.2
 
 
-def test_rests_tell_the_bias_and_nothing_of_the_scales():
-    """The gyro's matrix acts on the turn and not on the bias that is in its readings as well: else
-    whoever knows the bias of the readings to a percent of itself knows the scales too, and level
-    circles leave the vertical hard iron open by what they may be."""
+def test_rest_determines_the_gyro_bias_and_not_the_scales():
+    """The gyro's matrix acts on the rate and not on the bias, which is in the readings as well.
+    Otherwise a bias known to one percent would determine the scales, and the vertical hard
+    iron of level circles would be left open by their prior only.
+    """
     kind = replace(ASSEMBLED, iron_gauss=1e-9)
     for seed in (1, 2, 3):
         made = pieces.drive((("rest", 70.0), ("circles", 90.0), ("rest", 70.0)), seed, rate_hz=20.0)
@@ -128,8 +130,10 @@ def test_rests_tell_the_bias_and_nothing_of_the_scales():
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_what_a_lag_costs_follows_the_data(seed):
-    """Found in level circles, where it leaves the vertical hard iron open; the roll closes that."""
+def test_effect_of_a_delay_on_sigma_follows_the_data(seed):
+    """In level circles the delay is found but leaves the vertical hard iron open; a roll
+    determines it.
+    """
     made = pieces.drive((("circles", 100.0), ("roll", 60.0)), seed, rate_hz=20.0, lag_s=LAG_S)
     estimator = Estimator(pieces.IDEAL)
     estimator.add(part(made.block, 0, 2000))
@@ -143,8 +147,8 @@ def test_what_a_lag_costs_follows_the_data(seed):
 @pytest.mark.parametrize("motion", [
     (("rest", 62.0), ("circles", 73.0)), (("circles", 40.0), ("straight", 40.0)),
 ])  # fmt: skip
-def test_taking_a_lag_out_leaves_no_noise_behind(motion):
-    """The directions follow the lag, so that the fields fit as well as before."""
+def test_removing_a_delay_does_not_raise_the_noise(motion):
+    """The directions are delayed as well, so that the fields fit as before."""
     for seed in (1, 2):
         made = pieces.drive(motion, seed, lag_s=LAG_S)
         found = pieces.answer(made, at_once=32)
@@ -153,8 +157,8 @@ def test_taking_a_lag_out_leaves_no_noise_behind(motion):
         assert pieces.ratios(made, found)[:9].max() < 1.8
 
 
-def test_what_left_the_window_still_tells_the_lag():
-    """A roll that is forgotten as rows and remembered as a Gaussian, then circles for long."""
+def test_folded_epochs_still_determine_the_delay():
+    """A roll that is kept only as a Gaussian summary, followed by long circles."""
     made = pieces.drive((("roll", 80.0), ("circles", 1100.0)), 4, rate_hz=20.0, lag_s=LAG_S)
     estimator = Estimator(pieces.IDEAL)
     for a in range(0, len(made.block), 400):
@@ -163,12 +167,14 @@ def test_what_left_the_window_still_tells_the_lag():
     assert estimator._window.folded
     assert found.mag_lag_s == pytest.approx(LAG_S, abs=1e-3)
     ratio = pieces.ratios(made, found)[:9]
-    assert ratio.min() > 0.8 and ratio.max() < 2.0  # the bias walks, which the bound does not know
+    assert (
+        ratio.min() > 0.8 and ratio.max() < 2.0
+    )  # the bias walks, which the bound does not include
     assert pieces.nees_of(made, found) < 4.0
 
 
-def test_a_rest_before_the_bias_is_known_is_no_noise():
-    """Rows at rest drift where the gyro's bias is not known yet: that is no error of the model."""
+def test_rest_before_the_bias_is_known_does_not_raise_the_noise():
+    """Predicted fields at rest drift while the bias is unknown, which is no error of the model."""
     made = pieces.drive((("rest", 60.0), ("circles", 60.0), ("roll", 40.0)), 0)
     found = pieces.answer(made)
     assert found.noise_mag_gauss == pytest.approx(pieces.MAG_GAUSS, rel=0.05)
@@ -182,9 +188,10 @@ def level(seed, seconds=240.0, mag_gauss=2e-3):
     return replace(made, block=replace(made.block, raw_b_gauss=made.block.raw_b_gauss + louder))
 
 
-def test_level_turns_end_in_one_answer():
-    """The likelihood has a valley there that takes many steps, and its mirror image: all starts are
-    followed until two agree, and what is announced is not that they do not."""
+def test_level_turns_converge_to_one_estimate():
+    """The likelihood has a long valley there and its mirror image. All starts are followed until
+    two agree, so that the misfit is not due to their disagreement.
+    """
     for seed in range(8):
         made = level(seed)
         found = pieces.answer(made, at_once=32)
@@ -195,10 +202,10 @@ def test_level_turns_end_in_one_answer():
         assert found.sigma[8] < 0.15
 
 
-def test_no_way_is_straight_where_the_matrix_would_not_stay_positive():
+def test_path_is_infinite_when_the_matrix_would_not_stay_positive():
     at = np.r_[np.array([0.4, 0.0, 0.0, 0.4, 0.0, 0.03]), np.zeros(3)]
     there = at.copy()
-    there[5] += 0.2  # C zz would fall from 33 by more than that
+    there[5] += 0.2  # C zz would decrease from 33 by more than that
     factor = SimpleNamespace(point=SimpleNamespace(c=at))
     epoch, resting = (SimpleNamespace(has_motion=t, factor=factor) for t in (True, False))
     found = path_curvatures([epoch, resting], there, Moments(), np.eye(9))
@@ -206,8 +213,8 @@ def test_no_way_is_straight_where_the_matrix_would_not_stay_positive():
     assert found[1] == 0.0
 
 
-def test_rests_tell_that_the_bias_drifts():
-    """Two rolls between rests: the gyro's bias at both rests is known, and it has moved."""
+def test_two_rests_determine_the_bias_drift():
+    """Two rolls between rests: the gyro bias is known at both rests, and it has changed."""
     made = pieces.drive((("rest", 50.0), ("roll", 60.0), ("roll", 60.0), ("rest", 50.0)), 3)
     time_s = made.block.time_s
     drift = (time_s / time_s[-1] - 1.0)[:, None] * np.array([2e-3, -1e-3, 2e-3])

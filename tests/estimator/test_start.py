@@ -1,4 +1,4 @@
-"""The linear starts: exact without noise, and no shrinking with noise in the regressors."""
+"""The linear starts: exact without noise, and unbiased by noise in the regressors."""
 
 from __future__ import annotations
 
@@ -36,8 +36,10 @@ def test_linear_start_is_exact_without_noise():
     np.testing.assert_allclose(c[6:], B, atol=1e-6)
 
 
-def test_linear_start_does_not_shrink_with_noise():
-    """Errors in variables: the mean over noise stays at the truth; least squares would not."""
+def test_linear_start_is_not_attenuated_by_noise():
+    """Errors in variables: the mean over the noise stays at the truth, unlike that of least
+    squares.
+    """
     found = np.array([chain.linear_start([epoch(0.25, 5e-3, seed)]) for seed in range(12)])
     truth = np.r_[chain.upper_triangle(M), B]
     error, spread = found.mean(axis=0) - truth, found.std(axis=0) / np.sqrt(12)
@@ -49,7 +51,7 @@ def test_linear_start_needs_an_epoch_longer_than_its_lags():
     assert chain.linear_start([epoch(0.5, 0.0, n=15)]) is None
 
 
-def test_linear_start_refuses_what_is_not_positive_definite():
+def test_linear_start_returns_only_positive_definite_matrices():
     rng = np.random.default_rng(0)
     field = rng.normal(size=(400, 3))
     data = chain.EpochData(
@@ -66,25 +68,25 @@ def test_sphere_start_is_exact_on_a_sphere():
     np.testing.assert_allclose(c, np.r_[0.47, 0, 0, 0.47, 0, 0.47, B], atol=1e-12)
 
 
-def test_sphere_start_refuses_a_plane():
+def test_sphere_start_refuses_planar_data():
     angle = np.linspace(0, 6, 100)
     circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(100)])
     assert chain.sphere_start(circle) is None
 
 
 @pytest.mark.parametrize(("amplitude", "expected"), [(0.0, False), (0.02, True), (0.5, True)])
-def test_turned_wants_a_rotation(amplitude, expected):
+def test_motion_is_recognised_by_rotation(amplitude, expected):
     assert has_motion(epoch(amplitude, 1e-3, n=512), np.zeros(3)) is expected
 
 
-def test_a_field_that_wanders_while_the_gyro_rests_is_no_turn():
+def test_wandering_field_at_rest_is_not_motion():
     data = epoch(0.0, 1e-3, n=512)
     data.field_b_gauss[:, 2] += np.linspace(0, 0.05, 512)
     assert not has_motion(data, np.zeros(3))
 
 
-def test_a_magnet_that_comes_while_the_gyro_rests_is_no_turn_and_a_steady_turn_is_one():
-    """The mean rate may be bias, so only what is left of it tells a steady turn."""
+def test_magnet_at_rest_is_not_motion_and_a_steady_turn_is():
+    """The mean rate may be bias, so only the rate without the bias shows a steady turn."""
     data, bias = epoch(0.0, 1e-3, n=512), np.array([0.02, -0.01, 0.015])
     data.angle_b_rad[:] += bias * data.dt_s[:, None]
     away = np.exp(-0.5 * ((np.arange(512) - 256) / 80.0) ** 2)
@@ -94,7 +96,7 @@ def test_a_magnet_that_comes_while_the_gyro_rests_is_no_turn_and_a_steady_turn_i
     assert has_motion(replace(data, angle_b_rad=steady), bias)
 
 
-def test_a_mirrored_start_is_on_the_other_side_of_the_plane_of_the_fields():
+def test_mirrored_start_is_on_the_other_side_of_the_field_plane():
     heading = np.linspace(0.0, 2 * np.pi, 50)
     level = np.column_stack([0.2 * np.cos(heading), 0.2 * np.sin(heading), np.full(50, 0.4)])
     c = np.r_[chain.upper_triangle(M), 0.1, -0.2, 0.05]

@@ -1,4 +1,4 @@
-"""Misfit does not average out: by hand, and where errors of all epochs are the same."""
+"""Misfit that does not average out: a small example, and errors common to all epochs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from ahrsd.estimator.noise import covariance_with_common_errors
 
 NOTHING = np.zeros((2, 2)), 0.0
-#: four epochs tell the first number, the last of them the second one as well
+#: four epochs determine the first parameter, the last of them the second one as well
 EPOCHS = np.array([np.diag([25.0, 0.0])] * 3 + [np.diag([25.0, 4.0])])
 WEAK_PRIOR = 1e-9 * np.eye(2)
 
@@ -17,28 +17,30 @@ def covariance(temper, epochs=EPOCHS):
     return np.linalg.inv(epochs.sum(axis=0) / temper + WEAK_PRIOR)
 
 
-def test_each_number_by_as_many_epochs_as_tell_it():
-    """Variance of noise 1, and of what is the same in all, misfit - 1, n times."""
+def test_variance_of_a_parameter_counts_the_epochs_that_determine_it():
+    """Variance of the noise 1, and of the common error, misfit - 1, n times."""
     found = covariance_with_common_errors(
         covariance(9.0), EPOCHS, misfit=9.0, temper=9.0, folded=NOTHING
     )
     assert found == pytest.approx(np.diag([(1 + 8 * 4) / 100, 9 / 4]), rel=1e-6)
 
 
-def test_without_misfit_nothing_is_wider():
+def test_nothing_is_widened_without_misfit():
     before = covariance(1.0)
     found = covariance_with_common_errors(before, EPOCHS, misfit=1.0, temper=1.0, folded=NOTHING)
     assert np.array_equal(found, before)
 
 
-def test_a_direction_that_is_wider_already_is_not_widened_again():
-    """By what repeats with the attitude: 40 times the variance, of which this would make 33."""
+def test_direction_that_is_already_wider_is_not_widened_again():
+    """Errors that repeat with the attitude gave it 40 times the variance; this rule would give
+    33.
+    """
     before = covariance(40.0)
     found = covariance_with_common_errors(before, EPOCHS, misfit=9.0, temper=40.0, folded=NOTHING)
     assert found == pytest.approx(before, rel=1e-9)
 
 
-def test_epochs_that_left_count_as_if_they_were_there():
+def test_folded_epochs_count_as_if_in_the_window():
     whole = covariance_with_common_errors(
         covariance(9.0), EPOCHS, misfit=9.0, temper=9.0, folded=NOTHING
     )
@@ -49,16 +51,16 @@ def test_epochs_that_left_count_as_if_they_were_there():
     assert found == pytest.approx(whole, rel=1e-9)
 
 
-def test_what_is_believed_stays_where_the_data_say_little():
-    """Beside a prior of 1: what they are bent by hardly moves the answer."""
+def test_prior_dominated_direction_is_hardly_widened():
+    """With a prior of 1, errors of the epochs hardly change the estimate."""
     epochs = np.tile(np.diag([0.02, 0.02]), (5, 1, 1))
     before = np.linalg.inv(epochs.sum(axis=0) / 50.0 + np.eye(2))
     found = covariance_with_common_errors(before, epochs, misfit=50.0, temper=50.0, folded=NOTHING)
     assert np.diag(found) == pytest.approx([1.0, 1.0], rel=0.01)
 
 
-def test_it_is_the_spread_of_answers_whose_epochs_are_bent_alike():
-    """Ten thousand drawn: each epoch asks for noise of its own and for one bend of all."""
+def test_covariance_is_the_spread_of_estimates_with_a_common_error():
+    """Ten thousand draws: each epoch has its own noise, and all share one error."""
     rng = np.random.default_rng(1)
     n, misfit = 10_000, 5.0
     root = np.sqrt(EPOCHS.diagonal(axis1=1, axis2=2))  # (4, 2)

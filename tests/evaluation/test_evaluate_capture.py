@@ -1,4 +1,4 @@
-"""A capture with registers: before is what the device makes of the field, not what it reads."""
+"""A capture with registers: "before" is the output of the device, not the raw reading."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def captured(tmp_path):
     return path, device
 
 
-def test_before_is_what_the_registers_make_of_it(captured, run, capsys):
+def test_before_applies_the_registers_of_the_device(captured, run, capsys):
     path, device = captured
     assert run("evaluate", path, "--calibration", path.with_name("c.json"), "--json", "-") == 0
     field = json.loads(capsys.readouterr().out)["field"]
     assert field["after"]["spread"] < 0.005
     true_gauss = field["after"]["mean_gauss"]
-    # the mean size of C (A h + b - B) over all attitudes of h, beside what the command found
+    # mean size of C (A h + b - B) over all attitudes of h, compared with the command's result
     directions = np.random.default_rng(1).normal(size=(20_000, 3))
     h = true_gauss * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     reading = h @ device.truth.soft_iron.T + device.truth.hard_iron_gauss

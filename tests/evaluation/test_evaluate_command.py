@@ -1,4 +1,4 @@
-"""`ahrsd evaluate` from the shell: figures, files, and what is refused in one line."""
+"""`ahrsd evaluate` from the shell: figures, files, and one-line refusals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GOOD = {
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A recording of the vehicle as a table, its GPS fixes beside it, and its true calibration."""
+    """A recording of the vehicle as a table, its GPS fixes, and its true calibration."""
     from vehicle import drive
 
     vehicle = drive()
@@ -44,7 +44,7 @@ def files(tmp_path_factory):
     return folder
 
 
-def test_the_whole_command(files, run, capsys, tmp_path):
+def test_command_writes_figures_table_and_json(files, run, capsys, tmp_path):
     code = run(
         "evaluate", files / "drive.csv", "--calibration", files / "c.json", "--report",
         tmp_path / "out", "--date", "2026-07-01",
@@ -67,21 +67,21 @@ def test_the_whole_command(files, run, capsys, tmp_path):
     assert "dead reckoning by Doppler velocity" in out
 
 
-def test_the_igrf_and_a_given_position(files, run, capsys):
+def test_world_field_is_from_the_igrf_or_given(files, run, capsys):
     arguments = ("--position", "47.6,-122.3,10", "--date", "2026-07-01", "--model", "igrf")
     base = ("evaluate", files / "drive.csv", "--calibration", files / "c.json", "--json", "-")
     assert run(*base, *arguments) == 0
     assert json.loads(capsys.readouterr().out)["world_field"]["model"] == "IGRF-14"
 
 
-def test_a_calibration_that_is_worse_is_a_no(files, run, capsys, tmp_path):
+def test_worse_calibration_exits_with_code_one(files, run, capsys, tmp_path):
     bad = {**GOOD, "hard_iron_gauss": [0.3, 0.0, 0.0], "converged": False}
     (tmp_path / "bad.json").write_text(json.dumps(bad))
     assert run("evaluate", files / "drive.csv", "--calibration", tmp_path / "bad.json") == 1
     assert "has not converged" in capsys.readouterr().out
 
 
-def test_a_reference_table_with_attitude_or_a_heading(files, run, capsys, tmp_path):
+def test_reference_table_may_have_attitude_or_heading(files, run, capsys, tmp_path):
     from vehicle import drive
 
     vehicle = drive()
@@ -117,7 +117,7 @@ def test_a_reference_table_with_attitude_or_a_heading(files, run, capsys, tmp_pa
         (("--json", "no/where.json"), "is no folder"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_judged_is_said_in_one_line(files, run, capsys, arguments, words):
+def test_unusable_input_is_refused_in_one_line(files, run, capsys, arguments, words):
     code = run("evaluate", files / "drive.csv", "--calibration", files / "c.json", *arguments)
     said = capsys.readouterr().err
     assert code == 2
@@ -125,7 +125,7 @@ def test_what_cannot_be_judged_is_said_in_one_line(files, run, capsys, arguments
     assert said.count("\n") == 1
 
 
-def test_a_gps_file_that_is_none(files, run, capsys, tmp_path):
+def test_bad_gps_file_is_refused(files, run, capsys, tmp_path):
     base = ("evaluate", files / "drive.csv", "--calibration", files / "c.json")
     for text, words in (
         ("t_s,lat_deg\n1,2\n", "has no column lon_deg; a GPS file needs t_s, lat_deg, lon_deg"),
@@ -160,14 +160,14 @@ BAD = [
 
 
 @pytest.mark.parametrize(("change", "words"), BAD)
-def test_a_calibration_json_that_is_wrong_is_refused_in_one_line(change, words):
+def test_wrong_calibration_json_is_refused_in_one_line(change, words):
     with pytest.raises(CalibrationFileError, match=words) as caught:
         parse_calibration({**GOOD, **change}, "c.json")
     assert str(caught.value).startswith("c.json: ")
     assert "\n" not in str(caught.value)
 
 
-def test_a_calibration_json_without_soft_iron_corrects_the_hard_iron_alone():
+def test_calibration_json_without_soft_iron_corrects_only_hard_iron():
     found = parse_calibration({**GOOD, "correction_matrix": None, "soft_iron": None}, "c.json")
     assert np.array_equal(found.correction.matrix, np.eye(3))
     assert any("only the hard iron" in text for text in found.remarks)
@@ -176,7 +176,7 @@ def test_a_calibration_json_without_soft_iron_corrects_the_hard_iron_alone():
             parse_calibration(junk, "c.json")
 
 
-def test_one_of_several_calibrations():
+def test_one_of_several_calibrations_can_be_chosen():
     many = {"schema": "ahrsd.calibrations/1", "calibrations": [GOOD, {**GOOD, "method": "fnp"}]}
     assert parse_calibration(many, "c.json", "fnp").method == "fnp"
     with pytest.raises(CalibrationFileError, match="choose one with --method: magyc, fnp"):
@@ -185,7 +185,7 @@ def test_one_of_several_calibrations():
         parse_calibration(many, "c.json", "np")
 
 
-def test_a_file_that_is_no_json(files, run, capsys, tmp_path):
+def test_file_that_is_not_json_is_refused(files, run, capsys, tmp_path):
     (tmp_path / "x.json").write_text("{")
     assert run("evaluate", files / "drive.csv", "--calibration", tmp_path / "x.json") == 2
     assert "is no JSON" in capsys.readouterr().err
@@ -193,7 +193,7 @@ def test_a_file_that_is_no_json(files, run, capsys, tmp_path):
     assert "none.json: cannot be read: No such file" in capsys.readouterr().err
 
 
-def test_every_calibration_of_a_file_in_one_table(files, run, capsys, tmp_path):
+def test_all_calibrations_of_a_file_are_in_one_table(files, run, capsys, tmp_path):
     worse = {**GOOD, "method": "ellipsoid", "converged": False,
              "hard_iron_gauss": (HARD_IRON + 0.03).tolist()}  # fmt: skip
     none = {"method": "tls", "hard_iron_gauss": None, "warnings": ["needs the field's magnitude"]}
@@ -223,7 +223,7 @@ def test_every_calibration_of_a_file_in_one_table(files, run, capsys, tmp_path):
     assert f"{low:+.2f} to {high:+.2f}" in lines[first + 2]
 
 
-def test_a_file_of_one_calibration_has_no_table(files, run, capsys):
+def test_table_needs_several_calibrations(files, run, capsys):
     code = run(
         "evaluate", files / "drive.csv", "--calibration", files / "c.json", "--method", "all"
     )

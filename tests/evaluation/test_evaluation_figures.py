@@ -1,4 +1,4 @@
-"""Heading, field and dead reckoning of a vehicle whose truth is known."""
+"""Heading, field and dead reckoning of a vehicle with known truth."""
 
 from __future__ import annotations
 
@@ -33,16 +33,14 @@ def with_columns(vehicle, **columns):
 
 
 def with_optics(vehicle, world=None):
-    """The true attitude as an optical system gives it, in a world of its own."""
+    """The true attitude from an optical system with its own world frame."""
     world = Rotation.identity() if world is None else world
     q = (world * Rotation.from_matrix(vehicle.R_nb)).as_quat()
     names = ("ref_qx", "ref_qy", "ref_qz", "ref_qw")
     return with_columns(vehicle, **dict(zip(names, q.T, strict=True)))
 
 
-def test_against_the_course_the_truth_has_the_slip_and_the_declination_as_its_constant(
-    vehicle, perfect
-):
+def test_offset_of_true_heading_to_gps_course_is_slip_and_declination(vehicle, perfect):
     found = judge(
         "r", vehicle.track, perfect, [course_reference(vehicle.fixes, 4.0)], fixes=vehicle.fixes
     )
@@ -52,7 +50,7 @@ def test_against_the_course_the_truth_has_the_slip_and_the_declination_as_its_co
     assert len(after.error_deg) == 198
     assert after.rms_deg < 0.05
     assert after.worst_deg < 0.2
-    # magnetic heading minus course: the nose is 5 deg left of the course, north at the declination
+    # magnetic heading minus course: 5 deg of slip to the left, and the declination
     assert after.offset_deg == pytest.approx(-5.0 - DECLINATION_DEG, abs=0.02)
     assert max(after.fold_rms_deg) < 0.1
     assert len(after.fold_rms_deg) == 5
@@ -61,8 +59,8 @@ def test_against_the_course_the_truth_has_the_slip_and_the_declination_as_its_co
     assert found.better
 
 
-def test_the_error_of_a_hard_iron_on_a_level_turn_is_the_textbooks(vehicle):
-    """A hard iron b ahead swings the heading by atan(b sin / (H + b cos))."""
+def test_hard_iron_error_on_a_level_turn_has_the_textbook_form(vehicle):
+    """A hard iron b ahead changes the heading by atan(b sin / (H + b cos))."""
     heading = np.linspace(-np.pi, np.pi, 721)[:-1]
     field = np.column_stack(
         [0.2 * np.cos(heading) + 0.02, -0.2 * np.sin(heading), 0.4 + 0 * heading]
@@ -82,7 +80,7 @@ def test_the_error_of_a_hard_iron_on_a_level_turn_is_the_textbooks(vehicle):
     "world",
     [Rotation.from_euler("z", 77, degrees=True), Rotation.from_euler("x", 180, degrees=True)],
 )
-def test_an_optical_world_may_have_any_yaw_and_z_up(vehicle, perfect, world):
+def test_optical_frame_may_have_any_yaw_and_z_up(vehicle, perfect, world):
     track = with_optics(vehicle, world)
     reference = optical_reference(track)
     found = judge("r", track, perfect, [reference])
@@ -91,8 +89,8 @@ def test_an_optical_world_may_have_any_yaw_and_z_up(vehicle, perfect, world):
     assert found.headings[0].figures.before.rms_deg > 5.0
 
 
-def test_optical_attitude_judges_where_the_x_axis_points_up(vehicle, perfect):
-    """The error is that of the field's direction about the vertical, whatever the x axis does."""
+def test_optical_attitude_works_when_the_x_axis_is_vertical(vehicle, perfect):
+    """The error is that of the field's direction about the vertical, independent of the x axis."""
     noses_up = Rotation.from_matrix(vehicle.R_nb) * Rotation.from_euler("y", 89.9, degrees=True)
     turned = Rotation.from_euler("y", 89.9, degrees=True).inv().as_matrix()
     track = with_optics(replace(vehicle, R_nb=noses_up.as_matrix()))
@@ -105,7 +103,7 @@ def test_optical_attitude_judges_where_the_x_axis_points_up(vehicle, perfect):
     assert found.headings[0].figures.after.worst_deg < 1e-3
 
 
-def test_rows_without_an_optical_attitude_are_left_out(vehicle, perfect):
+def test_rows_without_optical_attitude_are_left_out(vehicle, perfect):
     track = with_optics(vehicle)
     for name in ("ref_qw", "ref_qx", "ref_qy", "ref_qz"):
         track.covariates[name][:4000] = np.nan
@@ -118,7 +116,7 @@ def test_rows_without_an_optical_attitude_are_left_out(vehicle, perfect):
     assert optical_reference(vehicle.track) is None
 
 
-def test_the_devices_own_yaw_is_said_to_be_no_truth(vehicle, perfect):
+def test_device_yaw_is_reported_not_to_be_the_truth(vehicle, perfect):
     yaw = np.degrees(wrapped(vehicle.heading_rad))
     track = with_columns(vehicle, vn_yaw_deg=yaw, vn_pitch_deg=0 * yaw, vn_roll_deg=0 * yaw)
     reference = device_heading(track)
@@ -136,7 +134,7 @@ def test_the_devices_own_yaw_is_said_to_be_no_truth(vehicle, perfect):
     assert device_heading(vehicle.track) is None
 
 
-def test_without_an_accelerometer_the_devices_tilt_is_taken_and_said(vehicle, perfect):
+def test_device_tilt_is_used_and_reported_without_an_accelerometer(vehicle, perfect):
     yaw, pitch, roll = np.degrees(Rotation.from_matrix(vehicle.R_nb).as_euler("ZYX").T)
     track = with_columns(vehicle, vn_yaw_deg=yaw, vn_pitch_deg=pitch, vn_roll_deg=roll)
     blind = replace(track, accel_b_m_s2=np.full((len(track), 3), np.nan))
@@ -152,8 +150,8 @@ def test_without_an_accelerometer_the_devices_tilt_is_taken_and_said(vehicle, pe
     assert any("nothing says which way is up" in text for text in nothing.warnings)
 
 
-def test_gravity_is_steadier_than_the_accelerometer_and_forgives_a_gyro_bias(vehicle):
-    """A swing of 2 m/s^2 at 0.2 Hz, and a bias of 1 mrad/s."""
+def test_estimated_gravity_is_better_than_the_accelerometer(vehicle):
+    """An oscillation of 2 m/s^2 at 0.2 Hz, and a gyro bias of 1 mrad/s."""
     t = vehicle.track.time_s
     true = vehicle.track.accel_b_m_s2
     shaken = true + 2.0 * np.sin(2 * np.pi * 0.2 * t)[:, None] * np.array([0.0, 1.0, 0.0])
@@ -190,7 +188,7 @@ def test_dead_reckoning_with_a_doppler_log_follows_the_slip(vehicle, perfect):
     assert np.hypot(north - vehicle.fixes.north_m, east - vehicle.fixes.east_m).max() < 0.1
 
 
-def test_dead_reckoning_with_the_fixes_own_speed_judges_the_heading(vehicle, perfect):
+def test_dead_reckoning_with_gps_speed_tests_the_heading(vehicle, perfect):
     track = replace(vehicle.track, covariates={})
     found = judge("r", track, perfect, [], fixes=vehicle.fixes)
     assert found.reckoned.velocity == "speed of GPS"
@@ -215,7 +213,7 @@ def test_positions_in_the_recording_serve_as_fixes(vehicle, perfect):
     assert fixes_of_track(vehicle.track) is None
 
 
-def test_no_way_no_dead_reckoning(vehicle, perfect):
+def test_no_dead_reckoning_without_motion(vehicle, perfect):
     still = replace(
         vehicle.fixes, north_m=0 * vehicle.fixes.north_m, east_m=0 * vehicle.fixes.east_m
     )
@@ -230,7 +228,7 @@ def test_no_way_no_dead_reckoning(vehicle, perfect):
     assert any("are both on the same clock?" in text for text in found.warnings)
 
 
-def test_a_gap_of_fixes_is_not_bridged(vehicle):
+def test_gap_of_fixes_is_not_bridged(vehicle):
     kept = np.r_[0:80, 110:200]
     broken = replace(
         vehicle.fixes,
@@ -243,7 +241,7 @@ def test_a_gap_of_fixes_is_not_bridged(vehicle):
     assert not np.any((found.time_s > 78.5) & (found.time_s < 110.5))
 
 
-def test_degrees_become_metres():
+def test_degrees_are_converted_to_metres():
     t = np.arange(20.0)
     lat, lon = 42.0 + 1e-4 * t, 179.999 + 1e-4 * t
     lon = (lon + 180.0) % 360.0 - 180.0  # across the date line
@@ -261,7 +259,7 @@ def test_degrees_become_metres():
             )
 
 
-def test_field_figures_are_the_definitions():
+def test_field_figures_follow_their_definitions():
     field = np.zeros((1000, 3))
     field[:, 2] = 0.5 + 0.05 * np.sign(np.sin(np.arange(1000) + 0.5))
     size = field[:, 2]
@@ -275,7 +273,7 @@ def test_field_figures_are_the_definitions():
     assert len(found.fold_spread) == 5
 
 
-def test_the_truth_leaves_no_spread_and_the_world_sets_the_scale(vehicle, perfect):
+def test_true_calibration_has_no_spread_and_the_world_field_sets_the_scale(vehicle, perfect):
     world = world_field(47.6, -122.3, 0.0, 2026.0)
     found = judge("r", vehicle.track, perfect, [course_reference(vehicle.fixes, 4.0)], world=world)
     assert found.field.after.spread < 1e-9
@@ -286,7 +284,7 @@ def test_the_truth_leaves_no_spread_and_the_world_sets_the_scale(vehicle, perfec
     assert found.headings[0].figures.after.offset_deg == pytest.approx(offset, abs=0.02)
 
 
-def test_what_flatters_is_said_and_what_is_worse_is_a_no(vehicle, perfect):
+def test_evaluation_on_training_data_is_warned_about_and_worse_is_a_no(vehicle, perfect):
     own = judge("another.csv.gz", vehicle.track, perfect, [])
     assert not own.held_out
     assert any("made from this very recording" in text for text in own.warnings)
@@ -297,7 +295,7 @@ def test_what_flatters_is_said_and_what_is_worse_is_a_no(vehicle, perfect):
     assert found.held_out
 
 
-def test_json_and_table_hold_the_same_figures(vehicle, perfect):
+def test_json_and_table_have_the_same_figures(vehicle, perfect):
     found = judge(
         "r", vehicle.track, perfect, [course_reference(vehicle.fixes, 4.0)], fixes=vehicle.fixes
     )
@@ -319,8 +317,10 @@ def _figures(error_deg, *, later_s=0.0):
     return HeadingFigures(0.0, 0.0, 0.0, (), 0.0, time_s, nothing, np.asarray(error_deg))
 
 
-def test_a_difference_of_two_headings_has_an_interval():
-    """Errors that stay for 20 s: the same ones, as large ones, and twice as large ones."""
+def test_difference_of_two_headings_has_a_confidence_interval():
+    """Errors correlated over 20 s: equal ones, independent ones of equal size, and ones of twice
+    the size.
+    """
     rng = np.random.default_rng(3)
     shared = np.repeat(rng.standard_normal(40), 20)
     one = _figures(shared)
@@ -332,7 +332,7 @@ def test_a_difference_of_two_headings_has_an_interval():
     assert high - low > 0.3  # 40 errors of size 1, not 800
 
 
-def test_headings_at_other_instants_or_over_a_minute_are_not_compared():
+def test_headings_at_other_instants_or_of_a_short_time_are_not_compared():
     one = _figures(np.ones(400))
     assert rms_difference(one, _figures(np.ones(400), later_s=0.5)) is None
     assert rms_difference(_figures(np.ones(70)), _figures(np.ones(70))) is None

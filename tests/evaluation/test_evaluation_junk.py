@@ -1,4 +1,4 @@
-"""Whatever a recording, its columns and a calibration hold: one line of error, or finite JSON."""
+"""Any recording, columns and calibration give a one-line error or finite JSON."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ COLUMNS = (
 
 
 def values(rng, n, kind, scale):
-    """Zeros, noise, a ramp, nothing but nan, or noise with holes."""
+    """Zeros, noise, a ramp, only nan, or noise with missing values."""
     noise = scale * rng.normal(size=n)
     return {
         "zero": np.zeros(n), "noise": noise, "ramp": scale * np.arange(n),
@@ -51,7 +51,9 @@ kinds = st.sampled_from(["zero", "noise", "ramp", "nan", "holes"])
     scale=st.sampled_from([1e-3, 1.0, 1e3]),
     gap=st.booleans(),
 )
-def test_junk(seed, n, columns, accel, gyro, scale, gap):
+def test_random_columns_give_a_one_line_error_or_finite_figures(
+    seed, n, columns, accel, gyro, scale, gap
+):
     rng = np.random.default_rng(seed)
     t = 0.02 * np.arange(n) + (30.0 * (np.arange(n) > n // 2) if gap else 0.0)
     raw = rng.normal(size=(n, 3))
@@ -98,7 +100,7 @@ def test_too_few_samples_and_time_backwards_are_refused(vehicle):
         build_track([(block, present), (replace(block, gap_before=True), present)])
 
 
-def test_fixes_that_are_all_apart_give_no_course():
+def test_isolated_fixes_give_no_course():
     fixes = Fixes(np.arange(12.0), np.zeros(12), np.zeros(12), "GPS")
     with pytest.raises(EvaluationError, match="GPS: 0 fixes faster"):
         course_reference(fixes, 4.0)

@@ -1,4 +1,6 @@
-"""A small world for the evidence's tests: attitude, field, iron, gravity. No emulator in it."""
+"""A small world for the tests of the evidence: attitude, field, iron and gravity, without the
+emulator.
+"""
 
 from __future__ import annotations
 
@@ -27,13 +29,15 @@ SOUND = BasisFacts(True, False, False, False, True)
 
 @dataclass
 class Scene:
-    """Degrees and seconds. Rest at both ends; between them turns of `turn_s` and swinging tilt."""
+    """Degrees and seconds. Rest at both ends; between them turns of `turn_s` and oscillating
+    tilt.
+    """
 
     duration_s: float = 330.0
     rest_s: float = 12.0
     rate_hz: float = 40.0
     turn_s: float = 20.0
-    heading_span_deg: float = 360.0  # less than 360: to and fro within it
+    heading_span_deg: float = 360.0  # less than 360: back and forth within it
     roll_deg: float = 35.0
     pitch_deg: float = 35.0
     noise_gauss: float = 0.0005
@@ -86,7 +90,7 @@ def truth() -> Affine:
 
 
 def estimate(correction: Affine | None = None, **changes: Any) -> Estimate:
-    """What an honest estimator would say of `correction` (default: the truth)."""
+    """The estimate of a well-calibrated estimator for `correction` (default: the truth)."""
     correction = correction or truth()
     sigma = np.r_[np.full(6, 0.002), np.full(3, 0.001), np.full(3, 1e-4)]
     value = Estimate(
@@ -110,7 +114,7 @@ def estimate(correction: Affine | None = None, **changes: Any) -> Estimate:
 
 
 def old() -> Affine:
-    """A calibration in force that is 2 to 5 degrees wrong."""
+    """A calibration in force with 2 to 5 degrees of error."""
     return Affine(
         np.linalg.inv(SOFT) + 0.01 * np.diag([1.0, -1.0, 0.0]), HARD + np.array([0.006, 0.004, 0])
     )
@@ -138,7 +142,7 @@ def evidence(scene: Scene, correction: Affine | None = None, **given: Any) -> Ev
 
 
 class World:
-    """What the tests get."""
+    """The functions and constants that the tests use."""
 
     Scene, EvidenceCollector = Scene, EvidenceCollector
     truth, old = staticmethod(truth), staticmethod(old)

@@ -1,4 +1,4 @@
-"""Attitude of a segment against the truth; the first-order bias correction; gravity."""
+"""Attitude of a segment compared with the truth; the first-order bias correction; gravity."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def test_bias_correction_is_first_order(world) -> None:
 
 
 @pytest.mark.parametrize("forward_m_s2", [0.0, 2.0])
-def test_down_is_found_though_the_vehicle_accelerates(world, forward_m_s2) -> None:
+def test_gravity_is_found_while_the_vehicle_accelerates(world, forward_m_s2) -> None:
     scene = world.Scene(duration_s=90.0, forward_m_s2=forward_m_s2)
     nodes = join_tracks([integrate_attitude(s, world.BIAS) for s in segments(scene)], world.BIAS)
     down_b = scene.attitude(nodes.time_s).inv().apply([0.0, 0.0, 1.0])
@@ -45,7 +45,7 @@ def test_down_is_found_though_the_vehicle_accelerates(world, forward_m_s2) -> No
     assert np.max(off_deg) < (0.3 if forward_m_s2 == 0 else 1.5)
 
 
-def test_a_part_of_the_segments_is_the_same_as_only_those(world) -> None:
+def test_selected_segments_equal_those_joined_alone(world) -> None:
     tracks = [integrate_attitude(s, world.BIAS) for s in segments(world.Scene(duration_s=100.0))]
     nodes = join_tracks(tracks, world.BIAS)
     some = nodes.select(np.array([False, True, False, True]))

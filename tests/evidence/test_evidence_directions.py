@@ -1,4 +1,4 @@
-"""Cells of the sphere of directions: about equally large, each vector in the one that holds it."""
+"""Cells of the sphere of directions: of nearly equal area, and each vector in its cell."""
 
 import numpy as np
 import pytest
@@ -6,19 +6,19 @@ import pytest
 from ahrsd.evidence.coverage import CELLS, cell_centres, cells_of, visited_cells
 
 
-def test_the_middle_of_each_cell_lies_in_it():
+def test_centre_of_each_cell_is_in_it():
     assert cells_of(cell_centres()).tolist() == list(range(CELLS))
     assert np.linalg.norm(cell_centres(), axis=1) == pytest.approx(np.ones(CELLS))
 
 
-def test_cells_are_about_equally_large():
+def test_cells_have_nearly_equal_area():
     points = np.random.default_rng(1).normal(size=(400_000, 3))
     counts = np.bincount(cells_of(points), minlength=CELLS)
     assert counts.min() > 0.75 * 400_000 / CELLS
     assert counts.max() < 1.15 * 400_000 / CELLS
 
 
-def test_length_does_not_count_and_nothing_points_nowhere():
+def test_cell_does_not_depend_on_length_and_zero_has_none():
     assert cells_of(np.array([[0.0, 0.0, 0.2], [0.0, 0.0, -9.0], [0.0, 0.0, 0.0]])).tolist() == [
         0,
         CELLS - 3,
@@ -32,7 +32,7 @@ def test_length_does_not_count_and_nothing_points_nowhere():
     assert not visited_cells(np.zeros((2, 3))).any()
 
 
-def test_level_circles_show_one_ring_at_the_dip(world) -> None:
+def test_level_circles_cover_one_ring_at_the_dip(world) -> None:
     """A dip of 60 degrees: all cells lie at about 30 degrees from down, all around."""
     motion = world.evidence(world.Scene(roll_deg=0.0, pitch_deg=0.0)).motion
     middle = cell_centres()[motion.directions]
@@ -45,7 +45,7 @@ def test_level_circles_show_one_ring_at_the_dip(world) -> None:
     assert np.count_nonzero(tumbled.directions) > 2 * len(middle)
 
 
-def test_directions_are_told_where_down_is_not_known(world) -> None:
+def test_directions_are_recorded_without_gravity(world) -> None:
     motion = world.evidence(world.Scene(accel=False)).motion
     assert np.count_nonzero(motion.directions) > 30
     assert np.isnan(motion.down_b).all()

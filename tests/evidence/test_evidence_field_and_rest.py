@@ -1,4 +1,4 @@
-"""Size and dip of the field, stationarity, and gyro bias at rest."""
+"""Magnitude and dip of the field, stationarity, and gyro bias at rest."""
 
 import numpy as np
 import pytest
@@ -18,24 +18,24 @@ def model(total, dip_deg):
     )
 
 
-def test_a_right_calibration_has_the_worlds_field(world) -> None:
+def test_correct_calibration_gives_the_world_field(world) -> None:
     seen = world.evidence(world.Scene(), world=model(0.5, 60.0), field_known=True)
     assert seen.field.mean_gauss == pytest.approx(0.5, rel=1e-3)
     assert seen.field.inclination_deg == pytest.approx(60.0, abs=0.2)
-    assert seen.field.spread == pytest.approx(0.0007, rel=0.2)  # noise alone: 0.35 of 500 mG
+    assert seen.field.spread == pytest.approx(0.0007, rel=0.2)  # only noise: 0.35 of 500 mG
     assert seen.world.magnitude_error < 1e-3
     assert seen.world.inclination_error_deg < 0.2
     assert seen.field.wander_gauss < 1e-3
     assert seen.change.scale_change == 0.0
 
 
-def test_the_wrong_place_shows(world) -> None:
+def test_wrong_position_shows_in_magnitude_and_dip(world) -> None:
     seen = world.evidence(world.Scene(), world=model(0.4, 45.0), field_known=True)
     assert seen.world.magnitude_error == pytest.approx(0.25, abs=0.01)
     assert seen.world.inclination_error_deg == pytest.approx(15.0, abs=0.3)
 
 
-def test_without_a_known_field_the_devices_scale_is_kept(world) -> None:
+def test_scale_of_the_device_is_kept_without_a_known_field(world) -> None:
     present = Affine(1.2 * world.truth().matrix, world.HARD + 0.005)
     seen = world.evidence(world.Scene(), present=present)
     assert seen.world is None
@@ -45,7 +45,7 @@ def test_without_a_known_field_the_devices_scale_is_kept(world) -> None:
     assert given.change.scale_change == pytest.approx(1 - 1 / 1.2, rel=1e-6)
 
 
-def test_a_magnet_that_comes_and_goes_wanders(world) -> None:
+def test_temporary_magnet_increases_spread_and_wander(world) -> None:
     def bump(t):
         return 0.15 * ((t > 125) & (t < 145))[:, None] * np.array([1.0, 0.0, 0.0])
 
@@ -56,7 +56,7 @@ def test_a_magnet_that_comes_and_goes_wanders(world) -> None:
     assert seen.field.min_gauss < 0.45
 
 
-def test_dip_is_not_compared_where_every_segment_was_rough(world) -> None:
+def test_dip_is_not_compared_when_every_segment_was_rough(world) -> None:
     rough = world.Scene(forward_m_s2=8.0, rest_s=0.0)
     assert np.isnan(world.evidence(rough).field.inclination_wander_deg)
 
@@ -74,7 +74,7 @@ def test_temperature_range(world) -> None:
     assert np.isnan(world.evidence(world.Scene(temperature_c=None)).field.temperature_range_c)
 
 
-def test_rest_agrees_with_the_true_bias_and_not_with_another(world) -> None:
+def test_rate_at_rest_agrees_only_with_the_true_bias(world) -> None:
     good = world.evidence(world.Scene()).gyro
     assert good.rest_s == pytest.approx(18.0, abs=2.0)
     assert good.disagreement < 2.0
@@ -84,8 +84,8 @@ def test_rest_agrees_with_the_true_bias_and_not_with_another(world) -> None:
     assert bad.disagreement == pytest.approx(0.002 / np.hypot(1e-4, 1e-4), rel=0.1)
 
 
-def test_a_bias_that_is_not_determined_is_judged_by_what_is_known_of_it(world) -> None:
-    """It is no sigma off, and 20 mrad/s: too far to be written, and not contradicted."""
+def test_undetermined_bias_is_judged_by_its_sigma(world) -> None:
+    """It differs by 20 mrad/s within its sigma: too much to be written, but not contradicted."""
     covariance = np.diag(np.r_[np.full(9, 1e-4), np.full(3, 0.02)]) ** 2
     off = world.BIAS + np.array([0.02, 0.0, 0.0])
     seen = world.evidence(world.Scene(), gyro_bias_rad_s=off, covariance=covariance).gyro
@@ -94,13 +94,13 @@ def test_a_bias_that_is_not_determined_is_judged_by_what_is_known_of_it(world) -
     assert seen.sigma_mrad_s == pytest.approx(20.0)
 
 
-def test_a_slow_steady_turn_is_no_rest(world) -> None:
-    """0.4 deg/s looks still to gyro and accelerometer; the field tells."""
+def test_slow_steady_turn_is_not_rest(world) -> None:
+    """Gyro and accelerometer do not show 0.4 deg/s; the field does."""
     scene = world.Scene(turn_s=900.0, roll_deg=0, pitch_deg=0, rest_s=0.0)
     assert world.evidence(scene).gyro.rest_s == 0.0
 
 
-def test_without_rest_there_is_no_agreement(world) -> None:
+def test_no_agreement_without_rest(world) -> None:
     seen = world.evidence(world.Scene(rest_s=0.0)).gyro
     assert seen.rest_s == 0.0
     assert np.isnan(seen.disagreement)
@@ -108,7 +108,7 @@ def test_without_rest_there_is_no_agreement(world) -> None:
 
 
 def rests(seconds_of_rest: float, every_s: float, phase_s: float, minutes: float = 10.0):
-    """Segments of a vehicle that drives, and rests now and then; its bias is BIAS."""
+    """Segments of a vehicle that drives and rests at times; its bias is BIAS."""
     rate_hz, random = 25.0, np.random.default_rng(7)
     time_s = np.arange(round(60.0 * minutes * rate_hz)) / rate_hz
     still = (time_s - phase_s) % every_s < seconds_of_rest
@@ -133,26 +133,26 @@ BIAS = np.array([0.004, -0.005, 0.002])
 
 
 @pytest.mark.parametrize("phase_s", np.arange(0.0, 60.0, 1.3))
-def test_rest_counts_however_it_falls(phase_s: float) -> None:
-    """Also where the cut between two segments lies in the middle of it."""
+def test_rest_counts_at_any_position(phase_s: float) -> None:
+    """Also if the boundary of two segments is within it."""
     found = mean_rate_at_rest(rests(6.0, 60.0, phase_s))
     assert found.duration_s >= 3.0 * 8  # 6 s a minute: five whole bins less the two outer ones
     assert found.duration_s <= 6.0 * 10
     assert np.linalg.norm(found.rate_b_rad_s - BIAS) < 4e-4
 
 
-def test_one_long_rest_is_not_longer_than_it_was() -> None:
+def test_duration_of_a_long_rest_is_right() -> None:
     found = mean_rate_at_rest(rests(300.0, 600.0, 100.0))
     assert found.duration_s == pytest.approx(300.0, abs=4.0)
 
 
-def test_rest_from_before_the_devices_clock_began_anew_is_of_before() -> None:
+def test_rest_before_a_restart_of_the_device_clock_does_not_count() -> None:
     segments = rests(6.0, 60.0, 10.0, minutes=4.0)
     before = mean_rate_at_rest(segments).duration_s
     assert mean_rate_at_rest([*segments, *segments]).duration_s == before
 
 
-def test_a_hole_in_the_stream_is_no_rest() -> None:
+def test_gap_in_the_stream_is_not_rest() -> None:
     segments = rests(300.0, 600.0, 100.0)
     pieces = contiguous_segments(segments)
     assert [len(piece) for piece in pieces] == [len(segments)]

@@ -1,4 +1,6 @@
-"""Predicted heading differences against the textbook, and heading proof on planted errors."""
+"""Predicted heading differences compared with the textbook, and the heading proof with known
+errors.
+"""
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from ahrsd.evidence.heading import SECTORS, visited_sectors
 LEVEL = np.array([0.25, 0.0, 0.433])
 
 
-def test_a_hard_iron_error_makes_a_semicircular_deviation() -> None:
+def test_hard_iron_error_causes_a_semicircular_deviation() -> None:
     """Residual iron e along x, towards heading psi: tan(error) = e sin psi / (H + e cos psi)."""
     e = 0.01
     curve = heading_error_curve(Affine(np.eye(3), np.array([-e, 0, 0])), Affine.identity(), LEVEL)
@@ -21,7 +23,7 @@ def test_a_hard_iron_error_makes_a_semicircular_deviation() -> None:
     )
 
 
-def test_a_soft_iron_error_makes_a_quadrantal_deviation() -> None:
+def test_soft_iron_error_causes_a_quadrantal_deviation() -> None:
     """Scales 1+s, 1-s on the axes: shown heading atan((1-s)/(1+s) tan psi)."""
     s = 0.02
     judged = Affine(np.diag([1 + s, 1 - s, 1.0]), np.zeros(3))
@@ -32,7 +34,7 @@ def test_a_soft_iron_error_makes_a_quadrantal_deviation() -> None:
     np.testing.assert_allclose(curve, expected, atol=1e-9)
 
 
-def test_vertical_hard_iron_shows_only_when_tilted() -> None:
+def test_vertical_hard_iron_matters_only_when_tilted() -> None:
     judged, truth = Affine(np.eye(3), np.array([0, 0, 0.05])), Affine.identity()
     assert np.max(np.abs(heading_error_curve(judged, truth, LEVEL))) < 1e-9
     tilted = heading_error_curve(judged, truth, LEVEL, roll_rad=np.radians(10))
@@ -47,7 +49,7 @@ def test_declination_and_scale_do_not_matter() -> None:
     np.testing.assert_allclose(heading_error_curve(big, Affine.identity(), turned), 0.0, atol=1e-9)
 
 
-def test_worst_difference_takes_the_tilt_that_was_driven() -> None:
+def test_worst_difference_uses_the_driven_tilt() -> None:
     judged, truth = Affine(np.eye(3), np.array([0, 0, 0.05])), Affine.identity()
     total, dip = float(np.linalg.norm(LEVEL)), float(np.arctan2(0.433, 0.25))
     flat = worst_difference_deg(judged, truth, Envelope(total, dip, 0.0, 0.0))
@@ -57,7 +59,7 @@ def test_worst_difference_takes_the_tilt_that_was_driven() -> None:
     assert np.isnan(worst_difference_deg(judged, truth, Envelope(total, dip, np.nan, 0.0)))
 
 
-def test_proof_sees_the_error_that_was_planted(world) -> None:
+def test_proof_has_the_size_of_a_known_error(world) -> None:
     """Flat circles; iron e along x: deviation amplitude asin(e/H), rms 1/sqrt 2 of it."""
     scene = world.Scene(roll_deg=0.5, pitch_deg=0.5)
     truth = world.truth()
@@ -73,7 +75,7 @@ def test_proof_sees_the_error_that_was_planted(world) -> None:
     assert 0.8 * seen.rms_before_deg < seen.gain_lower_deg < seen.rms_before_deg
 
 
-def test_closure_sees_a_gyro_scale_error(world) -> None:
+def test_closure_shows_a_gyro_scale_error(world) -> None:
     """1 % of scale is 3.6 degrees in a turn, with a perfect magnetometer."""
     block = world.Scene(roll_deg=0.5, pitch_deg=0.5).block()
     block.gyro_b_rad_s[:] = world.BIAS + 1.01 * (block.gyro_b_rad_s - world.BIAS)
@@ -86,25 +88,25 @@ def test_closure_sees_a_gyro_scale_error(world) -> None:
     assert seen.proof.closure_deg == pytest.approx(3.6, abs=0.3)
 
 
-def test_partial_turns_give_a_closure_too(world) -> None:
-    """180 degrees to and fro: no full turn in a window, the slope stands for it."""
+def test_partial_turns_give_a_closure(world) -> None:
+    """180 degrees back and forth: without a full turn in a window, the slope is used."""
     assert world.evidence(world.Scene(heading_span_deg=200.0)).proof.closure_deg < 0.5
     assert np.isnan(world.evidence(world.Scene(heading_span_deg=100.0)).proof.closure_deg)
 
 
-def test_acceleration_of_the_vehicle_does_not_spoil_the_proof(world) -> None:
+def test_proof_is_not_affected_by_acceleration(world) -> None:
     seen = world.evidence(world.Scene(forward_m_s2=3.0)).proof
     assert seen.rms_after_deg < 0.1
 
 
-def test_without_gravity_the_field_direction_stands_in(world) -> None:
+def test_field_direction_replaces_gravity_when_missing(world) -> None:
     seen = world.evidence(world.Scene(accel=False))
     assert seen.motion.regime == "unknown"
     assert 0.0 < seen.proof.rms_after_deg < 0.5 < seen.proof.rms_before_deg
     assert np.isnan(seen.proof.closure_deg)
 
 
-def test_coverage_counts_what_was_turned(world) -> None:
+def test_coverage_counts_headings_tilts_and_regime(world) -> None:
     full = world.evidence(world.Scene()).motion
     assert (full.heading_deg, full.regime, full.turn) == (360.0, "3D", "")
     assert full.roll_deg == pytest.approx(35, abs=1.5)
@@ -118,7 +120,7 @@ def test_coverage_counts_what_was_turned(world) -> None:
     assert still.regime == "none"
 
 
-def test_turn_advice_names_the_shorter_way() -> None:
+def test_turn_advice_is_the_shorter_direction() -> None:
     seen = np.ones(SECTORS, dtype=bool)
     assert turn_advice(seen, 95.0) == ""
     seen[20:32] = False  # 200 to 320 deg
@@ -126,6 +128,6 @@ def test_turn_advice_names_the_shorter_way() -> None:
     assert turn_advice(seen, 195.0) == "turn right about 120 deg more"
 
 
-def test_sectors_wrap_and_skip_what_is_unknown() -> None:
+def test_sectors_wrap_and_skip_unknown_headings() -> None:
     seen = visited_sectors(np.radians([5.0, -5.0, 725.0, np.nan]))
     assert np.flatnonzero(seen).tolist() == [0, 35]

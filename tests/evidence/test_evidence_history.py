@@ -37,7 +37,7 @@ def test_every_fourth_slot_of_thirty_seconds_is_held_out() -> None:
     assert history.role(block(450.5)) == "heldout"
 
 
-def test_role_is_the_same_however_the_stream_is_cut() -> None:
+def test_roles_do_not_depend_on_the_block_size() -> None:
     whole = block(0.0, 250.0)
     one, many = SegmentHistory(), SegmentHistory()
     for _, part in one.split(whole):
@@ -52,7 +52,7 @@ def test_role_is_the_same_however_the_stream_is_cut() -> None:
         np.testing.assert_allclose(a.raw_b_gauss, b.raw_b_gauss)
 
 
-def test_parts_are_disjoint_complete_and_gapped_where_the_role_changes() -> None:
+def test_parts_are_disjoint_and_complete_with_gaps_at_role_changes() -> None:
     history = SegmentHistory()
     parts = history.split(block(0.0, 125.0))
     assert [role for role, _ in parts] == ["train"] * 3 + ["heldout", "train"]
@@ -63,8 +63,10 @@ def test_parts_are_disjoint_complete_and_gapped_where_the_role_changes() -> None
     assert [float(p.time_s[0]) for _, p in parts] == [0.0, 30.0, 60.0, 90.0, 120.0]
 
 
-def test_averages_share_one_instant() -> None:
-    """At 100 Hz four samples are one; a field linear in time and the angle tell the same time."""
+def test_averaged_quantities_refer_to_one_instant() -> None:
+    """At 100 Hz four samples are averaged; a field linear in time and the angle give the same
+    time.
+    """
     history = SegmentHistory()
     fill(history, 0.0, 20.0, turn=0.5)
     history.close_segment()
@@ -78,7 +80,7 @@ def test_averages_share_one_instant() -> None:
 
 
 @pytest.mark.parametrize("change", [{"gap_before": True}, {"epoch": 1}])
-def test_a_gap_and_a_new_register_epoch_end_a_segment(change) -> None:
+def test_gap_and_new_register_epoch_end_a_segment(change) -> None:
     history = SegmentHistory()
     fill(history, 0.0, 10.0)
     history.add(replace(block(10.5), **change))
@@ -87,7 +89,7 @@ def test_a_gap_and_a_new_register_epoch_end_a_segment(change) -> None:
     assert [float(s.time_s[0]) for s in history.segments] == pytest.approx([0.015, 10.515])
 
 
-def test_a_sample_that_is_not_finite_ends_the_segment() -> None:
+def test_non_finite_sample_ends_the_segment() -> None:
     history = SegmentHistory()
     fill(history, 0.0, 10.0)
     bad = block(10.0)
@@ -99,7 +101,7 @@ def test_a_sample_that_is_not_finite_ends_the_segment() -> None:
     assert all(np.isfinite(s.raw_b_gauss).all() for s in history.segments)
 
 
-def test_a_clock_that_starts_again_begins_a_segment() -> None:
+def test_clock_restart_starts_a_segment() -> None:
     history = SegmentHistory()
     fill(history, 1000.0, 1010.0)
     fill(history, 0.0, 10.0)
@@ -108,7 +110,7 @@ def test_a_clock_that_starts_again_begins_a_segment() -> None:
     assert history.role(block(95.0)) == "heldout"
 
 
-def test_memory_is_bounded_and_rest_is_forgotten_first() -> None:
+def test_memory_is_bounded_and_rest_is_dropped_first() -> None:
     history = SegmentHistory(HistoryParameters(segment_s=10.0, segments=8))
     fill(history, 0.0, 40.0, turn=0.5, rate_hz=10)
     fill(history, 40.0, 60.0, rate_hz=10)
@@ -123,7 +125,7 @@ def test_memory_is_bounded_and_rest_is_forgotten_first() -> None:
     assert [s.turned_rad > 1.0 for s in quiet.segments] == [True] * 4 + [False] * 4
 
 
-def test_an_empty_block_changes_nothing() -> None:
+def test_empty_block_changes_nothing() -> None:
     history = SegmentHistory()
     history.add(block(0.0, 0.0))
     assert history.split(block(0.0, 0.0)) == []

@@ -1,4 +1,4 @@
-"""The two independent fits: they find the truth, they hold what the motion does not show."""
+"""The two independent fits: they find the truth, and hold what the motion does not determine."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def worst(fit, world, tilt):
 
 @pytest.mark.parametrize("fit", [fit_with_gyro, fit_magnitude])
 @pytest.mark.parametrize("noise", [0.0005, 0.005])
-def test_rich_motion_from_the_factory_setting(world, fit, noise) -> None:
+def test_rich_motion_gives_the_truth_from_the_factory_setting(world, fit, noise) -> None:
     found = fit(nodes_of(world, world.Scene(noise_gauss=noise)), Affine.identity(), noise / 1.4)
     assert worst(found, world, 35.0) < 0.03 + 50 * noise
     np.testing.assert_allclose(found.offset, world.HARD, atol=2e-4 + 0.2 * noise)
@@ -33,7 +33,7 @@ def test_rich_motion_from_the_factory_setting(world, fit, noise) -> None:
 
 
 @pytest.mark.parametrize(("fit", "limit"), [(fit_with_gyro, 0.1), (fit_magnitude, 0.7)])
-def test_flat_motion_gives_level_heading_and_holds_the_vertical(world, fit, limit) -> None:
+def test_level_motion_gives_the_heading_and_holds_the_vertical(world, fit, limit) -> None:
     nodes = nodes_of(world, world.Scene(roll_deg=1.0, pitch_deg=1.0))
     present = Affine(np.eye(3), np.array([0.0, 0.0, world.HARD[2]]))
     found = fit(nodes, present, 0.00035)
@@ -42,15 +42,15 @@ def test_flat_motion_gives_level_heading_and_holds_the_vertical(world, fit, limi
     np.testing.assert_allclose(found.offset[:2], world.HARD[:2], atol=2e-3)
 
 
-def test_the_scale_of_the_present_calibration_is_kept(world) -> None:
+def test_scale_of_the_present_calibration_is_kept(world) -> None:
     nodes = nodes_of(world, world.Scene())
     for fit in (fit_with_gyro, fit_magnitude):
         found = fit(nodes, Affine(1.3 * np.eye(3), np.zeros(3)), 0.00035)
         assert np.linalg.det(found.matrix) == pytest.approx(1.3**3, rel=1e-9)
 
 
-def test_noise_pulls_towards_the_present_and_not_towards_zero(world) -> None:
-    """Dead flat motion: nothing but noise and the calibration in force speaks of the vertical."""
+def test_noise_biases_towards_the_present_calibration_and_not_zero(world) -> None:
+    """Exactly level motion: only noise and the calibration in force inform the vertical."""
     noise = 0.005
     nodes = nodes_of(world, world.Scene(noise_gauss=noise, roll_deg=0.0, pitch_deg=0.0))
     present = Affine(np.diag([1.0, 1.0, 1.2]), world.HARD)
@@ -64,7 +64,7 @@ def test_noise_pulls_towards_the_present_and_not_towards_zero(world) -> None:
     np.testing.assert_allclose(known.offset, world.HARD, atol=0.02)
 
 
-def test_a_step_of_the_iron_between_the_halves_shows(world) -> None:
+def test_step_of_the_iron_between_the_halves_is_detected(world) -> None:
     def step(t):
         return 0.02 * (t > 165)[:, None] * np.array([1.0, 0.0, 0.0])
 
@@ -74,7 +74,7 @@ def test_a_step_of_the_iron_between_the_halves_shows(world) -> None:
     assert world.evidence(world.Scene()).refits.halves_deg < 0.1
 
 
-def test_halves_of_the_estimator_may_be_given(world) -> None:
+def test_halves_of_the_estimator_can_be_used(world) -> None:
     a = world.truth()
     b = Affine(a.matrix, a.offset + np.array([0.01, 0.0, 0.0]))
     seen = world.evidence(world.Scene(roll_deg=1, pitch_deg=1), halves=(a, b)).refits
@@ -82,11 +82,11 @@ def test_halves_of_the_estimator_may_be_given(world) -> None:
     assert seen.halves_deg == pytest.approx(np.degrees(0.01 / 0.25), rel=0.2)
 
 
-def test_one_segment_has_no_halves(world) -> None:
+def test_single_segment_has_no_halves(world) -> None:
     assert np.isnan(world.evidence(world.Scene(duration_s=29.0)).refits.halves_deg)
 
 
-def test_a_size_fit_that_is_no_ellipsoid_is_refused(world) -> None:
+def test_magnitude_fit_that_is_no_ellipsoid_is_refused(world) -> None:
     nodes = nodes_of(world, world.Scene(duration_s=60.0))
     rng = np.random.default_rng(3)
     nodes.raw_b_gauss[:] = rng.standard_normal(nodes.raw_b_gauss.shape)  # a ball, not a shell

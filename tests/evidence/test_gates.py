@@ -1,4 +1,4 @@
-"""Gates: a good calibration passes all, each planted bad one is stopped, nan never passes."""
+"""Gates: a good calibration passes all, each bad one is stopped, and nan never passes."""
 
 import math
 from dataclasses import fields, is_dataclass, replace
@@ -39,7 +39,7 @@ def good(world) -> Evidence:
     return world.evidence(world.Scene(), world=MODEL, field_known=True)
 
 
-def red(evidence: Evidence) -> dict[str, str]:
+def closed(evidence: Evidence) -> dict[str, str]:
     return {r.gate: r.advice for r in judge(evidence, LIMITS, 0.0) if not r.ok}
 
 
@@ -52,113 +52,115 @@ def put(value, path, new):
 # -- the good one ----------------------------------------------------------------------------------
 
 
-def test_a_good_calibration_passes_every_gate(good) -> None:
+def test_good_calibration_passes_every_gate(good) -> None:
     results = judge(good, LIMITS, 12.0)
-    assert red(good) == {}
+    assert closed(good) == {}
     assert all(holds(results, level) for level in Level)
     assert {r.since_s for r in results} == {12.0}
     assert {r.advice for r in results} == {""}
 
 
-def test_without_a_position_ram_may_be_written_and_flash_may_not(world) -> None:
+def test_ram_may_be_written_without_a_position_and_flash_may_not(world) -> None:
     seen = world.evidence(world.Scene())
-    assert list(red(seen)) == ["field.position"]
+    assert list(closed(seen)) == ["field.position"]
     results = judge(seen, LIMITS, 0.0)
     assert holds(results, Level.RAM)
     assert holds(results, Level.UNATTENDED)
     assert not holds(results, Level.FLASH)
-    assert "set the location" in red(seen)["field.position"]
+    assert "set the location" in closed(seen)["field.position"]
 
 
-def test_a_flat_vehicle_that_keeps_its_vertical_passes_ram(world) -> None:
+def test_level_vehicle_with_unchanged_vertical_passes_for_ram(world) -> None:
     seen = world.evidence(world.Scene(roll_deg=2.0, pitch_deg=2.0))
     assert seen.motion.regime == "2D"
-    assert list(red(seen)) == ["field.position"]
+    assert list(closed(seen)) == ["field.position"]
 
 
-def test_an_uneasy_vehicle_passes_too(world) -> None:
+def test_vehicle_in_motion_disturbances_passes(world) -> None:
     """A boat in waves: tilts of 10 degrees, its own accelerations, more noise."""
     scene = world.Scene(roll_deg=10.0, pitch_deg=6.0, forward_m_s2=0.5, noise_gauss=0.002)
-    assert list(red(world.evidence(scene, noise_mag_gauss=0.002))) == ["field.position"]
+    assert list(closed(world.evidence(scene, noise_mag_gauss=0.002))) == ["field.position"]
 
 
-# -- planted bad ones ------------------------------------------------------------------------------
+# -- bad calibrations ------------------------------------------------------------------------------
 
 
 def moved(world, x=0.0, y=0.0, z=0.0):
     return Affine(world.truth().matrix, world.HARD + np.array([x, y, z]))
 
 
-def test_a_cap_of_the_sphere_never_passes(world) -> None:
-    """80 degrees of heading, 10 of tilt, and a centre that is wrong along the cap's axis."""
+def test_calibration_from_a_cap_of_the_sphere_never_passes(world) -> None:
+    """80 degrees of heading, 10 of tilt, and a centre that is wrong along the axis of the cap."""
     scene = world.Scene(heading_span_deg=80.0, roll_deg=10.0, pitch_deg=10.0)
     for off in (0.0, 0.05, 0.15):
-        stopped = red(world.evidence(scene, moved(world, off, 0.0, off)))
+        stopped = closed(world.evidence(scene, moved(world, off, 0.0, off)))
         assert "motion.heading" in stopped
         assert "heldout_heading.coverage" in stopped
         assert "deg more" in stopped["motion.heading"]
 
 
-def test_a_circle_with_a_wrong_vertical_never_passes(world) -> None:
-    """In the plane it has the right heading and a round field: nothing else would see it."""
+def test_calibration_with_a_wrong_vertical_never_passes(world) -> None:
+    """In the plane its heading is right and the field constant, so that no other gate notices
+    it.
+    """
     scene = world.Scene(roll_deg=1.0, pitch_deg=1.0)
     for off in (-0.2, 0.05, 0.3):
-        stopped = red(world.evidence(scene, moved(world, z=off)))
+        stopped = closed(world.evidence(scene, moved(world, z=off)))
         assert "observability.held" in stopped
         assert "pitch and roll by 30 deg" in stopped["observability.held"]
 
 
 @pytest.mark.parametrize("matrix", [np.diag([1.05, 0.95, 1.0]), np.diag([1.0, 1.0, 1.25])])
-def test_a_wrong_matrix_never_passes(world, matrix) -> None:
+def test_wrong_matrix_never_passes(world, matrix) -> None:
     wrong = Affine(matrix @ world.truth().matrix, world.HARD)
-    stopped = red(world.evidence(world.Scene(), wrong))
+    stopped = closed(world.evidence(world.Scene(), wrong))
     assert {"second_opinion.heading", "heldout_heading.max"} <= set(stopped)
 
 
 @pytest.mark.parametrize("off", [(0.02, 0, 0), (0, -0.02, 0), (0, 0, 0.03), (0.3, 0, 0)])
-def test_a_wrong_hard_iron_never_passes(world, off) -> None:
-    stopped = red(world.evidence(world.Scene(), moved(world, *off)))
+def test_wrong_hard_iron_never_passes(world, off) -> None:
+    stopped = closed(world.evidence(world.Scene(), moved(world, *off)))
     assert "second_opinion.heading" in stopped
     assert "better.percent" in stopped
 
 
-def test_rest_never_passes(world) -> None:
-    stopped = red(world.evidence(world.Scene(heading_span_deg=0.0, roll_deg=0.0, pitch_deg=0.0)))
+def test_calibration_at_rest_never_passes(world) -> None:
+    stopped = closed(world.evidence(world.Scene(heading_span_deg=0.0, roll_deg=0.0, pitch_deg=0.0)))
     assert {"motion.regime", "motion.heading", "heldout_heading.windows"} <= set(stopped)
     assert "turn" in stopped["motion.heading"]
 
 
 @pytest.mark.parametrize("middle_s", [60.0, 105.0, 200.0])
-def test_a_magnet_that_passes_never_passes(world, middle_s) -> None:
+def test_calibration_with_a_passing_magnet_never_passes(world, middle_s) -> None:
     def near(t):
         return 0.2 * np.exp(-(((t - middle_s) / 6.0) ** 2))[:, None] * np.array([1.0, 0.5, 0.2])
 
-    stopped = red(world.evidence(world.Scene(magnet=near)))
+    stopped = closed(world.evidence(world.Scene(magnet=near)))
     assert {"second_opinion.heading", "repeatable.heading"} & set(stopped)
     if middle_s == 105.0:  # in a held-out segment
         assert "a magnet or steel came near" in stopped["heldout_heading.max"]
 
 
-def test_iron_that_stays_after_the_turn_never_passes(world) -> None:
+def test_calibration_with_iron_added_during_the_turn_never_passes(world) -> None:
     def loaded(t):
         return 0.05 * (t > 200.0)[:, None] * np.array([1.0, 0.0, 0.0])
 
-    stopped = red(world.evidence(world.Scene(magnet=loaded)))
+    stopped = closed(world.evidence(world.Scene(magnet=loaded)))
     assert {"repeatable.heading", "repeatable.hard_iron"} <= set(stopped)
     assert "iron changed" in stopped["repeatable.hard_iron"]
 
 
-def test_a_wrong_gyro_bias_never_passes(world) -> None:
+def test_wrong_gyro_bias_never_passes(world) -> None:
     off = world.BIAS + np.array([0.0, 0.0, 0.003])
-    stopped = red(world.evidence(world.Scene(), gyro_bias_rad_s=off))
+    stopped = closed(world.evidence(world.Scene(), gyro_bias_rad_s=off))
     assert "gyro_bias.agreement" in stopped
     assert "stand still" in stopped["gyro_bias.agreement"]
 
 
-def test_a_gyro_bias_that_is_not_determined_never_passes_and_is_not_called_wrong(world) -> None:
+def test_undetermined_gyro_bias_never_passes_and_is_not_called_wrong(world) -> None:
     covariance = np.diag(np.r_[np.full(9, 1e-3), 1e-4, 1e-4, 8e-3]) ** 2
     off = world.BIAS + np.array([0.0, 0.0, 0.0072])
-    stopped = red(world.evidence(world.Scene(), gyro_bias_rad_s=off, covariance=covariance))
+    stopped = closed(world.evidence(world.Scene(), gyro_bias_rad_s=off, covariance=covariance))
     assert "gyro_bias.agreement" not in stopped
     assert (
         "7.2 mrad/s off what rest shows (limit 1.2), and known to +-8.0: turn"
@@ -166,27 +168,27 @@ def test_a_gyro_bias_that_is_not_determined_never_passes_and_is_not_called_wrong
     )
 
 
-def test_a_room_is_never_saved_for_good(good) -> None:
+def test_field_that_varies_between_places_is_never_saved(good) -> None:
     for weak_deg in (0.043, 0.067):  # rooms of .8 to 1.8 mG that a limit of 0.1 let through
-        assert set(red(put(good, "estimate.place_deg", weak_deg))) == {"field.place"}
-    told = red(put(good, "estimate.place_deg", 0.3))
+        assert set(closed(put(good, "estimate.place_deg", weak_deg))) == {"field.place"}
+    told = closed(put(good, "estimate.place_deg", 0.3))
     assert set(told) == {"field.place"}
     assert (
         "what the model does not explain may cause 0.30 deg of heading error (limit 0.03)"
         in (told["field.place"])
     )
-    assert "gravity is needed" in red(put(good, "estimate.place_deg", math.nan))["field.place"]
+    assert "gravity is needed" in closed(put(good, "estimate.place_deg", math.nan))["field.place"]
 
 
 LEVEL_TOO_FEW = "the motion so far does not determine enough: turn through all headings"
 
 
 @pytest.mark.parametrize("gate", ["observability.converged", "observability.heading_sigma"])
-def test_advice_is_what_makes_the_most_of_the_doubt(good, gate) -> None:
+def test_advice_concerns_the_largest_uncertainty(good, gate) -> None:
     doubtful = put(put(good, "estimate.converged", False), "estimate.heading_sigma_deg", 1.4)
-    told = red(put(doubtful, "estimate.widened_by", LEVEL_TOO_FEW))[gate]
+    told = closed(put(doubtful, "estimate.widened_by", LEVEL_TOO_FEW))[gate]
     assert told.endswith(f": {LEVEL_TOO_FEW}")
-    assert "two full circles" in red(doubtful)[gate]
+    assert "two full circles" in closed(doubtful)[gate]
 
 
 @pytest.mark.parametrize(
@@ -204,32 +206,32 @@ def test_advice_is_what_makes_the_most_of_the_doubt(good, gate) -> None:
         (math.nan, math.nan, "pitch and roll by 30 deg if the vehicle can (tilt not known yet)"),
     ],
 )
-def test_tilt_that_was_shown_is_not_asked_for_again(good, roll_deg, pitch_deg, asked) -> None:
+def test_tilt_already_driven_is_not_advised_again(good, roll_deg, pitch_deg, asked) -> None:
     seen = put(put(good, "motion.roll_deg", roll_deg), "motion.pitch_deg", pitch_deg)
-    stopped = red(put(put(seen, "estimate.score", 0.1), "world.inclination_error_deg", 9.0))
+    stopped = closed(put(put(seen, "estimate.score", 0.1), "world.inclination_error_deg", 9.0))
     for gate in ("observability.score", "field.inclination"):
         assert stopped[gate].endswith(asked)
     assert ("if the vehicle can" in stopped["observability.score"]) == ("repeat" not in asked)
 
 
-def test_what_is_in_force_and_good_is_left_alone(world) -> None:
-    stopped = red(world.evidence(world.Scene(), present=world.truth()))
+def test_good_calibration_in_force_is_not_replaced(world) -> None:
+    stopped = closed(world.evidence(world.Scene(), present=world.truth()))
     assert {"better.percent", "better.degrees", "better.certain"} <= set(stopped)
 
 
-def test_a_large_step_is_for_a_person_and_a_larger_one_for_nobody(world) -> None:
+def test_large_step_needs_a_person_and_a_larger_one_is_refused(world) -> None:
     first = world.evidence(world.Scene(), present=Affine.identity())
     results = judge(first, LIMITS, 0.0)
     assert holds(results, Level.RAM)
     assert not holds(results, Level.UNATTENDED)
-    assert "a person must approve" in red(first)["step.auto"]
+    assert "a person must approve" in closed(first)["step.auto"]
     again = world.evidence(world.Scene(), present=moved(world, 0.15, 0.0, 0.0))
     assert not holds(judge(again, LIMITS, 0.0), Level.CANDIDATE)
-    assert "something else is wrong" in red(again)["step.operator"]
+    assert "something else is wrong" in closed(again)["step.operator"]
 
 
-def test_a_stream_without_gravity_never_passes(world) -> None:
-    stopped = red(world.evidence(world.Scene(accel=False)))
+def test_stream_without_gravity_never_passes(world) -> None:
+    stopped = closed(world.evidence(world.Scene(accel=False)))
     assert "add acceleration" in stopped["motion.regime"]
     assert "add acceleration" in stopped["motion.heading"]
 
@@ -245,32 +247,32 @@ def test_a_stream_without_gravity_never_passes(world) -> None:
         ("stepped", True, "stationarity.step", "the iron changed on the vehicle"),
     ],
 )
-def test_an_unsound_basis_never_passes(good, field, value, gate, words) -> None:
+def test_unsound_data_never_pass(good, field, value, gate, words) -> None:
     unsound: BasisFacts = replace(good.basis, **{field: value})
-    stopped = red(replace(good, basis=unsound))
+    stopped = closed(replace(good, basis=unsound))
     assert list(stopped) == [gate]
     assert words in stopped[gate]
     assert not holds(judge(replace(good, basis=unsound), LIMITS, 0.0), Level.CANDIDATE)
 
 
-def test_an_estimator_in_doubt_never_passes(world) -> None:
+def test_uncertain_estimate_never_passes(world) -> None:
     doubt = {
         "converged": False,
         "heading_sigma_deg": 1.4,
         "observability": Observability(np.ones(12), ("hard iron z",), 0.3),
     }
-    stopped = red(world.evidence(world.Scene(), **doubt))
+    stopped = closed(world.evidence(world.Scene(), **doubt))
     assert {"observability.converged", "observability.score", "observability.heading_sigma"} <= set(
         stopped
     )
     assert "not known well enough (limit 1.0 deg)" in stopped["observability.heading_sigma"]
 
 
-def test_before_anything_every_row_says_what_is_missing(world) -> None:
+def test_every_gate_reports_what_is_missing_before_data(world) -> None:
     empty = world.EvidenceCollector().evaluate(
         world.estimate(), world.old(), np.zeros(3), None, world.HEALTHY, world.SOUND
     )
-    stopped = red(empty)
+    stopped = closed(empty)
     assert len(stopped) > 20
     assert all(words and "nan" not in words for words in stopped.values())
 
@@ -292,7 +294,7 @@ _LEAVES = {
 
 
 @pytest.mark.parametrize("gate", GATES, ids=lambda gate: gate.gate)
-def test_every_row_can_turn_red_and_says_why(good, gate) -> None:
+def test_every_gate_can_close_with_a_reason(good, gate) -> None:
     limit = limit_of(gate, LIMITS)
     worse = limit + abs(limit) + 1.0 if gate.at_most else limit - abs(limit) - 1.0
     path, value = _LEAVES.get(gate.value, (gate.value, worse))
@@ -301,7 +303,7 @@ def test_every_row_can_turn_red_and_says_why(good, gate) -> None:
     bad = put(good, path, value)
     if gate.applies == "planar":
         bad = put(bad, "motion.regime", "2D")
-    words = red(bad)[gate.gate]
+    words = closed(bad)[gate.gate]
     assert len(words) > 15
     assert "{" not in words
     assert not holds(judge(bad, LIMITS, 0.0), gate.level)
@@ -316,7 +318,7 @@ def leaves(value, path=""):
 
 
 @given(data=st.data(), bad=st.sampled_from([math.nan, math.inf, -math.inf]))
-def test_a_number_that_is_not_finite_never_passes(good, data, bad) -> None:
+def test_non_finite_number_never_passes(good, data, bad) -> None:
     paths = data.draw(st.sets(st.sampled_from(sorted(leaves(good))), min_size=1))
     evidence = good
     for path in paths:
@@ -329,7 +331,7 @@ def test_a_number_that_is_not_finite_never_passes(good, data, bad) -> None:
 # -- the judge -------------------------------------------------------------------------------------
 
 
-def test_since_is_when_ok_last_changed(good) -> None:
+def test_since_is_the_time_of_the_last_change(good) -> None:
     bad = put(good, "field.spread", 0.5)
     first = judge(good, LIMITS, 10.0)
     second = judge(bad, LIMITS, 20.0, first)
@@ -343,7 +345,7 @@ def test_since_is_when_ok_last_changed(good) -> None:
     assert {r.gate: r.since_s for r in last}["field.spread_ram"] == 40.0
 
 
-def test_levels_need_what_is_below_them_and_missing_rows_are_red(good) -> None:
+def test_levels_include_lower_levels_and_missing_gates_are_closed(good) -> None:
     results = judge(good, LIMITS, 0.0)
     sizes = [len(for_level(results, level)) for level in (Level.CANDIDATE, Level.RAM, Level.FLASH)]
     assert sizes == sorted(sizes)
@@ -355,7 +357,7 @@ def test_levels_need_what_is_below_them_and_missing_rows_are_red(good) -> None:
     assert not holds((), Level.CANDIDATE)
 
 
-def test_limits_come_from_one_place(good) -> None:
+def test_limits_are_defined_in_one_place(good) -> None:
     strict = replace(LIMITS, holdout_rms_deg=1e-3)
     assert [r.gate for r in judge(good, strict, 0.0) if not r.ok] == ["heldout_heading.rms"]
     names = {f.name for f in fields(GateLimits)}
@@ -364,15 +366,15 @@ def test_limits_come_from_one_place(good) -> None:
     assert len(ROWS) == len(GATES)
 
 
-def test_rounding_is_no_reason_and_no_excuse(good) -> None:
+def test_limits_tolerate_only_rounding(good) -> None:
     def ok(rate_hz: float) -> bool:
-        return "stream_health.rate" not in red(put(good, "health.rate_hz", rate_hz))
+        return "stream_health.rate" not in closed(put(good, "health.rate_hz", rate_hz))
 
     assert ok(9.99999999)
     assert not ok(9.999)
 
 
-def test_margin_after_a_rollback_makes_improvement_harder() -> None:
+def test_margin_after_a_rollback_raises_the_required_improvement() -> None:
     twice = LIMITS.with_margin(2.0)
     assert (twice.min_improvement_percent, twice.min_improvement_deg) == (40.0, 0.6)
     assert twice.holdout_rms_deg == LIMITS.holdout_rms_deg
@@ -400,7 +402,7 @@ def limit_text(gate) -> str:
 
 
 @pytest.mark.parametrize("gate", GATES, ids=lambda gate: gate.gate)
-def test_the_documentation_has_this_row(gate) -> None:
+def test_documentation_has_every_gate(gate) -> None:
     name, code, limit, guards, meaning, todo = doc_rows()[gate.gate]
     assert name == f"`{gate.gate}`"
     assert (code, limit, guards) == (gate.code, limit_text(gate), gate.level.name.lower())
@@ -408,7 +410,7 @@ def test_the_documentation_has_this_row(gate) -> None:
     assert len(todo) > 10
 
 
-def test_the_documentation_has_no_row_more_and_names_every_limit() -> None:
+def test_documentation_has_no_further_gate_and_names_every_limit() -> None:
     assert list(doc_rows()) == [gate.gate for gate in GATES]
     text = DOC.read_text()
     assert [f.name for f in fields(GateLimits) if f"`{f.name}`" not in text] == []

@@ -1,4 +1,4 @@
-"""Which files of an archive are recordings, on a disk and behind fsspec."""
+"""Which files of an archive are recordings, on a disk and through fsspec."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def names(entries, root):
     return sorted(entry.url.removeprefix(f"{root}/") for entry in entries)
 
 
-def test_recordings_are_told_by_their_names_and_others_are_counted(archive):
+def test_recordings_are_recognised_by_name_and_other_files_are_counted(archive):
     left_out = []
     entries = list(Archive(str(archive)).entries(left_out.append))
     assert names(entries, archive) == sorted(FILES)
@@ -42,7 +42,7 @@ def test_patterns_replace_the_suffixes(archive):
     assert names(entries, archive) == ["readme.md", "rov1/harbour/a.mcap"]
 
 
-def test_a_folder_of_ros_2_is_one_recording(archive):
+def test_ros_2_folder_is_one_recording(archive):
     bag = archive / "rov3" / "bag"
     bag.mkdir(parents=True)
     (bag / "metadata.yaml").write_text("x")
@@ -53,7 +53,7 @@ def test_a_folder_of_ros_2_is_one_recording(archive):
     assert found[str(bag)].folders == ("rov3",)
 
 
-def test_fsspec_lists_the_same_and_gives_the_bytes(archive):
+def test_fsspec_lists_and_reads_the_same_files(archive):
     pytest.importorskip("fsspec", reason="fsspec (the extra fleet) is not installed")
     root = f"file://{archive}"
     entries = list(Archive(root).entries())
@@ -78,7 +78,7 @@ def test_fsspec_lists_the_same_and_gives_the_bytes(archive):
         ("s3://bucket/dives", "pip install 'ahrsd[s3]'"),
     ],
 )
-def test_what_cannot_be_listed_is_said(archive, root, words):
+def test_archive_that_cannot_be_listed_is_refused(archive, root, words):
     if root.startswith("s3"):
         try:
             import s3fs  # noqa: F401
@@ -91,8 +91,8 @@ def test_what_cannot_be_listed_is_said(archive, root, words):
     assert words in str(told.value)
 
 
-def test_a_storage_that_fails_in_words_of_its_own_ends_in_one_line(monkeypatch):
-    """The libraries of storages raise classes of their own, such as botocore's."""
+def test_storage_error_is_reported_in_one_line(monkeypatch):
+    """Storage libraries raise classes of their own, such as those of botocore."""
     fsspec = pytest.importorskip("fsspec", reason="fsspec (the extra fleet) is not installed")
 
     class BotoCoreError(Exception):

@@ -1,4 +1,6 @@
-"""A function over tasks: every task one answer, whoever dies; no more at once than the window."""
+"""A function over tasks: one answer per task, whichever process dies, and a bounded number in
+flight.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,7 @@ def squared(number: int) -> tuple[int, object]:
 
 
 def going_wrong(number: int) -> tuple[int, object]:
-    """Every fifth goes wrong, each in its own way."""
+    """Every fifth task fails, each in another way."""
     if number == 5:
         time.sleep(600.0)
     if number == 10:
@@ -63,11 +65,11 @@ def failed(_: int, loss: Loss) -> int:
     raise AssertionError(loss)
 
 
-def test_every_task_has_one_answer_and_failures_are_answers_too():
+def test_every_task_has_one_answer_including_failures():
     tasks = range(25)
     with crew(Place(2), Limits(time_s=4.0, memory_bytes=1 << 30)) as workers:
         found = list(workers.map(going_wrong, tasks, words))
-        again = dict(workers.map(squared, tasks, words))  # with the processes that are left
+        again = dict(workers.map(squared, tasks, words))  # with the remaining processes
     assert sorted(task for task, _ in found) == list(tasks)
     assert all(task == answer[0] for task, answer in found)
     by_task = {task: answer[1] for task, answer in found}
@@ -79,7 +81,7 @@ def test_every_task_has_one_answer_and_failures_are_answers_too():
     assert again == {task: (task, task**2) for task in tasks}
 
 
-def test_a_process_that_is_killed_costs_no_task_and_all_end_with_the_crew(tmp_path):
+def test_killed_process_loses_no_task_and_all_processes_end(tmp_path):
     found: list[int] = []
     with crew(Place(2), Limits()) as workers:
         for number, (task, answer) in enumerate(
@@ -99,7 +101,7 @@ def test_a_process_that_is_killed_costs_no_task_and_all_end_with_the_crew(tmp_pa
 
 
 class GoneThere:
-    """A task whose code is there where it is asked for, and not in the process that takes it."""
+    """A task whose code exists in the parent and not in the process that receives it."""
 
     def __init__(self, number: int, here: int) -> None:
         self.number, self.here = number, here
@@ -121,7 +123,7 @@ def slowly(task: GoneThere) -> int:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_task_that_no_process_can_take_is_lost_and_the_others_go_on(jobs):
+def test_task_that_no_process_can_load_fails_and_others_continue(jobs):
     tasks = [GoneThere(number, os.getpid() if number == 1 else 0) for number in range(5)]
     limits = Limits(begin_s=8.0)
     with crew(Place(jobs), limits) as workers:
@@ -139,7 +141,7 @@ def of_seconds(_: tuple[int, float], loss: Loss) -> int:
     raise AssertionError(loss)
 
 
-def test_a_task_may_take_longer_than_a_process_has_to_begin_with_it():
+def test_task_may_take_longer_than_the_start_limit():
     limits = Limits(begin_s=4.0)
     with crew(Place(1), limits) as workers:
         found = [answer for _, answer in workers.map(for_seconds, [(1, 7.0), (2, 0.0)], of_seconds)]
@@ -157,7 +159,7 @@ def test_processes_hold_one_blas_thread(monkeypatch):
     assert found == (0, "1")
 
 
-def test_no_more_are_in_flight_than_the_window():
+def test_tasks_in_flight_are_limited_by_the_window():
     flying: list[tuple[int, Future[int]]] = []
     most = taken = 0
 
@@ -185,7 +187,7 @@ def test_no_more_are_in_flight_than_the_window():
     assert most == 5
 
 
-def test_who_stops_in_the_middle_leaves_nothing_running(tmp_path):
+def test_no_process_remains_after_an_exception(tmp_path):
     before = threading.active_count()
     with pytest.raises(ZeroDivisionError), crew(Place(2), Limits()) as workers:
         for _ in workers.map(partial(own_process, tmp_path), range(1000), failed):

@@ -1,4 +1,4 @@
-"""Drift of all devices at once is what a plain computation says of each alone."""
+"""The drift of all devices at once equals a plain computation for each."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def sigma_of(name: str) -> str:
 
 
 def made_up(seed: int, *, tied: bool = True) -> list[dict[str, object]]:
-    """Rows in no order: some at the very same time, some without a temperature, some no part."""
+    """Rows in no order: some at the same time, some without a temperature, some without parts."""
     rng = np.random.default_rng(seed)
     rows = []
     for _, serial, vehicle, n in DEVICES:
@@ -101,7 +101,7 @@ def plain_line(day, warm, values, sigmas, step_after):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_all_devices_at_once_are_each_alone(tmp_path, seed):
+def test_all_devices_at_once_equal_each_alone(tmp_path, seed):
     rows = made_up(seed)
     store = store_of(tmp_path / "out", rows[:200])
     store_of(tmp_path / "out", rows[200:], compacted=False)
@@ -132,8 +132,8 @@ def test_all_devices_at_once_are_each_alone(tmp_path, seed):
         assert own.heading_kept_deg == pytest.approx(np.degrees(np.arctan2(moved, 0.25)))
 
 
-@pytest.mark.parametrize("seed", [0, 2])  # in which chance makes no step of the bias
-def test_slopes_and_steps_are_those_of_one_plain_fit(tmp_path, seed):
+@pytest.mark.parametrize("seed", [0, 2])  # a draw without a chance step of the bias
+def test_slopes_and_steps_equal_those_of_a_plain_fit(tmp_path, seed):
     rows = [one for one in made_up(seed, tied=False) if one["vehicle"] == "rov9"]
     with FleetRows(store_of(tmp_path / "out", rows)) as asked:
         (found,) = asked.drift()
@@ -156,8 +156,8 @@ def test_slopes_and_steps_are_those_of_one_plain_fit(tmp_path, seed):
             assert change.sigma == pytest.approx(fit["step"][1], rel=1e-6)
 
 
-def test_times_of_other_ages_are_still_in_order(tmp_path):
-    """A clock that was never set and one that is far ahead, of very many devices or few."""
+def test_extreme_times_are_ordered(tmp_path):
+    """A clock that was never set and one that is far ahead, for many devices or few."""
     from ahrsd.fleet.drift import Bins
 
     rows = [row(1, day=-700000.0), row(2, day=2900000.0), row(3, day=1.0)]

@@ -1,4 +1,4 @@
-"""`ahrsd fleet` on the command line: exit codes, words, files."""
+"""`ahrsd fleet` on the command line: exit codes, text and files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def out(tmp_path):
     return tmp_path / "out"
 
 
-def test_an_archive_that_holds_nothing_that_answers_is_exit_1(said, tmp_path):
+def test_archive_without_any_result_exits_with_code_one(said, tmp_path):
     (tmp_path / "archive").mkdir()
     (tmp_path / "archive" / "a.csv").write_text("a\n1\n")
     (tmp_path / "archive" / "notes.md").write_text("x")
@@ -61,12 +61,12 @@ def test_an_archive_that_holds_nothing_that_answers_is_exit_1(said, tmp_path):
         (("--folders", "ship"), "--folders ship: a level is one of vehicle, place, serial, or -"),
     ],
 )
-def test_a_wrong_option_is_one_line(said, tmp_path, options, words):
+def test_wrong_option_is_refused_in_one_line(said, tmp_path, options, words):
     code, _, err = said("run", tmp_path, "-o", tmp_path / "out", *options)
     assert (code, err) == (2, f"ahrsd: {words}\n")
 
 
-def test_status_counts(said, out):
+def test_status_counts_outcomes(said, out):
     code, text, _ = said("status", out)
     assert code == 0
     assert text.splitlines() == [
@@ -80,13 +80,13 @@ def test_status_counts(said, out):
     assert (body["seconds"], body["at_work"], body["run"]) == (50.0, False, {})
 
 
-def test_compact_moves_what_is_in_the_spool(said, out):
+def test_compact_moves_rows_out_of_the_spool(said, out):
     store_of(out, [row(60, serial_number=9)], compacted=False)
     assert said("compact", out)[:2] == (0, f"{out}: 1 row moved; 4 parts\n")
     assert said("compact", out)[:2] == (0, f"{out}: 0 rows moved; 4 parts\n")
 
 
-def test_ask_drift_names_the_step(said, out):
+def test_drift_question_reports_the_step(said, out):
     code, text, _ = said("ask", out, "drift")
     assert code == 0
     assert text.startswith("7, rov1: 12 calibrations, 2026-01-01 to 2026-04-21\n")
@@ -98,7 +98,7 @@ def test_ask_drift_names_the_step(said, out):
     assert body[1]["hard_iron"]["changes"] == []
 
 
-def test_ask_the_others(said, out):
+def test_other_questions_are_answered(said, out):
     assert "motor_current  vehicle  rov1" in said("ask", out, "recurring")[1]
     assert "1 refused: <b>is empty</b>\n  record again" in said("ask", out, "failures")[1]
     code, text, _ = said("ask", out, "select vehicle, count(*) as n from recordings group by 1")
@@ -109,14 +109,14 @@ def test_ask_the_others(said, out):
 @pytest.mark.parametrize(
     "question", ["drop table spool", "what drifts?", "select * from read_csv('/etc/passwd')"]
 )
-def test_what_is_no_question_is_exit_2(said, out, question):
+def test_invalid_question_exits_with_code_two(said, out, question):
     code, text, err = said("ask", out, question)
     assert (code, text) == (2, "")
     assert err.startswith("ahrsd: ask: ")
     assert err.count("\n") == 1
 
 
-def test_a_folder_without_rows_is_exit_2(said, tmp_path):
+def test_folder_without_rows_exits_with_code_two(said, tmp_path):
     for words in (("status",), ("compact",), ("ask", "drift")):
         code, _, err = said(words[0], tmp_path, *words[1:])
         assert (code, err) == (
@@ -125,7 +125,7 @@ def test_a_folder_without_rows_is_exit_2(said, tmp_path):
         )
 
 
-def test_the_page_shows_devices_worst_first_and_escapes_what_is_foreign(said, out, tmp_path):
+def test_page_shows_worst_devices_first_and_escapes_foreign_text(said, out, tmp_path):
     code, text, _ = said("status", out, "--report", tmp_path / "page")
     assert code == 0
     assert text.splitlines()[-1] == f"report: {tmp_path}/page/report.html"
@@ -139,7 +139,7 @@ def test_the_page_shows_devices_worst_first_and_escapes_what_is_foreign(said, ou
 
 @pytest.mark.skipif(BROWSER is None, reason="no browser is installed")
 @pytest.mark.parametrize("width_px", [400, pytest.param(1000, marks=pytest.mark.slow)])
-def test_the_page_in_a_browser(said, out, tmp_path, width_px):
+def test_page_is_complete_in_a_browser(said, out, tmp_path, width_px):
     said("status", out, "--report", tmp_path / "page")
     seen = look_at(tmp_path / "page" / "report.html", width_px, tmp_path)
     assert seen["errors"] == []
@@ -151,7 +151,7 @@ def test_the_page_in_a_browser(said, out, tmp_path, width_px):
     ]  # fmt: skip
 
 
-def test_a_question_that_is_none_is_told_which_there_are(said, out):
+def test_unknown_question_is_refused_with_the_possible_ones(said, out):
     code, _, err = said("ask", out, "nonsense")
     assert code == 2
     assert err.endswith("a question is drift, recurring, failures, or a SELECT over `recordings`\n")

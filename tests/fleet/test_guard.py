@@ -1,4 +1,4 @@
-"""Whatever a task does, it is one row, and the others go on."""
+"""Whatever a task does, it gives one row, and the others continue."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def ended(tmp_path_factory):
     return {one["recording"].rpartition("/")[2].removesuffix(".mcap"): one for one in found}
 
 
-def test_good_ones_are_done_beside_bad_ones(ended):
+def test_good_tasks_finish_despite_bad_ones(ended):
     good = [ended[name]["outcome"] for name in NAMES if "good" in name]
     assert good == ["done"] * 4
 
@@ -49,17 +49,17 @@ def test_good_ones_are_done_beside_bad_ones(ended):
         ("bug", "internal error", "KeyError: 'nobody foresaw it'"),
     ],
 )
-def test_a_failure_is_a_row_with_its_words(ended, name, outcome, words):
+def test_failure_is_a_row_with_its_message(ended, name, outcome, words):
     assert (ended[name]["outcome"], ended[name]["error"]) == (outcome, words)
     assert len(ended[name]["content_sha256"]) == 64
 
 
-def test_what_was_killed_once_is_done_at_the_second_try(ended):
+def test_task_killed_once_succeeds_at_the_second_try(ended):
     assert ended["once"]["outcome"] == "done"
     assert ended["kill"]["tries"] == processes.TRIES == 3
 
 
-def test_what_to_do_is_beside_what_a_limit_ended(ended):
+def test_task_ended_by_a_limit_has_a_remedy(ended):
     remedies = {name: ended[name]["remedy"] for name in ("hang", "hog", "kill", "bug")}
     assert remedies == {
         "hang": "give more time: --limit 1h --retry-failed",

@@ -1,4 +1,4 @@
-"""The worked example of docs/guide/fleet.md is run as it stands."""
+"""The worked example of docs/guide/fleet.md is run as written."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def commands(tmp_path):
     return folder
 
 
-def test_the_cluster_of_three_processes(tmp_path, commands):
+def test_example_of_a_cluster_runs(tmp_path, commands):
     port = str(free_port())
     write_archive(tmp_path / "ARCHIVE", 4)
     script = example().replace("8786", port)

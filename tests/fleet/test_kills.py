@@ -24,8 +24,8 @@ from fleet_kills import (
 from quick_fleet import write_quick_archive
 
 
-def test_every_recording_has_one_row_whoever_is_killed(tmp_path):
-    """It cannot end before the last kill: one of its recordings waits for a file."""
+def test_every_recording_has_one_row_after_kills(tmp_path):
+    """The run cannot end before the last kill, because one recording waits for a file."""
     archive = tmp_path / "archive"
     write_quick_archive(archive, 29, milliseconds=100)
     (archive / "rov0" / "held.mcap").write_bytes(bytes(9))
@@ -44,8 +44,8 @@ def test_every_recording_has_one_row_whoever_is_killed(tmp_path):
     assert {"driver", "process"} <= found["kills"].keys()
 
 
-def test_an_interrupted_run_says_so_and_leaves_nothing(tmp_path):
-    """It cannot end before the signal: two of its recordings wait for a file."""
+def test_interrupted_run_reports_it_and_leaves_no_process(tmp_path):
+    """The run cannot end before the signal, because two recordings wait for a file."""
     archive = tmp_path / "archive"
     write_quick_archive(archive, 3, milliseconds=10)
     for number in range(2):
@@ -69,7 +69,7 @@ def test_an_interrupted_run_says_so_and_leaves_nothing(tmp_path):
 
 
 @pytest.mark.slow
-def test_on_a_cluster_a_scheduler_and_a_worker_may_die(tmp_path):
+def test_run_recovers_from_a_killed_scheduler_and_worker(tmp_path):
     pytest.importorskip("distributed", reason="distributed (the extra cluster) is not installed")
     write_quick_archive(tmp_path / "archive", 24, milliseconds=500)
     cluster = Cluster(tmp_path)
@@ -101,7 +101,7 @@ def test_on_a_cluster_a_scheduler_and_a_worker_may_die(tmp_path):
         cluster.stop()
 
 
-def test_a_cluster_that_is_not_there_is_one_line_after_five_seconds(tmp_path):
+def test_missing_cluster_is_a_one_line_error_after_five_seconds(tmp_path):
     pytest.importorskip("distributed", reason="distributed (the extra cluster) is not installed")
     write_quick_archive(tmp_path / "archive", 1, milliseconds=10)
     fleet = Fleet(tmp_path / "archive", tmp_path / "out", quick=True)

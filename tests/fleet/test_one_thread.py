@@ -1,4 +1,4 @@
-"""The library's entry points hold BLAS to one thread, unless the caller says how many."""
+"""The library's entry points limit BLAS to one thread, unless the caller sets the number."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def threads() -> list[int]:
     return [one["num_threads"] for one in found if one["user_api"] == "blas"]
 
 
-def test_a_library_caller_has_one_thread_meanwhile_and_its_own_again(monkeypatch):
+def test_thread_number_is_one_during_a_call_and_restored(monkeypatch):
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     with threadpoolctl.threadpool_limits(2, user_api="blas"):
         before = threads()
@@ -25,12 +25,12 @@ def test_a_library_caller_has_one_thread_meanwhile_and_its_own_again(monkeypatch
         assert threads() == before
 
 
-def test_who_sets_the_number_decides(monkeypatch):
+def test_number_set_by_the_caller_is_kept(monkeypatch):
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
     with threadpoolctl.threadpool_limits(2, user_api="blas"):
         assert max(on_one_thread(threads)()) == 2
 
 
-def test_every_entry_point_does_it():
+def test_every_entry_point_is_limited():
     entries = (calibrate, diagnose_recording, evaluate, replay)
     assert all(hasattr(entry, "__wrapped__") for entry in entries)

@@ -1,4 +1,4 @@
-"""What the rows say: drift, recurring findings, failures, SQL that cannot write."""
+"""Answers from the rows: drift, recurring findings, failures, and read-only SQL."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_drift_of_each_device_worst_first(tmp_path):
     assert text.startswith("2, rov2: 40 calibrations, 2026-01-01 to 2027-01-26")
 
 
-def test_recordings_of_which_nobody_knows_the_device_are_not_one_device(tmp_path):
+def test_recordings_of_unknown_devices_are_not_one_device(tmp_path):
     rows = [row(i, day=float(i), serial_number=None, vehicle=None) for i in range(3)]
     with FleetRows(store_of(tmp_path / "out", rows)) as asked:
         assert asked.drift() == []
@@ -61,7 +61,7 @@ def test_recordings_of_which_nobody_knows_the_device_are_not_one_device(tmp_path
     ]
 
 
-def test_what_has_not_converged_or_has_no_time_is_no_calibration(tmp_path):
+def test_unconverged_or_undated_calibrations_are_excluded(tmp_path):
     rows = [row(1, day=0.0), row(2, day=1.0, converged=False), row(3)]
     with FleetRows(store_of(tmp_path / "out", rows)) as asked:
         assert asked.drift() == []
@@ -136,7 +136,7 @@ def test_sql_reads_the_rows(tmp_path):
         "",
     ],
 )
-def test_sql_writes_nothing_and_reads_nothing_else(tmp_path, query):
+def test_sql_can_only_read_the_rows(tmp_path, query):
     secret = tmp_path / "secret.txt"
     secret.write_text("x")
     store = store_of(tmp_path / "out", [row(1)])
@@ -145,7 +145,7 @@ def test_sql_writes_nothing_and_reads_nothing_else(tmp_path, query):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "secret.txt"]
 
 
-def test_of_several_versions_the_newest_row_of_each_recording_counts(tmp_path):
+def test_newest_row_of_each_recording_counts(tmp_path):
     old = [row(i, version="0.1.0", finished_utc="2026-01-01T00:00:00+00:00") for i in (1, 2)]
     new = row(9, version="0.2.0", content_sha256=f"{1:064x}", recording="dive_1.mcap",
               finished_utc="2026-02-01T00:00:00+00:00")  # fmt: skip
@@ -157,11 +157,11 @@ def test_of_several_versions_the_newest_row_of_each_recording_counts(tmp_path):
     assert counts["versions"] == ["0.1.0", "0.2.0"]
 
 
-def test_parts_that_are_replaced_while_they_are_asked_are_looked_up_again(tmp_path):
+def test_replaced_parts_are_looked_up_again(tmp_path):
     store = store_of(tmp_path / "out", [row(1)])
     with FleetRows(store) as asked:
         store.put(row(2))
-        store.compact()  # the part that was opened is gone
+        store.compact()  # the opened part is gone
         assert asked.sql("select count(*) from recordings").rows == [(2,)]
 
 
@@ -181,7 +181,7 @@ def test_foreign_texts_do_not_reach_the_terminal(tmp_path):
     assert all(text.isprintable() for text in lines)
 
 
-def test_a_table_is_cut_and_says_so():
+def test_long_table_is_truncated_with_a_note():
     lines = questions.table_lines(("n",), [(i,) for i in range(1000)])
     assert lines[0].strip() == "n"
     assert lines[-1] == "... and 960 more rows: --json has all"
@@ -191,5 +191,5 @@ def test_a_table_is_cut_and_says_so():
     ("seconds", "words"),
     [(0.4, "0 s"), (90, "90 s"), (600, "10 min"), (9000, "2.5 h"), (864000, "10 days")],
 )
-def test_durations_for_a_person(seconds, words):
+def test_durations_are_formatted(seconds, words):
     assert duration(seconds) == words

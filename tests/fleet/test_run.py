@@ -1,4 +1,4 @@
-"""A run: every recording one row with what the commands say of it, again and again."""
+"""A run: one row per recording with the results of the commands, and repeated runs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytest.importorskip("duckdb", reason="duckdb (the extra fleet) is not installed"
 
 PLACE = Place(2, LOADS)
 ONE = Place(1, LOADS)  # for a single recording
-BARE = Place(1, ())  # for what is refused before anything is computed
+BARE = Place(1, ())  # for recordings that are refused before any computation
 
 
 def ran(archive: Path | str, out: Path, place: Place = ONE, **orders: object) -> Progress:
@@ -47,7 +47,7 @@ def rows(out: Path) -> dict[str, dict[str, object]]:
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory):
-    """Three recordings of three vehicles, a PX4 log, and what is none."""
+    """Three recordings of three vehicles, a PX4 log, and files that are none."""
     folder = tmp_path_factory.mktemp("fleet") / "archive"
     write_archive(folder, 3)
     (folder / "rov0" / "empty.mcap").touch()
@@ -68,7 +68,7 @@ def out(archive):
     return archive.parent / "out"
 
 
-def test_every_recording_is_one_row_failures_too(archive, out):
+def test_every_recording_is_one_row_including_failures(archive, out):
     found = rows(out)
     outcomes = {name: one["outcome"] for name, one in found.items()}
     copies = {"dive_20260702_1.parquet", "copy.parquet"} & outcomes.keys()
@@ -88,7 +88,7 @@ def test_every_recording_is_one_row_failures_too(archive, out):
     assert found["gone.vnraw"]["error"] == "No such file or directory"
 
 
-def test_a_row_says_what_the_commands_say(archive, out):
+def test_row_has_the_results_of_the_commands(archive, out):
     path = archive / "rov0" / "dive_20260701_0.parquet"
     found = rows(out)[path.name]
     body = calibrate(path, Config()).json("magyc")
@@ -115,7 +115,7 @@ def test_a_row_says_what_the_commands_say(archive, out):
     assert found["version"] == "0.1.0"
 
 
-def test_again_there_is_nothing_to_do_but_copies_and_what_is_new(archive, out):
+def test_repeated_run_processes_only_new_files(archive, out):
     before = rows(out)
     done = ran(archive, out)
     assert (done.before, dict(done.outcomes)) == (7, {"was there": 1})
@@ -123,7 +123,7 @@ def test_again_there_is_nothing_to_do_but_copies_and_what_is_new(archive, out):
 
 
 @pytest.mark.slow
-def test_failures_are_done_again_when_asked(archive, out):
+def test_failures_are_repeated_when_requested(archive, out):
     before = rows(out)
     done = ran(archive, out, again=True)
     assert (done.failed, done.done) == (4, 5)
@@ -134,7 +134,7 @@ def test_failures_are_done_again_when_asked(archive, out):
 
 
 @pytest.mark.slow
-def test_a_file_that_was_mended_has_a_row_of_its_own(archive, tmp_path):
+def test_repaired_file_has_its_own_row(archive, tmp_path):
     small = tmp_path / "archive"
     small.mkdir()
     (small / "dive.csv").write_text("a,b\n1,2\n")
@@ -166,7 +166,7 @@ def test_options_are_in_the_key_and_labels_come_from_folders(archive, tmp_path):
     assert every == [(json.dumps({"rate_hz": 25.0}), found["converged"])]
 
 
-def test_through_fsspec_the_rows_are_the_same(archive, out, tmp_path):
+def test_rows_are_the_same_through_fsspec(archive, out, tmp_path):
     pytest.importorskip("fsspec", reason="fsspec (the extra fleet) is not installed")
     small = tmp_path / "archive" / "rov0"
     small.mkdir(parents=True)
@@ -180,7 +180,7 @@ def test_through_fsspec_the_rows_are_the_same(archive, out, tmp_path):
 
 
 @pytest.mark.slow
-def test_logs_of_autopilots_are_recordings_too(tmp_path):
+def test_autopilot_logs_are_recordings(tmp_path):
     pytest.importorskip("pyulog", reason="pyulog (the extra px4) is not installed")
     (tmp_path / "archive").mkdir()
     fast = sensor(3000, 100.0)
@@ -192,15 +192,17 @@ def test_logs_of_autopilots_are_recordings_too(tmp_path):
     assert found["outcome"] == "done", found["error"]
 
 
-def test_a_run_refuses_a_place_where_another_is_at_work(archive, tmp_path):
+def test_run_is_refused_while_another_is_active(archive, tmp_path):
     store = store_of(tmp_path / "out", [row(1)])
     with store.alone(), pytest.raises(AhrsdError, match="another `ahrsd fleet`"):
         ran(archive, tmp_path / "out")
 
 
 @pytest.mark.slow
-def test_what_a_recording_has_to_say_is_in_its_row_and_not_between_the_lines(tmp_path, capfd):
-    """The gyro's x axis is negated, which the core tells while it reads, and the verdict."""
+def test_warnings_of_a_recording_are_in_its_row_and_not_printed(tmp_path, capfd):
+    """The gyro's x axis is negated, which the core reports while reading, and so does the
+    verdict.
+    """
     made = simulate(ScenarioSettings("wam", "slow", seed=1, samples=3000))
     gyro = made.samples.gyro_b_rad_s * [-1.0, 1.0, 1.0]
     (tmp_path / "archive").mkdir()

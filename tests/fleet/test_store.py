@@ -1,4 +1,4 @@
-"""FleetRows are there exactly once, wherever a process was stopped."""
+"""Every row exists exactly once, wherever a process was stopped."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def names(*numbers: int) -> list[str]:
     return sorted(f"dive_{n}.mcap" for n in numbers)
 
 
-def test_rows_in_the_spool_and_in_parts_are_both_seen(tmp_path):
+def test_rows_in_the_spool_and_in_parts_are_both_read(tmp_path):
     store = store_of(tmp_path / "out", [row(1), row(2, serial_number=7)])
     store.put(row(3, serial_number=None))
     assert [p.parent.name for p in store.parts()] == ["serial=100", "serial=7"]
@@ -34,7 +34,7 @@ def test_rows_in_the_spool_and_in_parts_are_both_seen(tmp_path):
     assert list(store.spool.iterdir()) == []
 
 
-def test_a_stop_behind_the_list_leaves_rows_in_both_and_each_counts_once(tmp_path):
+def test_stop_after_the_list_was_written_duplicates_no_row(tmp_path):
     store = store_of(tmp_path / "out", [row(1), row(2)])
     store.put(row(1))  # as if the spool file had not been removed
     assert recordings(store) == names(1, 2)
@@ -42,7 +42,7 @@ def test_a_stop_behind_the_list_leaves_rows_in_both_and_each_counts_once(tmp_pat
     assert recordings(store) == names(1, 2)
 
 
-def test_a_stop_before_the_list_leaves_parts_that_nobody_counts(tmp_path):
+def test_stop_before_the_list_was_written_counts_no_unlisted_part(tmp_path):
     store = store_of(tmp_path / "out", [row(1)])
     before = (tmp_path / "out" / "parts.json").read_bytes()
     store.put(row(2))
@@ -59,7 +59,7 @@ def test_a_stop_before_the_list_leaves_parts_that_nobody_counts(tmp_path):
     assert len(list((tmp_path / "out" / "parts").rglob("*.parquet"))) == 1
 
 
-def test_half_a_file_is_never_read_and_goes(tmp_path):
+def test_incomplete_file_is_never_read_and_removed(tmp_path):
     store = store_of(tmp_path / "out", [row(1)])
     half = store.spool / f".{2:032x}.999999999"
     half.write_text('{"key": "0')
@@ -73,7 +73,7 @@ def test_half_a_file_is_never_read_and_goes(tmp_path):
     assert not part.exists()
 
 
-def test_a_row_made_anew_takes_the_place_of_the_old_one_in_another_part(tmp_path):
+def test_new_row_replaces_the_old_one_in_another_part(tmp_path):
     failed = row(1, serial_number=None, outcome="too slow", error="stopped")
     store = store_of(tmp_path / "out", [failed, row(2)])
     store.put(row(1, serial_number=100))
@@ -85,7 +85,7 @@ def test_a_row_made_anew_takes_the_place_of_the_old_one_in_another_part(tmp_path
     assert [p.parent.name for p in store.parts()] == ["serial=100"]
 
 
-def test_small_parts_of_a_device_become_one(tmp_path):
+def test_small_parts_of_a_device_are_joined(tmp_path):
     store = store_of(tmp_path / "out", [row(1)])
     for number in range(2, 6):
         store.put(row(number))
@@ -94,7 +94,7 @@ def test_small_parts_of_a_device_become_one(tmp_path):
     assert recordings(store) == names(1, 2, 3, 4, 5)
 
 
-def test_what_is_known_may_leave_failures_out(tmp_path):
+def test_known_rows_can_exclude_failures(tmp_path):
     store = store_of(tmp_path / "out", [row(1), row(2, outcome="crashed")])
     store.put(row(3, outcome="refused"))
     every = store.known("stamp", failures=True)
@@ -105,7 +105,7 @@ def test_what_is_known_may_leave_failures_out(tmp_path):
     assert not store.has(f"{2:032x}", failures=False)
 
 
-def test_a_part_that_is_replaced_while_a_worker_looks_is_looked_up_again(tmp_path, monkeypatch):
+def test_part_replaced_during_a_lookup_is_looked_up_again(tmp_path, monkeypatch):
     store = store_of(tmp_path / "out", [row(1)])
     old = store.parts()
     store.put(row(2))
@@ -118,11 +118,11 @@ def test_a_part_that_is_replaced_while_a_worker_looks_is_looked_up_again(tmp_pat
         store.has(f"{3:032x}", failures=True)
 
 
-def test_nothing_is_known_of_nothing():
+def test_no_row_is_known_in_an_empty_store():
     assert not Known([]).holds("0" * 32)
 
 
-def test_only_one_is_at_work(tmp_path):
+def test_only_one_run_is_active(tmp_path):
     store = store_of(tmp_path / "out", [])
     assert not store.at_work()
     with store.alone():
@@ -133,7 +133,7 @@ def test_only_one_is_at_work(tmp_path):
     assert not store.at_work()
 
 
-def test_a_folder_with_other_files_is_not_taken(tmp_path):
+def test_folder_with_other_files_is_refused(tmp_path):
     (tmp_path / "mine.txt").write_text("x")
     with pytest.raises(AhrsdError, match="holds other files"):
         Store(tmp_path).create()
@@ -141,7 +141,7 @@ def test_a_folder_with_other_files_is_not_taken(tmp_path):
         Store(tmp_path).rows()
 
 
-def test_a_list_of_a_later_format_is_refused(tmp_path):
+def test_list_of_a_later_format_is_refused(tmp_path):
     store = store_of(tmp_path / "out", [row(1)])
     (tmp_path / "out" / "parts.json").write_text(json.dumps({"schema": "ahrsd.fleet/9"}))
     with pytest.raises(AhrsdError, match=r"is not ahrsd\.fleet/1"):

@@ -1,4 +1,4 @@
-"""Drift, temperature and steps come back as they were put in; nothing is seen where nothing is."""
+"""Drift, temperature dependence and steps are recovered, and none is found without one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ STEP = np.array([5e-3, -3e-3, 4e-3])
 
 
 def series(seed: int, n: int = 120, *, step_at: int | None = None, warm: bool = True) -> Series:
-    """Calibrations over two years that scatter by 0.5 mG beside a sigma of 0.2 mG."""
+    """Calibrations over two years that scatter by 0.5 mG with a sigma of 0.2 mG."""
     rng = np.random.default_rng(seed)
     day = 20000.0 + np.sort(rng.uniform(0.0, 730.0, n))
     temperature = rng.normal(15.0, 6.0, n)
@@ -25,7 +25,7 @@ def series(seed: int, n: int = 120, *, step_at: int | None = None, warm: bool = 
     return Series(day, temperature if warm else np.full(n, np.nan), values, np.full((n, 3), 2e-4))
 
 
-def test_drift_temperature_and_a_step_come_back_within_their_sigmas():
+def test_drift_temperature_and_a_step_are_recovered_within_their_sigmas():
     given = [series(seed, step_at=70) for seed in range(40)]
     z = []
     for one, found in zip(given, trends(given), strict=True):
@@ -47,7 +47,7 @@ def test_drift_alone_has_no_steps():
     assert sum(bool(one.changes) for one in found) <= 5
 
 
-def test_one_calibration_that_is_off_is_no_step():
+def test_single_outlying_calibration_is_not_a_step():
     given = []
     for seed in range(20):
         one = series(seed)
@@ -59,7 +59,7 @@ def test_one_calibration_that_is_off_is_no_step():
     assert np.abs(z).max() < 5.0
 
 
-def test_two_steps_are_told_in_order():
+def test_two_steps_are_reported_in_order():
     one = series(3)
     one.values[30:] += STEP
     one.values[90:] -= 2 * STEP
@@ -69,7 +69,7 @@ def test_two_steps_are_told_in_order():
 
 
 @pytest.mark.parametrize("n", [8, 12, 60])
-def test_a_step_is_one_step_where_no_temperature_is_known(n):
+def test_step_is_single_without_a_temperature(n):
     one = series(6, n, step_at=n // 2, warm=False)
     one.values[:] = 0.1 + np.arange(n)[:, None] // (n // 2) * STEP  # without any scatter
     (found,) = trends([one])
@@ -78,7 +78,7 @@ def test_a_step_is_one_step_where_no_temperature_is_known(n):
     assert change.size == pytest.approx(STEP, rel=1e-6)
 
 
-def test_what_a_series_does_not_tell_is_nan():
+def test_undetermined_coefficients_are_nan():
     cold, two = series(1, warm=False), series(1, 2)
     found = trends([cold, two])
     assert np.isnan(found[0].per_degree).all()
@@ -87,14 +87,14 @@ def test_what_a_series_does_not_tell_is_nan():
     assert found[1].changes == ()
 
 
-def test_a_device_does_not_change_the_answer_about_another():
+def test_devices_do_not_influence_each_other():
     alone = trends([series(5, 60, step_at=20)])[0]
     beside = trends([series(9, 150), series(5, 60, step_at=20), series(2, 3)])[1]
     assert beside.per_year == pytest.approx(alone.per_year, rel=1e-6)
     assert beside.changes[0].size == pytest.approx(alone.changes[0].size, rel=1e-6)
 
 
-def test_many_calibrations_are_averaged_and_a_step_within_an_average_is_one_step():
+def test_step_within_averaged_calibrations_is_one_step():
     one = series(4, 3001, step_at=1507)
     bins = Bins.of(np.zeros(3001, np.int64), np.arange(3001))
     (day,) = bins.means([one.day]).T
@@ -109,5 +109,5 @@ def test_many_calibrations_are_averaged_and_a_step_within_an_average_is_one_step
     assert change.size == pytest.approx(STEP, abs=3e-4)
 
 
-def test_nothing_is_asked_of_nothing():
+def test_no_series_gives_no_trends():
     assert trends([]) == []

@@ -162,7 +162,7 @@ def test_absorbed_changes_are_invisible() -> None:
 
 
 @pytest.mark.slow
-def test_command_repeats_itself_and_hides_what_it_must(tmp_path: Path) -> None:
+def test_command_is_reproducible_and_hides_the_truth(tmp_path: Path) -> None:
     flags = ["--null", "1", "--single", "1", "--pair", "1", "--withheld", "2", "--outside", "1"]
     for name in ("a", "b"):
         assert world.main([str(tmp_path / name), "--seed", "3", *flags]) == 0

@@ -205,7 +205,7 @@ def test_same_seed_same_files_and_the_contract(tmp_path: Path) -> None:
                 assert e["visibility_without_attitude"] >= 4.99
 
 
-def test_needed_columns_are_there_unless_withheld() -> None:
+def test_needed_columns_exist_unless_withheld() -> None:
     single = case("single", "mag_bias_temperature")
     assert "temperature_c" in single.table
     hidden = case("withheld", "mag_bias_temperature")
@@ -213,7 +213,7 @@ def test_needed_columns_are_there_unless_withheld() -> None:
     assert "temperature_c" not in hidden.table
 
 
-def test_link_faults_are_what_they_say() -> None:
+def test_link_faults_have_their_stated_effect() -> None:
     w = world("auv")
     for seed in range(12):
         built = RECIPES["frame_error"].draw(w, np.random.default_rng(seed))

@@ -1,4 +1,4 @@
-"""The figures by which calibrations are judged, against numbers worked out by hand."""
+"""The figures by which calibrations are judged, compared with values computed by hand."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_the_truth_has_no_error_whatever_its_volume():
     assert found["nees"] is None
 
 
-def test_errors_are_norms():
+def test_errors_are_norms_of_differences():
     hard_iron = TRUTH.hard_iron_gauss + np.array([3e-3, 0.0, 4e-3])
     off = MethodAnswer(None, hard_iron, TRUTH.gyro_bias_rad_s + np.array([0.0, 2e-3, 0.0]))
     found = figures(off, EXPERIMENT)
@@ -62,7 +62,7 @@ def test_geodesic_is_affine_invariant():
     assert geodesic(B, A) == pytest.approx(geodesic(A, B))
 
 
-def test_a_hard_iron_across_the_field_turns_a_level_heading_by_its_angle():
+def test_hard_iron_across_the_field_rotates_the_level_heading_by_its_angle():
     """A level sensor without soft iron that turns once; b along x of 5 % of the level field."""
     n = 3600
     heading = np.linspace(0, 2 * np.pi, n, endpoint=False)
@@ -79,7 +79,7 @@ def test_a_hard_iron_across_the_field_turns_a_level_heading_by_its_angle():
 
 
 @pytest.mark.parametrize("noise_gauss", [0.0, 2e-3])
-def test_the_expected_heading_error_is_that_of_draws_from_the_covariance(noise_gauss):
+def test_expected_heading_error_equals_that_of_draws_from_the_covariance(noise_gauss):
     made = simulate(ScenarioSettings("mam", "rov", samples=5000))
     draws = 1e-4 * np.random.default_rng(3).standard_normal((40, 12))
     errors = []
@@ -121,7 +121,7 @@ def test_nees_of_draws_from_the_covariance_is_one():
 
 
 @pytest.mark.parametrize(
-    ("answer", "said"),
+    ("answer", "message"),
     [
         (MethodAnswer(-np.eye(3), np.zeros(3), np.zeros(3)), "determinant -1 cannot"),
         (MethodAnswer(np.full((3, 3), np.nan), np.zeros(3), None), "soft iron is not finite"),
@@ -129,8 +129,8 @@ def test_nees_of_draws_from_the_covariance_is_one():
         (MethodAnswer(None, np.array([np.nan, 0, 0]), None), "hard_iron_gauss is not finite"),
     ],
 )
-def test_what_is_no_calibration_is_refused(answer, said):
-    with pytest.raises(ValueError, match=said):
+def test_invalid_calibration_is_refused(answer, message):
+    with pytest.raises(ValueError, match=message):
         figures(answer, EXPERIMENT)
 
 

@@ -1,5 +1,6 @@
-"""The Cramer-Rao bound against what does not share its code: a dense Fisher matrix from numeric
-derivatives, two smoothers over many seeds, and published figures."""
+"""The Cramer-Rao bound compared with independent code: a dense Fisher matrix from numeric
+derivatives, two smoothers over many seeds, and published figures.
+"""
 
 from __future__ import annotations
 
@@ -131,7 +132,7 @@ def test_equals_a_dense_fisher_matrix(full):
     )
 
 
-def test_a_known_field_frees_the_volume_and_costs_nothing_else():
+def test_known_field_determines_the_volume_and_changes_nothing_else():
     experiment = quick(200)
     free, known = bound_of(experiment), bound_of(experiment, field_known=True)
     A = experiment.truth.soft_iron
@@ -143,7 +144,7 @@ def test_a_known_field_frees_the_volume_and_costs_nothing_else():
     assert known.covariance[6:, 6:] == pytest.approx(free.covariance[6:, 6:], rel=1e-6)
 
 
-def test_the_antisymmetric_part_costs_accuracy_and_the_full_matrix_says_how_much():
+def test_full_matrix_bound_includes_the_cost_of_the_antisymmetric_part():
     experiment = simulate(ScenarioSettings("lam", "slow", seed=0))
     symmetric, full = bound_of(experiment), bound_of(experiment, full_matrix=True)
     assert full.covariance.shape == (15, 15)
@@ -151,7 +152,7 @@ def test_the_antisymmetric_part_costs_accuracy_and_the_full_matrix_says_how_much
     assert full.soft_iron > symmetric.soft_iron
 
 
-def test_a_gap_is_not_bridged_and_costs_information():
+def test_gap_is_not_bridged_and_loses_information():
     whole = simulate(ScenarioSettings("mam", "rov", seed=1, samples=4000))
     t = trajectory(whole)
     dt = t.dt_s.copy()
@@ -184,7 +185,7 @@ def test_a_sensor_at_rest_determines_nothing():
         cramer_rao(rest, np.eye(3), SM, SG)
 
 
-def test_its_work_is_in_whole_arrays_and_not_by_sample():
+def test_bound_is_computed_on_whole_arrays():
     experiment = simulate(ScenarioSettings("lam"))
     calls, _ = counted_calls(lambda: bound_of(experiment))
     print(f"{calls} calls for {len(experiment)} samples")
@@ -212,9 +213,8 @@ PUBLISHED = {
     ],
 )
 def test_published_bounds_at_400_s(scenario, motion):
-    """Seeds differ, so only the spread over runs can be asked for: 20 % where it is small.
-
-    "rov" MAM and LAM come out 10 % below the published figures (0.29 and 0.56 for 0.32 and 0.62).
+    """Seeds differ, so only the spread over runs can be required: 20 % if it is small. "rov" MAM
+    and LAM are 10 % below the published figures (0.29 and 0.56 for 0.32 and 0.62).
     """
     runs = [bound_of(simulate(ScenarioSettings(scenario, motion, seed))) for seed in range(12)]
     hard, soft, gyro = PUBLISHED[scenario, motion]
@@ -364,13 +364,13 @@ def check_at_bound(errors, bounds, above):
 
 
 @pytest.mark.parametrize("runs", [15, pytest.param(40, marks=pytest.mark.slow)])
-def test_a_full_likelihood_smoother_of_its_own_reaches_it(runs):
+def test_independent_maximum_likelihood_smoother_reaches_the_bound(runs):
     settings = [ScenarioSettings("mam", "rov", seed, samples=1500) for seed in range(runs)]
     check_at_bound(*errors_and_bounds(smooth, settings), above=1.0)
 
 
 @pytest.mark.parametrize("runs", [6, pytest.param(12, marks=pytest.mark.slow)])
-def test_the_estimator_fed_whole_reaches_it(runs):
+def test_estimator_on_a_whole_recording_reaches_the_bound(runs):
     def estimate(experiment):
         estimator = Estimator()
         for block in experiment.blocks(1000):

@@ -1,5 +1,6 @@
-"""The bound with an instrument's and a place's imperfections against what shares no code with it:
-a dense Fisher matrix from differences of the physical readings, and the scatter of answers."""
+"""The bound with imperfections of instrument and place, compared with independent code: a dense
+Fisher matrix from differences of the physical readings, and the scatter of estimates.
+"""
 
 from __future__ import annotations
 
@@ -139,7 +140,7 @@ def besides(experiment, kind, around):
         pytest.param(AS_SPECIFIED, AROUND, id="specified, and around", marks=pytest.mark.slow),
     ],
 )
-def test_equals_a_dense_fisher_matrix_with_what_is_known_of_the_imperfections(kind, around):
+def test_equals_a_dense_fisher_matrix_with_priors_of_the_imperfections(kind, around):
     experiment = turning()
     readings = Readings(experiment, kind, around)
     J = dense(readings)
@@ -155,10 +156,9 @@ def test_equals_a_dense_fisher_matrix_with_what_is_known_of_the_imperfections(ki
 
 
 @pytest.mark.slow
-def test_answers_scatter_as_it_says_where_the_imperfections_are_drawn():
-    """Most probable answers to readings of which everything was drawn: noise and imperfections.
-
-    Chord iterations with the matrix at the truth; the readings themselves are not linear.
+def test_estimates_scatter_as_predicted_when_the_imperfections_are_drawn():
+    """Most probable estimates from readings with random noise and imperfections. Chord
+    iterations with the matrix at the truth; the readings themselves are not linear.
     """
     experiment = turning()
     readings = Readings(experiment, ASSEMBLED, AROUND)
@@ -185,7 +185,7 @@ def test_answers_scatter_as_it_says_where_the_imperfections_are_drawn():
     assert np.all(scatter > 2.0 * np.diag(plain.covariance)[6:])
 
 
-def test_it_is_never_below_the_plain_one_and_grows_with_the_sizes():
+def test_extended_bound_is_never_below_the_plain_one_and_grows_with_the_sizes():
     experiment = simulate(ScenarioSettings("lam", "rov", seed=1, samples=3000))
     small, large = (
         cramer_rao(trajectory, experiment.truth.soft_iron, SM, SG, nuisances=extra).covariance
@@ -202,7 +202,7 @@ def test_it_is_never_below_the_plain_one_and_grows_with_the_sizes():
     assert np.all(np.diag(large)[6:9] > 2.0 * np.diag(plain)[6:9])
 
 
-def test_of_a_perfect_instrument_it_is_the_plain_one():
+def test_extended_bound_of_a_perfect_instrument_is_the_plain_one():
     experiment = turning()
     nothing = replace(ASSEMBLED, **dict.fromkeys(ASSEMBLED.__slots__, 1e-12))
     assert astuple(nothing) == (1e-12,) * 6
@@ -214,8 +214,8 @@ def test_of_a_perfect_instrument_it_is_the_plain_one():
     assert found[6:, 6:] == pytest.approx(plain[6:, 6:], rel=1e-5)
 
 
-def test_roll_and_pitch_close_what_level_circles_leave_open():
-    """Axes that may be turned, a lag and scales leave the iron open unless the motion tells."""
+def test_roll_and_pitch_determine_what_level_circles_leave_open():
+    """Misalignment, delay and scale errors leave the iron undetermined without such motion."""
     level = pieces.drive((("circles", 120.0),), 3, rate_hz=10.0)
     rolled = pieces.drive((("circles", 60.0), ("roll", 30.0), ("pitch", 30.0)), 3, rate_hz=10.0)
     worst = []

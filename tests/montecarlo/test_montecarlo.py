@@ -1,4 +1,4 @@
-"""Monte Carlo: deterministic, resumable, honest about failures; and a short form of the goals."""
+"""Monte Carlo: deterministic, resumable, failures counted; and a short form of the goals."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def without_time(records):
 
 
 @pytest.mark.slow
-def test_a_run_says_everything_and_its_seed_decides_it():
+def test_run_has_all_results_and_is_determined_by_its_seed():
     one = run_one(SHORT, 3)
     assert [(r["method"], r["at_s"]) for r in one["results"]] == [
         ("magyc", 40.0),
@@ -57,14 +57,14 @@ def test_a_run_says_everything_and_its_seed_decides_it():
     assert without_time([run_one(SHORT, 4)]) != without_time([one])
 
 
-def test_any_order_gives_what_one_after_the_other_gives():
+def test_results_do_not_depend_on_the_order():
     plan = Plan("mam", "rov", methods=("ellipsoid", "fnp"), at_s=(40.0,))
     here = run_many(plan, range(3))
     there = run_many(plan, range(3), runner=lambda p, seeds: one_by_one(p, [*seeds][::-1]))
     assert without_time(there) == without_time(here)
 
 
-def test_a_seed_that_was_lost_is_a_failure_of_every_method_and_is_run_again(tmp_path):
+def test_lost_seed_is_a_failure_of_every_method_and_is_repeated(tmp_path):
     plan = Plan("mam", "rov", methods=("ellipsoid", "fnp"), at_s=(40.0, 60.0))
 
     def losing(p, seeds):
@@ -88,7 +88,7 @@ def test_a_seed_that_was_lost_is_a_failure_of_every_method_and_is_run_again(tmp_
 
 
 @pytest.mark.slow
-def test_the_command_on_processes_says_what_this_process_says(run, tmp_path):
+def test_command_with_processes_gives_the_results_of_one_process(run, tmp_path):
     """All seeds by two processes; then a limit that none can meet."""
     path, words = tmp_path / "m.json", ("--motion", "rov", "--runs", 3, "--at", "40", "--jobs", 2)
     methods = ("--method", "ellipsoid", "--method", "fnp")
@@ -104,7 +104,7 @@ def test_the_command_on_processes_says_what_this_process_says(run, tmp_path):
     assert not (tmp_path / "runs").exists()
 
 
-def test_what_is_done_is_not_done_again_and_a_torn_line_is(tmp_path):
+def test_finished_seeds_are_not_repeated_except_torn_lines(tmp_path):
     plan = Plan("mam", "rov", methods=("ellipsoid",), at_s=(40.0,))
     run_many(plan, range(3), resume=tmp_path)
     (path,) = tmp_path.iterdir()
@@ -130,7 +130,7 @@ def test_another_plan_has_another_file(tmp_path):
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_failures_are_counted_in_their_own_words_and_leave_no_number():
+def test_failures_are_counted_by_reason_and_give_no_number():
     # 5 s of slow LAM: no ellipsoid is to be seen
     plan = Plan("lam", "slow", methods=("ellipsoid",), at_s=(5.0,))
     (row,) = summarise(run_many(plan, range(4)))
@@ -142,7 +142,7 @@ def test_failures_are_counted_in_their_own_words_and_leave_no_number():
     assert next(iter(row.failures)) in text
 
 
-def test_the_summary_is_arithmetic():
+def test_summary_in_a_small_example():
     def record(error, bound, nees):
         errors = dict.fromkeys(FIGURES)
         result = {
@@ -176,12 +176,12 @@ def test_the_summary_is_arithmetic():
         ({"noise_gyro_rad_s": -1.0}, "noise_gyro_rad_s is -1"),
     ],
 )
-def test_wrong_plans_are_named(wrong, said):
+def test_wrong_plans_are_refused(wrong, said):
     with pytest.raises(ValueError, match=said):
         Plan("mam", **wrong)
 
 
-def test_every_id_of_the_contract_is_known():
+def test_every_documented_method_id_is_known():
     contract = (
         "magyc magyc-ifg magyc-bfg magical-ifg magical-bfg magical-ls magical-nls twostep "
         "ellipsoid magfactor3 tls np fnp np-uncertain-field"
@@ -239,7 +239,7 @@ def test_the_tables_have_the_bound_of_every_parameter_and_of_the_heading():
     assert f"{rows[0].ordinary_bound['heading_deg']:#.4g}" in wider
 
 
-def test_the_bound_of_an_ordinary_instrument_stands_beside_the_plain_one(run, tmp_path, capsys):
+def test_table_has_the_bound_of_an_ordinary_instrument_and_the_plain_one(run, tmp_path, capsys):
     path, words = tmp_path / "m.json", ("--motion", "rov", "--runs", 2, "--jobs", 1)
     methods = ("--method", "ellipsoid", "--at", "60,120")
     assert run("montecarlo", "wam", *words, *methods, "--json", path) == 0
@@ -270,7 +270,7 @@ def test_sweeps_over_noise_and_hard_iron(run, tmp_path):
     assert sets[1]["truth"]["hard_iron_gauss"] == pytest.approx([0.1128, 0.3282, 0.339])
 
 
-def test_an_answer_that_is_missing_at_the_end_is_exit_1(run, capsys):
+def test_missing_estimate_at_the_end_exits_with_code_one(run, capsys):
     arguments = ("--runs", 2, "--at", "5", "--jobs", 1, "--method", "ellipsoid")
     assert run("montecarlo", "lam", *arguments) == 1
     assert "0/2" in capsys.readouterr().out
@@ -284,12 +284,12 @@ def test_an_answer_that_is_missing_at_the_end_is_exit_1(run, capsys):
         (("--noise-mag", "nan"), "noise_mag_gauss is nan"),
     ],
 )
-def test_bad_use_is_exit_2(run, capsys, arguments, said):
+def test_bad_use_exits_with_code_two(run, capsys, arguments, said):
     assert run("montecarlo", "wam", *arguments) == 2
     assert said in capsys.readouterr().err
 
 
-def test_a_folder_that_cannot_be_used_is_said(tmp_path):
+def test_unusable_folder_is_refused(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
     plan = Plan("mam", methods=("ellipsoid",), at_s=(40.0,))
@@ -299,9 +299,9 @@ def test_a_folder_that_cannot_be_used_is_said(tmp_path):
 
 @pytest.mark.parametrize("runs", [8, pytest.param(16, marks=pytest.mark.slow)])
 def test_short_form_of_the_goals(runs):
-    """A few runs: within three standard errors of the bound, and an honest covariance.
+    """A few runs: within three standard errors of the bound, with a correct covariance.
 
-    The full form is in docs/validation/montecarlo.md; 16 runs cannot tell 1.0 from 1.25.
+    The full form is in docs/validation/montecarlo.md; 16 runs cannot distinguish 1.0 from 1.25.
     """
     plan = Plan("mam", "rov", at_s=(80.0,))
     batch, stream = summarise(run_many(plan, range(runs)))

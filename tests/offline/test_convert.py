@@ -1,4 +1,4 @@
-"""What `ahrsd convert --list` says of recordings of our own."""
+"""Output of `ahrsd convert --list` for the project's own recordings."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ def listed(path) -> list[str]:
     return result.output.splitlines()
 
 
-def test_a_byte_stream_tells_its_messages_and_what_is_none(tmp_path):
+def test_list_of_a_byte_stream_has_its_messages_and_the_other_bytes(tmp_path):
     line = encode_sentence("VNMAR", (0.1, 0.2, 0.3, 0.0, 0.0, -9.8, 0.01, 0.02, 0.03))
-    packets = bytes.fromhex("fa010800")  # cut off: it came to nothing
+    packets = bytes.fromhex("fa010800")  # cut off: no message
     (tmp_path / "raw").write_bytes(7 * line + b"$VNWRG,06,14*59\r\n" + 5 * line + packets)
     first, second, third, left = listed(tmp_path / "raw")
     assert first == "raw is a byte stream"
@@ -28,7 +28,7 @@ def test_a_byte_stream_tells_its_messages_and_what_is_none(tmp_path):
     assert left == f"4 of {12 * len(line) + 17 + 4:,} bytes belong to no whole message"
 
 
-def test_a_table_tells_an_acceleration_where_it_has_one(tmp_path):
+def test_list_of_a_table_has_acceleration_only_if_present(tmp_path):
 
     rows = np.arange(40.0)
     columns = {"time_s": rows / 20}

@@ -1,8 +1,9 @@
-"""Golden replays: what each stream of fixtures/replays/golden.toml must give, decision by decision.
+"""Golden replays: the expected result of each stream in fixtures/replays/golden.toml, decision
+by decision.
 
-Counts, gates, states and the hash of all decisions are compared everywhere, whatever the Python and
-the processor; the bytes of the streams only where the arithmetic is the one on which they were made
-(tests/support/files/golden.py says why).
+Counts, gates, states and the hash of all decisions are compared on every Python and processor. The
+bytes of the streams are compared only with the arithmetic on which they were made (reason:
+tests/support/files/golden.py).
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def found():
     return get
 
 
-def test_there_are_thirty_and_ten_with_faults():
+def test_at_least_thirty_streams_exist_ten_of_them_with_faults():
     assert set(FACTS) == set(golden.STREAMS)
     assert len(FACTS) >= 30
     assert sum(bool(one.setup.faults) for one in golden.STREAMS.values()) >= 10
@@ -43,7 +44,7 @@ def test_there_are_thirty_and_ten_with_faults():
 
 
 @pytest.mark.parametrize("name", FACTS)
-def test_a_stream_replays_to_its_facts(found, name):
+def test_stream_replays_to_its_expected_facts(found, name):
     expected, seen = FACTS[name], found(name)
     assert set(seen) == set(expected)
     for key in set(expected) - {"sha256", *NUMBERS}:
@@ -53,14 +54,14 @@ def test_a_stream_replays_to_its_facts(found, name):
 
 
 @pytest.mark.parametrize("name", FACTS)
-def test_the_decisions_are_the_same_to_the_last_digit(found, name):
+def test_hash_of_the_decisions_is_reproduced(found, name):
     why = f"the hashes were made on {ARITHMETIC}, this is {golden.arithmetic()}"
     assert found(name)["sha256"] == FACTS[name]["sha256"], why
 
 
 @pytest.mark.parametrize("kernels", ["Prescott", pytest.param("Nehalem", marks=pytest.mark.slow)])
-def test_the_decisions_are_the_same_with_the_kernels_of_another_processor(kernels):
-    """OpenBLAS has kernels for each; with those of an older one the last digits differ."""
+def test_hash_of_the_decisions_is_the_same_with_older_processor_kernels(kernels):
+    """OpenBLAS has kernels per processor; with those of an older one the last digits differ."""
     names = ["clean_rov_binary", "clean_narrow", "fault_iron"]
     code = "import golden, sys; print(*(golden.found_in(name)['sha256'] for name in sys.argv[1:]))"
     folder = Path(golden.__file__).parent
@@ -76,8 +77,8 @@ def test_the_decisions_are_the_same_with_the_kernels_of_another_processor(kernel
     assert ended.stdout.split() == [FACTS[name]["sha256"] for name in names], ended.stderr
 
 
-def test_what_is_wrong_shows():
-    """The streams differ in what was done to them."""
+def test_faults_of_the_streams_appear_in_their_facts():
+    """The streams differ in the faults applied to them."""
     assert len({facts["sha256"] for facts in FACTS.values()}) == len(FACTS)
     assert {name for name, facts in FACTS.items() if facts["restarts"]} == {
         "fault_reset", "fault_clock_wrap",
@@ -86,12 +87,12 @@ def test_what_is_wrong_shows():
         assert FACTS[name]["gaps"] > 0, name
     for name in ("fault_bit_flip", "fault_noise_insert", "fault_byte_drop"):
         assert FACTS[name]["rejected"] > 0, name
-    for name in ("fault_garbage", "fault_wrong_rate"):  # not even the shape of a message is left
+    for name in ("fault_garbage", "fault_wrong_rate"):  # not even the shape of a message remains
         assert FACTS[name]["samples"] < 0.95 * FACTS["clean_tumble_vnymr"]["samples"], name
 
 
 @pytest.mark.parametrize("name", ["clean_tumble_vnymr", "fault_garbage"])
-def test_a_stream_is_made_as_the_table_says(name, tmp_path, monkeypatch):
+def test_stream_can_be_generated_again_from_its_description(name, tmp_path, monkeypatch):
     kept = golden.path_of(name).read_bytes()
     monkeypatch.setattr(golden, "FOLDER", tmp_path)
     golden.make_stream(name)

@@ -1,4 +1,4 @@
-"""`ahrsd calibrate --method NAME|all` on a recording that was simulated."""
+"""`ahrsd calibrate --method NAME|all` on a simulated recording."""
 
 import json
 from datetime import date
@@ -15,7 +15,7 @@ from ahrsd.offline.calibrate import calibrate
 from ahrsd.offline.compare_methods import run_published
 
 
-def test_the_command_knows_every_method():
+def test_command_offers_every_method():
     assert set(_METHODS) - {"magyc", "all"} == set(METHODS)
 
 
@@ -31,7 +31,7 @@ def simulated(tmp_path_factory):
     return path, json.loads(path.with_name("wam.csv.truth.json").read_text())
 
 
-def test_all_methods_in_one_table(simulated, run, capsys):
+def test_all_methods_are_printed_in_one_table(simulated, run, capsys):
     path, truth = simulated
     target = path.with_name("all.json")
     picture = path.with_name("all.png")
@@ -55,28 +55,26 @@ def test_all_methods_in_one_table(simulated, run, capsys):
             assert "magnitude" in entry["warnings"][-1]
 
 
-def test_one_method_says_no_with_exit_code_one(simulated, run, capsys):
+def test_method_without_an_answer_exits_with_code_one(simulated, run, capsys):
     path, _ = simulated
     assert run("calibrate", path, "--method", "twostep") == 1
     assert "no answer" in capsys.readouterr().out
 
 
-def test_a_figure_of_one_method_is_refused(simulated, run, capsys):
+def test_figure_of_a_single_method_is_refused(simulated, run, capsys):
     path, _ = simulated
     assert run("calibrate", path, "--figure", path.with_name("one.png")) == 2
     assert "--figure compares the methods: give --method all" in capsys.readouterr().err
 
 
-def test_magfactor3_takes_the_devices_attitude_where_place_and_attitude_are_known(
-    simulated, tmp_path
-):
-    """Its yaw is magnetic; on the Black Sea the field dips as the simulated one does."""
+def test_magfactor3_uses_the_device_attitude_when_place_and_attitude_are_known(simulated, tmp_path):
+    """The device's yaw is magnetic. At the Black Sea the field has the dip of the simulated one."""
     path, truth = simulated
     names = path.read_text().split("\n", 1)[0].split(",")
     rows = np.genfromtxt(path, delimiter=",", skip_header=1)
     q = rows[:, [names.index(f"ref_q{part}") for part in "xyzw"]]
     ypr = Rotation.from_quat(q).as_euler("ZYX", degrees=True)
-    ypr[:, 0] -= np.degrees(np.arctan2(52.0, 227.0))  # the thesis' field, m0
+    ypr[:, 0] -= np.degrees(np.arctan2(52.0, 227.0))  # the field m0 of the thesis
     header = ",".join([*names[:7], "vn_yaw_deg", "vn_pitch_deg", "vn_roll_deg"])
     table = tmp_path / "with_attitude.csv"
     np.savetxt(table, np.hstack([rows[:, :7], ypr]), "%.7g", ",", header=header, comments="")
@@ -92,8 +90,8 @@ def test_magfactor3_takes_the_devices_attitude_where_place_and_attitude_are_know
 
 
 @pytest.mark.parametrize("method", [pytest.param("magyc", marks=pytest.mark.slow), "all"])
-def test_clipped_readings_end_in_one_line(simulated, tmp_path, run, capsys, method):
-    """Ours would converge on them; what it says of itself does not show what was cut off."""
+def test_clipped_readings_are_refused_in_one_line(simulated, tmp_path, run, capsys, method):
+    """The project's own method would converge; its covariance does not show the clipped part."""
     path, _ = simulated
     names = path.read_text().split("\n", 1)[0]
     rows = np.genfromtxt(path, delimiter=",", skip_header=1)

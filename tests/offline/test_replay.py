@@ -1,4 +1,6 @@
-"""Replays of the emulated device's streams: facts, and the same decisions whatever the way."""
+"""Replays of the emulated device's streams: facts, and equal decisions however they are
+replayed.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ DAMAGED, RESTART, SWITCH = FACTS
 
 
 def samples_of(seen: list[Event]) -> np.ndarray:
-    """(N, 11) everything that the estimator is given."""
+    """(N, 11) everything that the estimator receives."""
     return np.vstack(
         [
             np.column_stack([b.time_s, b.dt_s, b.raw_b_gauss, b.gyro_b_rad_s, b.accel_b_m_s2])
@@ -48,7 +50,7 @@ def whole():
 
 
 @pytest.mark.parametrize("name", FACTS)
-def test_an_emulated_stream_replays_to_its_facts(whole, name):
+def test_emulated_stream_replays_to_its_expected_facts(whole, name):
     facts, summary = FACTS[name], summary_json(whole(name)[0], name)
     assert faults(summary, REPLAY) == []
     assert summary["packets"] == {
@@ -68,7 +70,7 @@ def test_an_emulated_stream_replays_to_its_facts(whole, name):
 
 @pytest.mark.parametrize("name", FACTS)
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_how_the_bytes_were_cut_changes_no_sample_and_no_decision(whole, monkeypatch, name, seed):
+def test_samples_and_decisions_do_not_depend_on_the_chunks_of_bytes(whole, monkeypatch, name, seed):
     core, seen = whole(name)
     pieces = cut(content(FOLDER / name), seed)
     monkeypatch.setattr(opening, "_byte_inputs", lambda _: inputs(pieces))
@@ -80,12 +82,12 @@ def test_how_the_bytes_were_cut_changes_no_sample_and_no_decision(whole, monkeyp
     assert other.decisions.sha256 == core.decisions.sha256
 
 
-def test_the_hash_tells_decisions_apart(whole):
+def test_different_decisions_have_different_hashes(whole):
     hashes = {whole(name)[0].decisions.sha256 for name in FACTS}
     assert len(hashes) == len(FACTS)
 
 
-def test_a_paced_replay_takes_its_time_and_the_same_decisions(whole, tmp_path):
+def test_paced_replay_takes_real_time_and_decides_the_same(whole, tmp_path):
     import time
 
     short = tmp_path / "short.vnraw"
@@ -98,17 +100,19 @@ def test_a_paced_replay_takes_its_time_and_the_same_decisions(whole, tmp_path):
     assert fast.decisions.count > 0
 
 
-def test_a_table_of_a_streams_samples_gives_its_estimate(whole, tmp_path):
+def test_table_of_the_samples_gives_the_estimate_of_the_stream(whole, tmp_path):
     core, seen = whole(RESTART)
     columns = "time_s,mag_x_gauss,mag_y_gauss,mag_z_gauss,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,"
     columns += "accel_x_m_s2,accel_y_m_s2,accel_z_m_s2"
     rows = samples_of(seen)
-    start = int(np.argmin(np.diff(rows[:, 0]))) + 1  # the restart: a table's time must not fall
+    start = (
+        int(np.argmin(np.diff(rows[:, 0]))) + 1
+    )  # the restart: time must not decrease in a table
     rows[start:, 0] += 100.0
     path = tmp_path / "same.csv"
     rows = np.delete(rows, 1, axis=1)
     np.savetxt(path, rows, delimiter=",", header=columns, comments="", fmt="%.12g")
-    table = replay(path, Config(), held_out=False).core  # in the stream nothing was, so early
+    table = replay(path, Config(), held_out=False).core  # the stream has none so early
     assert table.stream.facts.samples == core.stream.facts.samples
     assert len(table.stream.gaps) == 2
     one, other = core.calibrator.estimate, table.calibrator.estimate
@@ -120,13 +124,13 @@ def test_a_table_of_a_streams_samples_gives_its_estimate(whole, tmp_path):
     assert np.abs(one.gyro_bias_rad_s - other.gyro_bias_rad_s).max() < 3e-4
 
 
-def test_json_on_stdout_is_all_that_is_on_stdout(run, capsys):
+def test_stdout_is_pure_json_when_json_goes_to_stdout(run, capsys):
     assert run("replay", FOLDER / RESTART, "--json", "-") == 0
     summary = json.loads(capsys.readouterr().out)
     assert faults(summary, REPLAY) == []
 
 
-def test_json_in_a_file_and_words_on_stdout(run, tmp_path, capsys):
+def test_stdout_is_text_when_json_goes_to_a_file(run, tmp_path, capsys):
     assert run("replay", FOLDER / DAMAGED, "--json", tmp_path / "s.json") == 0
     lines = capsys.readouterr().out.splitlines()
     assert json.loads((tmp_path / "s.json").read_text())["samples"] == FACTS[DAMAGED]["samples"]
@@ -139,14 +143,14 @@ def test_json_in_a_file_and_words_on_stdout(run, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == [tmp_path / "s.json"]
 
 
-def test_a_rate_that_is_given_is_used(run, tmp_path, capsys):
+def test_given_rate_is_used(run, tmp_path, capsys):
     assert run("replay", FOLDER / DAMAGED, "--rate", 50, "--json", "-") == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["rate_hz"] == 50.0
     assert summary["rate_source"] == "as given"
 
 
-def test_a_stream_that_was_cut_off_says_so(tmp_path):
+def test_truncated_stream_is_reported(tmp_path):
     path = tmp_path / "cut.vnraw"
     path.write_bytes(content(FOLDER / DAMAGED)[:30_000])
     assert replay(path, Config()).warnings == ["the recording ends in the middle of a message"]

@@ -1,6 +1,6 @@
 """Real recordings replay to the facts in fixtures/replays/recordings.toml.
 
-The recordings are not part of the project; where they are absent these tests say so and skip.
+The recordings are not part of the project; without them these tests are skipped.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ EACH = [pytest.param(one, marks=pytest.mark.slow if one in LONG else ()) for one
 
 
 class Found:
-    """A replay and the samples that it saw."""
+    """A replay and the samples that it processed."""
 
     def __init__(self, path: Path) -> None:
         self.blocks: list[SamplesSeen] = []
@@ -69,7 +69,7 @@ def replayed(recordings):
 
 
 @pytest.mark.parametrize("name", EACH)
-def test_a_recording_replays_to_its_facts(replayed, name):
+def test_recording_replays_to_its_expected_facts(replayed, name):
     facts, summary = FACTS[name], replayed(name).summary
     assert summary["packets"]["valid"] == facts["valid"]
     if "rejected" in facts:
@@ -87,7 +87,7 @@ def test_a_recording_replays_to_its_facts(replayed, name):
 
 
 @pytest.mark.parametrize("name", EACH)
-def test_the_summary_is_the_contracts(replayed, name):
+def test_summary_has_the_documented_form(replayed, name):
     found = replayed(name)
     assert faults(found.summary, REPLAY) == []
     assert len(found.summary["decisions"]) == found.done.core.decisions.count > 0
@@ -95,8 +95,8 @@ def test_the_summary_is_the_contracts(replayed, name):
     assert not [line for line in lines if "nan" in line or " -0.00 " in line or "-0 %" in line]
 
 
-def test_text_and_nmea_around_the_packets_change_no_sample(replayed, recordings, tmp_path):
-    """As far as half of the recording; all of it is in the slow form, below."""
+def test_text_and_nmea_between_packets_change_no_sample(replayed, recordings, tmp_path):
+    """Over half of the recording; the whole of it is in the slow test below."""
     whole = gzip.decompress((recordings / "vn100" / MIXED).read_bytes())
     part = tmp_path / MIXED
     part.write_bytes(gzip.compress(whole[: len(whole) // 2], 1))
@@ -108,13 +108,13 @@ def test_text_and_nmea_around_the_packets_change_no_sample(replayed, recordings,
 
 
 @pytest.mark.slow
-def test_text_and_nmea_around_all_packets_change_no_sample(replayed):
+def test_text_and_nmea_between_packets_change_no_sample_of_the_whole_recording(replayed):
     pure = replayed("F00379.vnbin.gz").table()
     assert np.array_equal(pure, replayed(MIXED).table(), equal_nan=True)
     assert replayed(MIXED).summary["skipped_bytes"] == 334515
 
 
-def test_a_sensor_at_rest_proposes_nothing_and_says_what_is_not_observable(replayed):
+def test_sensor_at_rest_proposes_nothing_and_lists_unobservable_directions(replayed):
     found = replayed("static_2025_kiran_5min.vnraw.gz")
     calibration = found.summary["calibration"]
     assert calibration["converged"] is False
@@ -127,7 +127,7 @@ def test_a_sensor_at_rest_proposes_nothing_and_says_what_is_not_observable(repla
     assert found.summary["state"] == "OBSERVING"
 
 
-def test_two_people_with_one_sensor_find_one_hard_iron(replayed):
+def test_two_people_with_one_sensor_find_the_same_hard_iron(replayed):
     one, other = (
         replayed(f"punch_2024_{who}.vnraw.gz").summary["calibration"]
         for who in ("satish", "shaked")
@@ -135,11 +135,13 @@ def test_two_people_with_one_sensor_find_one_hard_iron(replayed):
     apart = np.subtract(one["hard_iron_gauss"], other["hard_iron_gauss"])
     sigmas = [c["standard_deviation"]["hard_iron_gauss"] for c in (one, other)]
     assert np.abs(apart / np.hypot(*sigmas)).max() < 3.0
-    assert np.abs(apart).max() < 0.03  # x, which a fist turns about, is held
+    assert np.abs(apart).max() < 0.03  # x, the axis a fist turns about, is held
 
 
 def test_two_walks_with_one_sensor_agree_on_the_horizontal_hard_iron(replayed):
-    """Only since what their logger lost without a trace is not bridged (stream_rate)."""
+    """They agree because samples lost by their logger without a trace are not bridged
+    (stream_rate).
+    """
     one, other = (
         replayed(f"walk_{way}_2024_sazgar.vnraw.gz").summary["calibration"]
         for way in ("square", "circle")
@@ -151,14 +153,14 @@ def test_two_walks_with_one_sensor_agree_on_the_horizontal_hard_iron(replayed):
     assert np.abs(other["gyro_bias_rad_s"]).max() < 0.04
 
 
-def test_what_a_reader_must_know_is_said_once(replayed):
+def test_each_warning_is_reported_once(replayed):
     found = replayed("walk_square_2024_sazgar.vnraw.gz")
     said = warnings_of(found.done.core, found.done.warnings)
     assert len(said) == len(set(said))
     assert sum("missing although the bytes show no gap" in text for text in said) == 1
 
 
-def test_a_message_without_a_magnetometer_is_one_line_and_exit_2(run, recordings, capsys):
+def test_message_without_a_magnetometer_is_refused_in_one_line(run, recordings, capsys):
     path = recordings / "vn100" / "wrongtype_VNYIA_2023_gopi.vnraw.gz"
     for command in ("replay", "calibrate"):
         assert run(command, path) == 2
@@ -181,7 +183,7 @@ def test_a_message_without_a_magnetometer_is_one_line_and_exit_2(run, recordings
         "simulated/wam_0.csv.gz",
     ],
 )
-def test_tables_replay(recordings, name):
+def test_table_replays_without_registers(recordings, name):
     summary = Found(recordings / name).summary
     assert faults(summary, REPLAY) == []
     assert summary["samples"] > 500
@@ -194,13 +196,12 @@ def test_tables_replay(recordings, name):
 
 
 @pytest.mark.slow
-def test_a_replay_costs_little_more_than_its_parsing(recordings):
-    """Measured: 12 times the calls of parsing alone, 300 a message.
-
-    In seconds: `benchmarks/daemon/bench_replay.py`.
+def test_cost_of_a_replay_is_bounded_by_that_of_parsing(recordings):
+    """Measured: 12 times the calls of parsing alone, 300 per message. In seconds:
+    `benchmarks/daemon/bench_replay.py`.
     """
     path = recordings / "vn100" / "punch_2024_satish.vnraw.gz"
-    replay(path, Config())  # what is loaded on first use
+    replay(path, Config())  # modules that are loaded on first use
     parsing, messages = counted_calls(lambda: parse_alone(path))
     whole, done = counted_calls(lambda: replay(path, Config()))
     print(f"{parsing} calls to parse {messages} messages, {whole} to replay them")
@@ -209,7 +210,7 @@ def test_a_replay_costs_little_more_than_its_parsing(recordings):
 
 
 def parse_alone(path: Path) -> int:
-    """Unpack, deframe and decode every message; how many there are."""
+    """Unpack, deframe and decode every message; returns their number."""
     deframer = Deframer()
     return sum(
         decode(frame) is not None for chunk in read_chunks(path) for frame in deframer.feed(chunk)

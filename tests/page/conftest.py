@@ -1,6 +1,7 @@
-"""Statuses as a daemon told them beside an emulated device, and a page that is asked without one.
+"""Statuses of a daemon with an emulated device, and a page that is requested without one.
 
-`gathering`: the circle is nearly shown, no held-out segment yet. `qualified`: a candidate waits.
+`gathering`: the circle is nearly complete, without a held-out segment so far. `qualified`: a
+candidate waits.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def qualified() -> dict[str, Any]:
 
 @pytest.fixture
 def feed(qualified):
-    """A feed that heard a candidate just now; a test may let it hear something else."""
+    """A feed that has just received a candidate; a test may feed something else."""
     found = SimpleNamespace(heard=Heard(copy.deepcopy(qualified), time.monotonic()))
     found.hear = lambda status: setattr(found, "heard", Heard(status, time.monotonic()))
     return found

@@ -1,4 +1,4 @@
-"""Who may ask and who may approve."""
+"""Who may request the page and who may approve."""
 
 import pytest
 
@@ -36,11 +36,11 @@ from ahrsd.page.access import (
         ("", "127.0.0.1", False),
     ],
 )
-def test_a_page_is_asked_under_a_name_that_cannot_be_anybodys(header, own, known):
+def test_host_header_must_be_a_known_name(header, own, known):
     assert host_is_known(header, own, {"rov.local"}) is known
 
 
-def test_names_and_addresses_out_of_a_header():
+def test_host_name_is_parsed_from_the_header():
     assert host_of("[::1]:80") == "::1"
     assert host_of("Rov.Local:80") == "rov.local"
     assert host_of("a b") in ("", "a b")
@@ -61,11 +61,11 @@ def test_names_and_addresses_out_of_a_header():
         ({}, False),
     ],
 )
-def test_a_form_comes_from_this_page(headers, fine):
+def test_form_must_come_from_this_page(headers, fine):
     assert comes_from_here(headers, "http") is fine
 
 
-def test_a_form_is_bound_to_its_browser():
+def test_form_is_bound_to_its_browser():
     mark = form_mark(b"secret", "browser")
     assert is_form_mark(b"secret", "browser", mark)
     assert not is_form_mark(b"secret", "another", mark)
@@ -74,7 +74,7 @@ def test_a_form_is_bound_to_its_browser():
     assert not is_form_mark(b"secret", "browser", "")
 
 
-def test_the_right_token_is_taken_and_no_other():
+def test_only_the_right_token_is_accepted():
     token = Token("a1b2c3d4e5f6")
     assert token.check("a1b2c3d4e5f6", 0.0).right
     assert token.check(" a1b2c3d4e5f6\n", 0.0).right
@@ -83,7 +83,7 @@ def test_the_right_token_is_taken_and_no_other():
     assert not token.check("ü\udc80", 0.0).right
 
 
-def test_wrong_tokens_are_counted_and_a_right_one_then_waits_too():
+def test_too_many_wrong_tokens_also_block_the_right_one():
     token = Token("a1b2c3d4e5f6")
     for _ in range(5):
         assert token.check("guess", 100.0).text == "this is not the operator's token"
@@ -98,7 +98,7 @@ def test_wrong_tokens_are_counted_and_a_right_one_then_waits_too():
     assert token.check("guess", 3600.0).text.startswith("too many wrong tokens")
 
 
-def test_a_file_holds_one_token():
+def test_file_must_contain_one_token():
     assert token_in("a1b2c3d4e5f6\n") == "a1b2c3d4e5f6"
     for wrong in ("", "short", "two words here now", "x" * 300, "a1b2c3d4e5fü"):
         with pytest.raises(TokenError, match="holds no token"):

@@ -1,4 +1,4 @@
-"""The page as a browser, and as others, ask it."""
+"""The page as requested by a browser and by others."""
 
 import re
 
@@ -13,7 +13,7 @@ HERE = "http://127.0.0.1:9191"
 
 
 class Words:
-    """The operator's side of a daemon that answers as it is told."""
+    """The operator's side of a daemon that answers as configured."""
 
     def __init__(self):
         self.said, self.answer = [], (True, "43278c0e is being written")
@@ -29,8 +29,8 @@ def words():
 
 
 @pytest.fixture
-def asked(feed, words):
-    """A client of a page that was given a token."""
+def client(feed, words):
+    """A client of a page with a token."""
     app = make_app(Site(feed, words, frozenset({"rov.local"}), Token(TOKEN)))
     with TestClient(app, base_url=HERE) as client:
         yield client
@@ -53,22 +53,22 @@ def approve(client, headers=None, **changes):
     return client.post("/approve", data=form, headers=sent)
 
 
-def test_the_page_shows_the_daemon_and_loads_nothing_from_elsewhere(asked):
-    answer = asked.get("/")
+def test_page_shows_the_daemon_and_loads_nothing_external(client):
+    answer = client.get("/")
     assert answer.status_code == 200
     assert "QUALIFIED" in answer.text
     assert "43278c0e" in answer.text
     loaded = re.findall(r'(?:src|href)="([^"]+)"', answer.text)
     assert loaded == ["static/icon.svg", "static/page.css", "static/page.js"]
     for name in loaded:
-        assert asked.get(f"/{name}").status_code == 200
+        assert client.get(f"/{name}").status_code == 200
     assert re.search(r"<script(?![^>]*src=)", answer.text) is None
     assert " style=" not in answer.text
     assert " on" not in "".join(re.findall(r"<[^>]* on\w+=", answer.text))
 
 
-def test_every_answer_says_what_a_browser_may_do_with_it(asked):
-    for answer in (asked.get("/"), asked.get("/static/page.js"), asked.get("/nothing")):
+def test_every_answer_has_security_headers(client):
+    for answer in (client.get("/"), client.get("/static/page.js"), client.get("/nothing")):
         policy = answer.headers["content-security-policy"]
         assert "default-src 'none'" in policy
         assert "script-src 'self'" in policy
@@ -77,40 +77,40 @@ def test_every_answer_says_what_a_browser_may_do_with_it(asked):
         assert answer.headers["x-content-type-options"] == "nosniff"
         assert answer.headers["cache-control"] == "no-store"
         assert "access-control-allow-origin" not in answer.headers
-    cookie = asked.get("/").headers["set-cookie"].lower()
+    cookie = client.get("/").headers["set-cookie"].lower()
     assert "httponly" in cookie
     assert "samesite=strict" in cookie
 
 
 @pytest.mark.parametrize("path", ["/", "/events", "/static/page.js", "/approve"])
-def test_under_a_foreign_name_nothing_is_told(asked, path):
-    answer = asked.get(path, headers={"host": "evil.example"})
+def test_request_under_a_foreign_host_name_is_refused(client, path):
+    answer = client.get(path, headers={"host": "evil.example"})
     assert answer.status_code == 421
     assert "QUALIFIED" not in answer.text
-    assert asked.get("/", headers={"host": "rov.local:9191"}).status_code == 200
+    assert client.get("/", headers={"host": "rov.local:9191"}).status_code == 200
 
 
-def test_only_its_own_files_are_served(asked):
+def test_only_files_of_the_page_are_served(client):
     for name in ("../app.py", "page.html", "..%2f..%2fpyproject.toml", "%2fetc%2fpasswd"):
-        assert asked.get(f"/static/{name}").status_code == 404
+        assert client.get(f"/static/{name}").status_code == 404
 
 
-def test_an_approval_is_the_operators_word_and_its_answer_is_shown(asked, words):
-    answer = approve(asked)
+def test_approval_reaches_the_daemon_and_its_answer_is_shown(client, words):
+    answer = approve(client)
     assert (answer.status_code, answer.json()) == (
         200,
         {"accepted": True, "text": "43278c0e is being written"},
     )
     assert words.said == ["43278c0e"]
     words.answer = (False, "the vehicle has not said that a write is safe")
-    answer = approve(asked)
+    answer = approve(client)
     assert (answer.status_code, answer.json()["accepted"]) == (409, False)
     assert answer.json()["text"] == "the vehicle has not said that a write is safe"
 
 
-def test_without_javascript_the_answer_is_a_page(asked, words):
+def test_answer_is_a_page_without_javascript(client, words):
     words.answer = (False, "<b>no</b>")
-    answer = approve(asked, headers={"accept": "text/html"})
+    answer = approve(client, headers={"accept": "text/html"})
     assert "<h2>Refused</h2><p>&lt;b&gt;no&lt;/b&gt;</p>" in answer.text
 
 
@@ -131,20 +131,20 @@ def test_without_javascript_the_answer_is_a_page(asked, words):
         ({}, {"token": "x" * 5000}, 413, "a form of more than 4096 bytes"),
     ],
 )
-def test_nothing_is_said_to_the_daemon_for_anybody_else(asked, words, headers, form, code, why):
-    answer = approve(asked, headers, **form)
+def test_unauthorised_approval_never_reaches_the_daemon(client, words, headers, form, code, why):
+    answer = approve(client, headers, **form)
     assert answer.status_code == code
     assert answer.json()["accepted"] is False
     assert why in answer.json()["text"]
     assert words.said == []
 
 
-def test_the_mark_of_one_browser_is_no_good_in_another(asked, words):
-    mark = mark_of(asked)
-    asked.cookies.clear()
-    mark_of(asked)  # another browser
-    asked.cookies.set("ahrsd-page", "a-cookie-that-was-planted", domain="127.0.0.1")
-    answer = asked.post(
+def test_form_mark_of_another_browser_is_refused(client, words):
+    mark = mark_of(client)
+    client.cookies.clear()
+    mark_of(client)  # another browser
+    client.cookies.set("ahrsd-page", "a-cookie-that-was-planted", domain="127.0.0.1")
+    answer = client.post(
         "/approve",
         data={"mark": mark, "token": TOKEN, "candidate": "43278c0e"},
         headers={"origin": HERE},
@@ -153,15 +153,15 @@ def test_the_mark_of_one_browser_is_no_good_in_another(asked, words):
     assert words.said == []
 
 
-def test_wrong_tokens_are_limited(asked, words):
+def test_wrong_tokens_are_limited(client, words):
     for _ in range(5):
-        assert "not the operator's token" in approve(asked, token="guess").json()["text"]
-    answer = approve(asked)
+        assert "not the operator's token" in approve(client, token="guess").json()["text"]
+    answer = approve(client)
     assert "too many wrong tokens" in answer.json()["text"]
     assert words.said == []
 
 
-def test_a_page_without_a_token_only_shows(read_only, words):
+def test_page_without_a_token_is_read_only(read_only, words):
     text = read_only.get("/").text
     assert "<form" not in text
     assert "<input" not in text
@@ -173,21 +173,21 @@ def test_a_page_without_a_token_only_shows(read_only, words):
     assert words.said == []
 
 
-def test_a_candidate_that_changed_meanwhile_is_not_approved(asked, feed, qualified, words):
+def test_changed_candidate_is_not_approved(client, feed, qualified, words):
     qualified["write_back"]["proposal"]["id"] = "0badcafe"
     feed.hear(qualified)
-    answer = approve(asked)
+    answer = approve(client)
     assert "no longer proposed" in answer.json()["text"]
     assert words.said == []
 
 
-def test_the_daemon_away(asked, feed, words):
+def test_page_without_a_daemon_shows_no_old_values(client, feed, words):
     feed.heard = Heard(feed.heard.status, feed.heard.at_s - 60.0, "the daemon has ended")
-    text = asked.get("/").text
+    text = client.get("/").text
     assert "The daemon is away" in text
     assert "the daemon has ended" in text
     assert "43278c0e" not in text
-    answer = approve(asked)
+    answer = approve(client)
     assert (answer.status_code, answer.json()["text"]) == (
         503,
         "the daemon is away: the daemon has ended",
@@ -195,9 +195,9 @@ def test_the_daemon_away(asked, feed, words):
     assert words.said == []
 
 
-def test_foreign_text_is_escaped_on_the_page(asked, feed, qualified):
+def test_foreign_text_is_escaped(client, feed, qualified):
     qualified["sensors"] = ["<img src=x onerror=alert(1)>"]
     feed.hear(qualified)
-    text = asked.get("/").text
+    text = client.get("/").text
     assert "<img" not in text
     assert "&lt;img src=x" in text

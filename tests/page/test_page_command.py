@@ -1,4 +1,4 @@
-"""`ahrsd page` as a process: beside a daemon's socket, in a real browser, and what it refuses."""
+"""`ahrsd page` as a process: with a daemon's socket, in a real browser, and refused starts."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ OVERFLOW = """[...document.querySelectorAll('body *')].filter(e =>
 
 
 class Daemon:
-    """The daemon's socket and its ear for an operator, with a status that a test may change."""
+    """The daemon's socket and its operator input, with a status that a test may change."""
 
     def __init__(self, state, status):
         self.state, self.status, self.said = state, status, []
@@ -110,7 +110,7 @@ def has(place, words):
 
 @in_a_browser
 @pytest.mark.parametrize("dark", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_on_a_phone_and_on_a_desk(daemon, tmp_path, dark):
+def test_page_fits_a_phone_and_a_desktop(daemon, tmp_path, dark):
     with page_of(tmp_path) as (address, _), LiveBrowser(tmp_path / "browser") as browser:
         for width in (390, 1280):
             browser.open(address, width, dark=dark)
@@ -127,7 +127,7 @@ def test_on_a_phone_and_on_a_desk(daemon, tmp_path, dark):
 
 
 @in_a_browser
-def test_it_follows_the_daemon_and_never_shows_what_is_old(daemon, tmp_path):
+def test_page_follows_the_daemon_and_shows_no_outdated_values(daemon, tmp_path):
     with page_of(tmp_path) as (address, page), LiveBrowser(tmp_path / "browser") as browser:
         browser.open(address, 390)
         browser.until(has("#head", "QUALIFIED"))
@@ -139,7 +139,7 @@ def test_it_follows_the_daemon_and_never_shows_what_is_old(daemon, tmp_path):
         browser.until(has("#alarms", "<b id='planted'>the gyro is stuck</b>"))
         assert browser.value("document.getElementById('planted')") is None
 
-        # what a person unfolded stays so while its text is renewed
+        # an unfolded section stays unfolded while its text is updated
         shut = [one | {"ok": False, "advice": f"turn {k}"} for k, one in enumerate(turned["gates"])]
         held = [f"gate {one['gate']}: {one['advice']}" for one in shut[:9]]
         back = turned["write_back"] | {"holds": held}
@@ -172,7 +172,7 @@ def test_it_follows_the_daemon_and_never_shows_what_is_old(daemon, tmp_path):
 
 
 @in_a_browser
-def test_a_candidate_is_approved_with_the_token(daemon, tmp_path, token_file):
+def test_candidate_is_approved_with_the_token(daemon, tmp_path, token_file):
     def approve(browser, token):
         browser.value(f"document.getElementById('token').value = {json.dumps(token)}")
         browser.value("document.querySelector('#approve button').click()")
@@ -202,7 +202,7 @@ def test_a_candidate_is_approved_with_the_token(daemon, tmp_path, token_file):
 
 
 @in_a_browser
-def test_a_page_without_a_token_has_no_form(daemon, tmp_path):
+def test_page_without_a_token_has_no_form(daemon, tmp_path):
     with page_of(tmp_path) as (address, _), LiveBrowser(tmp_path / "browser") as browser:
         browser.open(address, 390)
         browser.until(has("#candidate", "43278c0e"))
@@ -224,10 +224,10 @@ def events(address, count):
     return found
 
 
-def test_a_browser_that_never_reads_keeps_nobody_waiting(daemon, tmp_path):
+def test_blocked_browser_does_not_delay_others(daemon, tmp_path):
     with page_of(tmp_path) as (address, process):
         place, end_s = urlsplit(address), time.monotonic() + PATIENCE_S
-        while "QUALIFIED" not in events(address, 1)[0]["head"]:  # the daemon was not heard yet
+        while "QUALIFIED" not in events(address, 1)[0]["head"]:  # the daemon has not answered yet
             assert time.monotonic() < end_s
         first, *later = events(address, 3)
         assert "QUALIFIED" in first["head"]
@@ -255,7 +255,7 @@ def unix_sockets(process):
     return len(psutil.Process(process.pid).net_connections("unix"))
 
 
-def test_it_ends_when_it_is_asked_to_with_browsers_open(daemon, tmp_path):
+def test_page_terminates_with_browsers_connected(daemon, tmp_path):
     with page_of(tmp_path) as (address, process):
         place = urlsplit(address)
         with socket.create_connection((place.hostname, place.port)) as open_one:
@@ -265,7 +265,7 @@ def test_it_ends_when_it_is_asked_to_with_browsers_open(daemon, tmp_path):
             assert process.wait(PATIENCE_S) in (0, -signal.SIGTERM)
 
 
-def test_without_a_daemon_it_says_so_and_waits(tmp_path):
+def test_page_without_a_daemon_says_so_and_waits(tmp_path):
     with page_of(tmp_path) as (address, _):
         (first,) = events(address, 1)
         time.sleep(1.0)
@@ -283,7 +283,7 @@ def refused(*options):
     return f"{found.output}{found.exception}", found.exception
 
 
-def test_a_token_that_others_can_read_is_none(tmp_path, token_file):
+def test_token_readable_by_others_is_refused(tmp_path, token_file):
     token_file.chmod(0o640)
     text, error = refused("--token-file", token_file)
     assert text.endswith(f"token: can be read by others: chmod 600 {token_file}")
@@ -297,8 +297,8 @@ def test_a_token_that_others_can_read_is_none(tmp_path, token_file):
     assert "No such file" in refused("--token-file", tmp_path / "none")[0]
 
 
-def test_a_credential_of_the_unit_is_kept_by_systemd(daemon, tmp_path, token_file, monkeypatch):
-    """Its mode shows a group where an access list admits the unit's user."""
+def test_systemd_credential_is_accepted_as_token(daemon, tmp_path, token_file, monkeypatch):
+    """Its mode shows a group if an access list admits the unit's user."""
     token_file.chmod(0o440)
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
     with page_of(tmp_path, "--token-file", str(token_file)) as (address, process):
@@ -309,12 +309,12 @@ def test_a_credential_of_the_unit_is_kept_by_systemd(daemon, tmp_path, token_fil
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
-def test_a_token_of_somebody_else_is_none(token_file):
+def test_token_of_another_user_is_refused(token_file):
     os.chown(token_file, 12345, 12345)
     assert "belongs to user 12345" in refused("--token-file", token_file)[0]
 
 
-def test_addresses_and_ports():
+def test_bad_or_occupied_address_is_refused():
     assert "must be an IP address" in refused("--address", "rov.local")[0]
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -323,7 +323,7 @@ def test_addresses_and_ports():
     assert error.exit_code == 75
 
 
-def test_a_name_is_one_whatever_its_port(daemon, tmp_path):
+def test_host_option_is_a_name_for_any_port(daemon, tmp_path):
     assert "must be a name such as rov.local" in refused("--host", "http://rov.local/")[0]
     with page_of(tmp_path, "--host", "ROV.local:9191") as (address, _):
         asked = http.client.HTTPConnection(urlsplit(address).netloc, timeout=PATIENCE_S)
@@ -337,7 +337,7 @@ def test_a_name_is_one_whatever_its_port(daemon, tmp_path):
     assert codes == [200, 421]
 
 
-def test_another_address_is_said_aloud(tmp_path):
+def test_public_address_is_warned_about(tmp_path):
     command = [sys.executable, "-m", "ahrsd", "page", "--state-directory", str(tmp_path)]
     process = subprocess.Popen(
         [*command, "--port", "0", "--address", "0.0.0.0"],
@@ -349,15 +349,15 @@ def test_another_address_is_said_aloud(tmp_path):
     process.communicate()
 
 
-def test_what_is_not_installed_is_named(monkeypatch):
+def test_missing_packages_are_named(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     text, error = refused()
     assert text.endswith("starlette and uvicorn are missing: pip install 'ahrsd[page]'")
     assert error.exit_code == 2
 
 
-def test_the_process_is_small():
-    """It loads nothing of what estimates, records or draws."""
+def test_process_loads_no_heavy_modules():
+    """It loads no module that estimates, records or plots."""
     program = (
         "import sys, ahrsd.page.app; heavy = {'gtsam', 'scipy', 'rerun', 'matplotlib', 'pyarrow'};"
         "print(sorted(heavy & {name.partition('.')[0] for name in sys.modules}))"

@@ -1,4 +1,4 @@
-"""The picture: where a direction is drawn, and which dots are of which kind."""
+"""The picture: position of a direction, and the kinds of its dots."""
 
 import re
 
@@ -19,7 +19,7 @@ def places(path):
     return [(float(x), float(y)) for x, y in re.findall(r"M(\S+) (\S+)h0", path)]
 
 
-def test_ahead_is_up_right_is_right_down_is_the_middle_of_the_left_disc():
+def test_projection_of_the_main_directions():
     drawn = project(np.array([[0, 0, 1], [0, 0, -1], [1, 0, 1], [0, 1, 1], [1, 0, -1]]), UPRIGHT)
     half = RADIUS * np.sqrt(1 - np.cos(np.pi / 4))
     assert drawn[0] == pytest.approx(BELOW)
@@ -29,7 +29,7 @@ def test_ahead_is_up_right_is_right_down_is_the_middle_of_the_left_disc():
     assert drawn[4] == pytest.approx(np.add(ABOVE, [0, -half]))
 
 
-def test_equal_shares_of_the_sphere_are_equal_shares_of_the_discs():
+def test_projection_preserves_area():
     points = np.random.default_rng(3).normal(size=(100_000, 3))
     drawn = project(points, UPRIGHT)
     radius = np.hypot(*(drawn - np.where(drawn[:, :1] < 180, BELOW, ABOVE)).T)
@@ -37,7 +37,7 @@ def test_equal_shares_of_the_sphere_are_equal_shares_of_the_discs():
     assert np.mean(radius < RADIUS / np.sqrt(2)) == pytest.approx(0.5, abs=0.01)
 
 
-def test_a_sensor_that_hangs_upside_down_is_drawn_as_the_vehicle_is():
+def test_inverted_sensor_is_drawn_in_the_vehicle_frame():
     hanging = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, -1.0]])  # ahead, right, down in its axes
     assert project(np.array([[0, 0, -1.0]]), hanging)[0] == pytest.approx(BELOW)
     assert project(np.array([[0, -1.0, -1.0]]), hanging)[0][0] > BELOW[0]
@@ -55,7 +55,7 @@ def test_every_cell_is_one_dot_of_one_kind():
     assert places(calm.wanted) == []
 
 
-def test_what_is_missing_of_the_circle_is_to_be_shown_while_it_is_wanted():
+def test_missing_part_of_the_circle_is_marked_while_required():
     half = shown_of({"motion": motion(cells(lambda f, a: level_ring(f, a) and a < 180))})
     wanted = places(dots(half, NOTHING, circle=True, tilts=False).wanted)
     assert len(wanted) == np.count_nonzero(half.level & ~half.seen) > 5
@@ -63,7 +63,7 @@ def test_what_is_missing_of_the_circle_is_to_be_shown_while_it_is_wanted():
     assert places(dots(half, NOTHING, circle=False, tilts=False).wanted) == []
 
 
-def test_what_was_seen_just_now_is_fresh_until_it_is_counted():
+def test_recent_directions_are_marked_until_counted():
     fresh = Fresh(keep_s=60.0)
     direction = cell_centres()[cell_of(120.0)].tolist()
     fresh.take(direction, 10.0)
@@ -78,6 +78,6 @@ def test_what_was_seen_just_now_is_fresh_until_it_is_counted():
     assert np.count_nonzero(fresh.cells(6.0)) == 1
 
 
-def test_the_marker_is_where_the_field_is_now():
+def test_marker_is_at_the_present_field_direction():
     assert marker([0.0, 0.0, 0.4], UPRIGHT) == tuple(BELOW)
     assert marker([None, None, None], UPRIGHT) is None

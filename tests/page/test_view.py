@@ -1,4 +1,4 @@
-"""What the page says, value by value, out of statuses that a daemon told."""
+"""Text of the page, value by value, from statuses of a daemon."""
 
 import pytest
 from shown_status import gate as view_gate
@@ -14,7 +14,7 @@ def figures(found):
     return {one.name: (one.value, one.unit, one.sigma) for one in found}
 
 
-def test_heading_now_and_as_it_would_be(qualified):
+def test_present_and_predicted_heading_are_shown(qualified):
     qualified["readings"] |= {"heading_deg": 7.4, "heading_would_be_deg": 359.45, "age_s": 0.1}
     qualified["estimate"]["heading_sigma_deg"] = 0.052
     assert figures(view.heading_figures(qualified)) == {
@@ -24,7 +24,7 @@ def test_heading_now_and_as_it_would_be(qualified):
     }
 
 
-def test_no_figure_is_shown_that_is_not_of_now(qualified):
+def test_outdated_figures_are_not_shown(qualified):
     qualified["readings"]["age_s"] = 12.0
     assert {value for value, _, _ in figures(view.heading_figures(qualified)).values()} == {"–"}
     assert list(figures(view.reading_figures(qualified))) == ["Samples"]
@@ -37,7 +37,7 @@ def test_no_figure_is_shown_that_is_not_of_now(qualified):
     assert view.alarms(qualified)[0].title == "The device is gone"
 
 
-def test_before_it_has_converged_there_is_no_other_heading(gathering):
+def test_predicted_heading_is_missing_before_convergence(gathering):
     gathering["readings"]["heading_would_be_deg"] = None
     _, would_be, change = view.heading_figures(gathering)
     assert (would_be.value, would_be.sigma, would_be.note) == (
@@ -48,7 +48,7 @@ def test_before_it_has_converged_there_is_no_other_heading(gathering):
     assert change.value == "–"
 
 
-def test_the_estimate_with_its_sigma(qualified):
+def test_estimate_is_shown_with_its_sigma(qualified):
     qualified["estimate"] |= {
         "hard_iron_gauss": [0.0742, -0.0153, 0.0861],
         "sigma_hard_iron_gauss": [0.0001, 0.0002, 0.0004],
@@ -66,7 +66,7 @@ def test_the_estimate_with_its_sigma(qualified):
     assert view.estimate_figures(qualified | {"estimate": None}) == []
 
 
-def test_readings(qualified):
+def test_readings_are_shown(qualified):
     qualified["readings"] |= {
         "age_s": 0.1, "roll_deg": -0.3, "pitch_deg": 12.4, "gyro_b_rad_s": [0.0, 0.0, 0.1],
         "corrected_b_gauss": [0.3, 0.0, 0.4], "would_be_b_gauss": [0.0, 0.0, 0.49],
@@ -82,7 +82,7 @@ def test_readings(qualified):
     }
 
 
-def test_gates_that_hold_with_advice_and_the_rest_in_one_row(gathering):
+def test_closed_gates_have_advice_and_unmeasured_ones_share_a_row(gathering):
     rows = view.gate_rows(gathering, Pace())
     assert rows[0].name == "heldout_heading.windows"
     assert rows[0].advice.startswith("0 of 2 held-out segments are usable: keep turning")
@@ -94,7 +94,7 @@ def test_gates_that_hold_with_advice_and_the_rest_in_one_row(gathering):
     assert view.gates_counted(gathering) == (40, 49)
 
 
-def test_next_countdown_and_drive(gathering, qualified):
+def test_next_step_countdown_and_drive_are_shown(gathering, qualified):
     pace = Pace()
     assert view.next_step(gathering, may_approve=True).startswith("0 of 2 held-out segments")
     gathering["readings"]["gyro_b_rad_s"] = [0.0, 0.0, 0.01]
@@ -117,7 +117,7 @@ def test_next_countdown_and_drive(gathering, qualified):
     assert view.countdown(qualified, pace) == ""
 
 
-def test_bars_say_percent_and_time(gathering):
+def test_bars_have_percent_and_time(gathering):
     gathering["motion"]["next"] = "turn left about 120 deg more"
     circle, tilts = view.bars(gathering, Pace())
     assert (circle.name, circle.percent, circle.left) == (
@@ -143,7 +143,7 @@ def test_bars_say_percent_and_time(gathering):
          "Something changed"),
     ],
 )  # fmt: skip
-def test_what_must_be_known_first(qualified, changes, kind, title):
+def test_alarms_and_warnings_have_kind_and_title(qualified, changes, kind, title):
     assert view.alarms(qualified) == []
     for key, value in changes.items():
         qualified[key] = value if isinstance(value, list) else qualified[key] | value
@@ -157,7 +157,7 @@ def test_alarms_stand_above_warnings(qualified):
     assert [one.kind for one in view.alarms(qualified)] == ["alarm", "warning"]
 
 
-def test_a_candidate_can_be_approved_only_while_it_is_qualified(qualified):
+def test_candidate_can_be_approved_only_while_qualified(qualified):
     found = view.candidate(qualified)
     assert (found.id, found.refusal) == ("43278c0e", "")
     assert found.change == "heading changes by up to 24.5°"
@@ -186,7 +186,7 @@ def sections(status, at_s=0.0, now_s=0.5, **options):
     return board.sections(heard, now_s)
 
 
-def test_every_section_is_there(gathering):
+def test_every_section_is_present(gathering):
     found = sections(gathering)
     assert set(found) == set(SECTIONS)
     assert "CANDIDATE" in found["head"]
@@ -195,7 +195,7 @@ def test_every_section_is_there(gathering):
     assert 'class="now"' in found["marker"]
 
 
-def test_a_long_list_of_gates_is_folded(gathering):
+def test_long_list_of_gates_is_folded(gathering):
     shut = [view_gate(f"observability.gate{k}") for k in range(9)]
     gathering["gates"] = shut
     holds = [f"gate {one['gate']}: {one['advice']}" for one in shut]
@@ -209,7 +209,7 @@ def test_a_long_list_of_gates_is_folded(gathering):
     assert "<details>" not in sections(gathering)["gates"]
 
 
-def test_the_form_knows_its_candidate_only_where_one_may_approve(qualified):
+def test_form_names_the_candidate_only_if_approval_is_possible(qualified):
     field = '<input type="hidden" name="candidate" value="43278c0e" form="approve">'
     assert field in sections(qualified, may_approve=True)["candidate"]
     assert "<input" not in sections(qualified)["candidate"]
@@ -225,19 +225,19 @@ def test_the_form_knows_its_candidate_only_where_one_may_approve(qualified):
         (0.5, "/run/ahrsd/socket: no daemon answers", "no daemon answers"),
     ],
 )
-def test_when_the_daemon_is_away_nothing_old_is_left(qualified, now_s, fault, words):
+def test_no_old_values_remain_when_the_daemon_is_away(qualified, now_s, fault, words):
     found = sections(qualified, now_s=now_s, fault=fault)
     assert {name for name, text in found.items() if text} == {"alarms"}
     assert "The daemon is away" in found["alarms"]
     assert words in found["alarms"]
 
 
-def test_it_says_since_when(qualified):
+def test_duration_of_the_absence_is_shown(qualified):
     assert ", for 2 min." in sections(qualified, now_s=130.0)["alarms"]
     assert "nothing was received before" in sections(None, now_s=3.0)["alarms"]
 
 
-def test_a_daemon_of_another_version_is_told_not_guessed(qualified):
+def test_status_of_another_version_is_reported_and_not_interpreted(qualified):
     del qualified["gates"]
     found = sections(qualified)
     assert "it may be another version" in found["alarms"]
@@ -245,7 +245,7 @@ def test_a_daemon_of_another_version_is_told_not_guessed(qualified):
 
 
 def broken(status):
-    """The status with one thing missing or of another kind, for each thing in its first levels."""
+    """The status with one entry missing or of another type, for each entry in its first levels."""
     for key, value in status.items():
         yield key, {name: one for name, one in status.items() if name != key}
         for odd in (None, "odd", [], {}, [None], -1e308):
@@ -256,7 +256,7 @@ def broken(status):
 
 
 @pytest.mark.parametrize("name", [pytest.param("gathering", marks=pytest.mark.slow), "qualified"])
-def test_no_status_ends_the_page(name, request):
+def test_page_survives_any_status(name, request):
     whole = request.getfixturevalue(name)
     told = 0
     for where, status in broken(whole):
@@ -266,7 +266,7 @@ def test_no_status_ends_the_page(name, request):
     assert told > 100
 
 
-def test_foreign_text_stays_text(qualified):
+def test_foreign_text_is_not_interpreted(qualified):
     qualified["write_back"]["holds"] = [EVIL]
     qualified["write_back"]["proposal"]["lines"] = [EVIL]
     qualified["link"]["port"] = EVIL

@@ -192,7 +192,7 @@ def rewritten(**changes: object) -> bytes:
         ({"uncompressed_crc": 1}, "a damaged block"),
     ],
 )
-def test_a_block_that_lies_is_left_out_and_said(tmp_path, capsys, changes, words):
+def test_inconsistent_block_is_skipped_and_reported(tmp_path, capsys, changes, words):
     path = tmp_path / "a.mcap"
     path.write_bytes(rewritten(**changes))
     code, shown = run(path, capsys)

@@ -1,4 +1,4 @@
-"""DataFlash logs of ArduPilot: the raw field comes back, whatever the autopilot did to it."""
+"""DataFlash logs of ArduPilot: the raw field is recovered from the autopilot's corrections."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_offsets_and_matrix_are_undone(tmp_path):
     assert "x forward, y to the right, z down" in recording.facts["frame"]
 
 
-def test_the_scale_is_undone(tmp_path):
+def test_scale_is_undone(tmp_path):
     path, slow, _ = log(tmp_path, {**CALIBRATED, "COMPASS_SCALE": 1.2}, scale=1.2)
     np.testing.assert_allclose(raw_mg(path), 1e3 * slow["mag"], atol=HALF_STEP_MG)
 
@@ -74,7 +74,9 @@ def test_the_scale_is_undone(tmp_path):
         ("ArduPlane V3.9.0", {"COMPASS_PMOT_EN": 0.0}, "after"),
     ],
 )
-def test_the_motors_are_undone_in_the_order_of_the_version(tmp_path, firmware, parameters, order):
+def test_motor_compensation_is_undone_in_the_order_of_the_version(
+    tmp_path, firmware, parameters, order
+):
     motor = np.outer(40.0 + 30.0 * np.sin(np.arange(600) / 9.0), [1.0, -2.0, 3.0])
     path, slow, _ = log(tmp_path, {**CALIBRATED, **parameters}, firmware, motor=motor, order=order)
     np.testing.assert_allclose(raw_mg(path), 1e3 * slow["mag"], atol=2 * HALF_STEP_MG)
@@ -82,7 +84,7 @@ def test_the_motors_are_undone_in_the_order_of_the_version(tmp_path, firmware, p
     assert any(words in note for note in open_recording(path).notes)
 
 
-def test_an_order_that_nobody_knows_is_told(tmp_path):
+def test_unknown_order_of_corrections_is_reported(tmp_path):
     path, _, _ = log(tmp_path, motor=np.full((600, 3), 40.0))
     assert any("the order is a guess" in note for note in open_recording(path).notes)
 
@@ -131,7 +133,7 @@ def test_covariates_come_along(tmp_path):
     assert open_recording(path).facts["recorded_utc"] == "2026-01-29T00:00:00.000+00:00"
 
 
-def test_bytes_that_are_no_message_are_counted(tmp_path):
+def test_bytes_outside_messages_are_counted(tmp_path):
     path, _, _ = log(tmp_path)
     data = path.read_bytes()
     middle = data.index(b"\xa3\x95\x03", len(data) // 2)
@@ -221,7 +223,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", list(WRONG), ids=lambda one: one.__name__)
-def test_a_log_that_is_wrong_ends_in_one_line(tmp_path, wrong):
+def test_bad_log_is_refused_in_one_line(tmp_path, wrong):
     path = tmp_path / "log.bin"
     wrong(path)
     with pytest.raises(RecordingError) as refused:
@@ -231,7 +233,7 @@ def test_a_log_that_is_wrong_ends_in_one_line(tmp_path, wrong):
     assert refused.value.exit_code == 2
 
 
-def test_of_two_compasses_the_first_is_used_and_told_or_the_one_that_is_chosen(tmp_path):
+def test_first_or_chosen_one_of_two_compasses_is_used(tmp_path):
     slow = parts()[2]
     second = df.mags(slow["time_s"] + 0.001, 500.0 * slow["mag"], 0.0, 0.0, number=1)
     path = df.save(tmp_path / "log.bin", *parts()[:2], second)
@@ -261,7 +263,7 @@ def two_imus(tmp_path, first, second, parameters=None):
     return open_recording(path), data
 
 
-def test_a_gyro_that_does_not_turn_beside_one_that_does_is_left(tmp_path):
+def test_constant_one_of_two_gyros_is_not_used(tmp_path):
     offsets = {"INS_GYROFFS_X": 0.5, "INS_GYR2OFFS_X": 0.01}
     recording, data = two_imus(tmp_path, 1e-3, 1.0, offsets)
     undone = data["gyro"] + [0.01, 0.0, 0.0]
@@ -270,13 +272,13 @@ def test_a_gyro_that_does_not_turn_beside_one_that_does_is_left(tmp_path):
     assert any("the gyro of IMU 0 hardly turns" in note for note in recording.notes)
 
 
-def test_of_two_gyros_that_turn_the_first_counts(tmp_path):
+def test_first_of_two_working_gyros_is_used(tmp_path):
     recording, data = two_imus(tmp_path, 1.0, 1.02)
     np.testing.assert_allclose(recording.table.rows.gyro_b_rad_s, data["gyro"], atol=1e-6)
     assert not any("hardly turns" in note for note in recording.notes)
 
 
-def test_a_dead_compass_is_passed_over_and_told(tmp_path):
+def test_dead_compass_is_skipped_with_a_note(tmp_path):
     data = sensor(600, 20.0)
     field, none = 1e3 * data["mag"], np.zeros((600, 3))
     recording = open_recording(

@@ -1,6 +1,6 @@
-"""Recordings that no sensor in order makes: an error of one line, or no answer and its reason.
+"""Recordings that no working sensor makes: a one-line error, or no answer with a reason.
 
-Ours and every published method, through the files that people give to `ahrsd calibrate`.
+For the project's own and every published method, through the files that `ahrsd calibrate` reads.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def written(folder: Path, rows: np.ndarray) -> Path:
 
 
 def tried(folder: Path, rows: np.ndarray) -> BatchResult | str:
-    """What `ahrsd calibrate` makes of these rows, or the one line that it ends in."""
+    """The result of `ahrsd calibrate` for these rows, or its one-line error."""
     try:
         return calibrate(written(folder, rows), PLACE)
     except RecordingError as error:
@@ -70,7 +70,7 @@ def tried(folder: Path, rows: np.ndarray) -> BatchResult | str:
 
 
 def refused_by_ours(result: BatchResult) -> None:
-    """Not converged, the reason in words, and not one register to write."""
+    """Not converged, with a reason, and without registers."""
     assert not result.converged
     assert result.reasons()
     body = result.json("magyc")
@@ -90,15 +90,15 @@ def refused_by(result: BatchResult, methods: list[str]) -> None:
 
 
 def refused(folder: Path, rows: np.ndarray) -> None:
-    """An error of one line, or no answer from anybody."""
+    """A one-line error, or no answer from any method."""
     result = tried(folder, rows)
     if not isinstance(result, str):
         refused_by_ours(result)
         refused_by(result, list(METHODS))
 
 
-def test_what_is_in_order_is_answered(tmp_path):
-    """Else the refusals below would prove nothing."""
+def test_good_recording_is_answered(tmp_path):
+    """Otherwise the refusals below would prove nothing."""
     result = tried(tmp_path, tumbling(1))
     assert result.converged, result.reasons()
     for method in METHODS:
@@ -240,7 +240,7 @@ def test_a_sigma_that_cannot_be(value):
         (np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), "the gyro's x y z are the magnetometer's"),
     ],
 )
-def test_a_gyro_that_is_not_what_it_says_is_named(tmp_path, gyro, words):
+def test_wrong_gyro_is_reported(tmp_path, gyro, words):
     rows = tumbling(4)
     assert not any(words in said for said in tried(tmp_path, rows).all_warnings())
     rows[:, 4:] = rows[:, 4:] @ gyro.T
@@ -251,7 +251,7 @@ def test_a_gyro_that_is_not_what_it_says_is_named(tmp_path, gyro, words):
     )
 
 
-def test_a_field_that_stands_still_while_the_sensor_turns_is_named(tmp_path):
+def test_constant_field_of_a_turning_sensor_is_reported(tmp_path):
     rows = tumbling(4)
     assert not any("repeats one reading" in said for said in tried(tmp_path, rows).all_warnings())
     rows[500:900, 1:4] = rows[500, 1:4]

@@ -1,4 +1,4 @@
-"""What cannot be used ends in one line that names file, fault and remedy, and in exit 2."""
+"""Unusable files are refused with exit code 2 and one line that names file, fault and remedy."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ def refused(
             assert word in line, line
 
 
-def test_a_file_that_is_not_there(run, capsys, tmp_path):
+def test_missing_file_is_refused(run, capsys, tmp_path):
     refused(run, capsys, tmp_path / "a.vnraw", "does not exist; give the path")
 
 
-def test_a_folder(run, capsys, tmp_path):
+def test_folder_is_refused(run, capsys, tmp_path):
     refused(run, capsys, tmp_path, "is a folder; give the path")
 
 
@@ -77,25 +77,25 @@ def test_a_folder(run, capsys, tmp_path):
         ("a.xyz", b"anything", ("no recording by its name nor by its content", ".vnraw")),
     ],
 )  # fmt: skip
-def test_files_without_a_message(run, capsys, tmp_path, name, data, words):
+def test_files_without_a_message_are_refused(run, capsys, tmp_path, name, data, words):
     (tmp_path / name).write_bytes(data)
     refused(run, capsys, tmp_path / name, *words)
 
 
-def test_a_gzip_file_that_is_cut_off(run, capsys, tmp_path):
+def test_truncated_gzip_file_is_refused(run, capsys, tmp_path):
     path = tmp_path / "cut.vnbin.gz"
     path.write_bytes(STREAM.read_bytes()[:40_000])
     assert run("replay", path) == 0
     assert "warning: the gzip file is truncated after" in capsys.readouterr().out
 
 
-def test_a_capture_that_holds_nothing(run, capsys, tmp_path):
+def test_empty_capture_is_refused(run, capsys, tmp_path):
     with CaptureWriter(tmp_path / "a.mcap", {}) as writer:
         writer.write(Stop(1, "end"))
     refused(run, capsys, tmp_path / "a.mcap", "holds nothing that a device sent; record again")
 
 
-def test_a_capture_that_is_cut_off_works_up_to_there_and_says_so(run, capsys, tmp_path):
+def test_truncated_capture_is_read_up_to_its_end_with_a_note(run, capsys, tmp_path):
     path = tmp_path / "a.mcap"
     device = binary_device(4, {})
     with CaptureWriter(path, {}) as writer:
@@ -127,12 +127,12 @@ def test_a_capture_that_is_cut_off_works_up_to_there_and_says_so(run, capsys, tm
     ],
     ids=["columns", "time", "nan", "milligauss", "rows"],
 )  # fmt: skip
-def test_tables(run, capsys, tmp_path, rows, change, words):
+def test_wrong_tables_are_refused(run, capsys, tmp_path, rows, change, words):
     table(tmp_path / "a.csv", *change(rows))
     refused(run, capsys, tmp_path / "a.csv", *words)
 
 
-def test_a_cell_that_is_no_number(run, capsys, tmp_path, rows):
+def test_cell_that_is_not_a_number_is_reported(run, capsys, tmp_path, rows):
     text = io.StringIO()
     np.savetxt(text, rows, delimiter=",", header=",".join(COLUMNS), comments="", fmt="%.9g")
     lines = text.getvalue().splitlines()
@@ -142,7 +142,7 @@ def test_a_cell_that_is_no_number(run, capsys, tmp_path, rows):
 
 
 @pytest.mark.parametrize("option", ["--json", "--rerun"])
-def test_an_output_that_cannot_be_written_is_told_first(run, capsys, tmp_path, option):
+def test_unwritable_output_is_reported_first(run, capsys, tmp_path, option):
     assert run("replay", STREAM, option, tmp_path / "no" / "a.out") == 2
     out, error = capsys.readouterr()
     assert out == ""
@@ -151,7 +151,7 @@ def test_an_output_that_cannot_be_written_is_told_first(run, capsys, tmp_path, o
     assert capsys.readouterr().err == f"ahrsd: {tmp_path}: is a folder; name a file\n"
 
 
-def test_a_report_that_cannot_be_written_is_told_first(run, capsys, tmp_path):
+def test_unwritable_report_is_reported_first(run, capsys, tmp_path):
     assert run("calibrate", STREAM, "--report", tmp_path / "no" / "r.html") == 2
     assert "give a folder; the page is report.html in it" in capsys.readouterr().err
 
@@ -181,7 +181,7 @@ def test_a_pipe_is_written_and_not_replaced(run, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("rate", ["0", "-5", "nan", "inf"])
-def test_a_rate_that_is_none(run, capsys, rate):
+def test_invalid_rate_is_refused(run, capsys, rate):
     assert run("replay", FOLDER / "tumble_vnymr_damaged.vnraw.gz", "--rate", rate) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "give --rate in Hz" in line

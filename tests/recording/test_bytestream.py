@@ -14,7 +14,7 @@ STREAM = bytes(range(256)) * 100
 
 
 @pytest.mark.parametrize("name", ["a.vnraw", "a.vnraw.gz"])
-def test_the_bytes_come_as_they_are_without_host_time(tmp_path, name):
+def test_bytes_are_read_unchanged_without_host_time(tmp_path, name):
     path = tmp_path / name
     path.write_bytes(gzip.compress(STREAM) if name.endswith(".gz") else STREAM)
     items = list(read_received(path))
@@ -55,7 +55,7 @@ def test_a_file_without_a_byte_ends_in_one_line(tmp_path, damage, words):
         (6, lambda data: data + b"and more", "what follows it is no gzip", len(STREAM)),
     ],
 )
-def test_what_comes_before_the_damage_is_read_and_said(tmp_path, level, damage, words, least):
+def test_bytes_before_damage_are_read_with_a_note(tmp_path, level, damage, words, least):
     path = tmp_path / "a.vnraw.gz"
     path.write_bytes(damage(gzip.compress(STREAM, compresslevel=level)))
     notes: list[str] = []
@@ -89,7 +89,7 @@ LINE = b"$VNYMR,+010.071,+000.278*64\r\n"
     ],
 )
 @pytest.mark.parametrize("zipped", [False, True])
-def test_what_a_text_file_did_to_the_lines_is_undone(tmp_path, content, words, zipped):
+def test_line_changes_of_a_text_file_are_undone(tmp_path, content, words, zipped):
     path = tmp_path / ("a.txt" + ".gz" * zipped)
     path.write_bytes(gzip.compress(content) if zipped else content)
     notes: list[str] = []
@@ -114,7 +114,7 @@ def test_binary_streams_are_never_touched(tmp_path):
     assert notes == []
 
 
-def test_nul_bytes_at_the_end_are_said(tmp_path):
+def test_nul_bytes_at_the_end_are_reported(tmp_path):
     (tmp_path / "a.vnraw").write_bytes(LINE * 400 + bytes(70_000))
     notes: list[str] = []
     assert b"".join(read_stream(tmp_path / "a.vnraw", notes=notes)).startswith(LINE * 400)

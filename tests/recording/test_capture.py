@@ -98,7 +98,7 @@ def wait_until(condition, seconds: float = 5.0) -> None:
         time.sleep(0.01)
 
 
-def test_every_input_comes_back_in_order_with_what_was_sent_between(tmp_path):
+def test_inputs_and_sent_commands_are_read_back_in_order(tmp_path):
     items = [*EVERY_INPUT[:4], Sent(11, b"$VNRRG,23*XX\r\n"), *EVERY_INPUT[4:]]
     write(tmp_path / "a.mcap", items)
     reader = CaptureReader(tmp_path / "a.mcap")
@@ -147,7 +147,7 @@ def test_samples_survive_json():
 
 
 @given(st.binary(max_size=60) | st.sampled_from([b'{"type":"Tick"}', b'{"type":"x"}', b"[1]"]))
-def test_what_is_no_input_is_a_value_error(data):
+def test_invalid_input_raises_a_value_error(data):
     with pytest.raises(ValueError):
         capture.input_from_json(data)
 
@@ -255,7 +255,7 @@ def test_every_truncation_reads_up_to_its_last_whole_block(tmp_path):
     assert max(counts) == len(items)
 
 
-def test_a_damaged_block_is_left_out_and_said(tmp_path):
+def test_damaged_block_is_skipped_and_reported(tmp_path):
     items: list[Input | Sent] = [Received(k, os.urandom(100_000)) for k in range(9)]
     write(tmp_path / "a.mcap", items)
     data = bytearray((tmp_path / "a.mcap").read_bytes())
@@ -327,7 +327,7 @@ def test_a_full_disk_costs_nothing_while_the_queue_holds(tmp_path):
     assert reader.notes == []
 
 
-def test_what_does_not_fit_into_the_queue_is_counted_and_the_reader_says_so(tmp_path):
+def test_dropped_items_are_counted_and_reported_by_the_reader(tmp_path):
     disk = new_disk()
     disk.full = True
     writer = CaptureWriter(
@@ -364,7 +364,7 @@ def test_a_stalled_disk_does_not_stall_the_caller(tmp_path):
     assert writer.close().records == 2001
 
 
-def test_closing_on_a_disk_that_stays_full_tells_what_was_lost(tmp_path):
+def test_closing_on_a_full_disk_reports_the_loss(tmp_path):
     disk = new_disk()
     disk.full = True
     writer = CaptureWriter(tmp_path / "a.mcap", {}, create=lambda p: disk(p, "xb"))
@@ -387,7 +387,7 @@ def test_a_real_full_disk_resumes_when_space_returns(small_disk):
     assert [item.host_ns for item in CaptureReader(small_disk / "a.mcap")] == list(range(12))
 
 
-def test_nothing_grows_with_the_file(tmp_path):
+def test_memory_does_not_grow_with_the_file(tmp_path):
     with CaptureWriter(tmp_path / "a.mcap", {}) as writer:
         threads = threading.active_count()
         for k in range(5000):

@@ -93,7 +93,7 @@ ELSEWHERE = {
 }
 
 
-def test_every_case_of_the_folder_is_tried():
+def test_every_case_of_the_folder_is_tested():
     table = (FOLDER / "README.md").read_text(encoding="utf-8")
     listed = set(re.findall(r"^\| (f\d+) ", table, re.MULTILINE))
     assert len(listed) >= 24
@@ -112,7 +112,7 @@ def of_case(case: Case) -> object:
 
 
 @pytest.mark.parametrize("case", [of_case(case) for case in CASES])
-def test_the_command_line_says_what_is_right(tmp_path, run, capsys, case):
+def test_command_line_gives_the_correct_values(tmp_path, run, capsys, case):
     written = tmp_path / "answer.json"
     code = run(case.command, FOLDER / case.file, "--json", written)
     shown = "".join(capsys.readouterr())

@@ -1,4 +1,6 @@
-"""Files of others: what is no regular file is said, a word is new where it was seen to change."""
+"""Foreign files: irregular files are refused, and a permission is recent only after an observed
+change.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,7 @@ ODD = [
 
 
 @pytest.mark.parametrize(("kind", "words"), ODD)
-def test_what_is_no_small_regular_file_is_one_line_at_once(tmp_path, kind, words):
+def test_irregular_or_large_file_is_refused_in_one_line(tmp_path, kind, words):
     with pytest.raises(ForeignFileError, match=words):
         read_regular(odd(tmp_path / "word", kind), 64)
 
@@ -88,7 +90,7 @@ def test_such_a_configuration_is_one_line(tmp_path, kind, words):
     assert caught.value.lines == [f"{tmp_path / 'a.toml'}: {words}"]
 
 
-def test_a_disk_that_hangs_is_said_and_not_waited_for(tmp_path, monkeypatch):
+def test_hanging_disk_is_reported_and_not_awaited(tmp_path, monkeypatch):
     monkeypatch.setattr("ahrsd.foreign_file.read_regular", lambda *_: threading.Event().wait())
     with pytest.raises(ForeignFileError, match="did not answer within 0 s: its disk hangs"):
         text_within(tmp_path / "a", 64, 0.05)
@@ -98,7 +100,7 @@ def contents(data=b"safe", mtime_ns=1, inode=7):
     return Contents(data, (1, inode, mtime_ns, len(data)))
 
 
-def test_the_first_sight_says_nothing_and_a_change_dates_from_the_look_before():
+def test_change_is_dated_to_the_previous_check():
     seen = Changes()
     assert seen.seen(contents(), 10.0).writings == 0
     assert seen.sight.since_s == float("-inf")
@@ -110,7 +112,7 @@ def test_the_first_sight_says_nothing_and_a_change_dates_from_the_look_before():
     assert seen.sight.writings == 3
 
 
-def test_what_comes_back_after_it_was_away_is_seen_for_the_first_time():
+def test_reappearing_file_counts_as_seen_for_the_first_time():
     seen = Changes()
     seen.seen(contents(), 1.0)
     seen.seen(contents(mtime_ns=2), 2.0)
@@ -120,7 +122,7 @@ def test_what_comes_back_after_it_was_away_is_seen_for_the_first_time():
     assert seen.seen(contents(mtime_ns=4), 5.0).since_s == 4.0
 
 
-def test_a_look_that_hung_makes_no_old_word_new():
+def test_hanging_check_does_not_make_an_old_permission_recent():
     """Written right after the look at 1 s, found by the one that hung until 11 s."""
     seen = Changes()
     seen.seen(contents(), 1.0)
@@ -161,7 +163,7 @@ def word(host, tmp_path):
     made.close()
 
 
-def test_a_word_is_fresh_for_as_long_as_it_was_seen_to_change(host, word):
+def test_permission_is_recent_for_a_limited_time_after_a_change(host, word):
     host.look()
     host.file = contents(b"safe", 1)
     until(word.safe)
@@ -177,7 +179,7 @@ def test_a_word_is_fresh_for_as_long_as_it_was_seen_to_change(host, word):
 
 
 @pytest.mark.parametrize("stamp_ns", [10**30, -(10**18), 30 * 10**9])
-def test_no_time_stamp_makes_a_word_new_or_old(host, tmp_path, stamp_ns):
+def test_file_time_stamps_do_not_affect_a_permission(host, tmp_path, stamp_ns):
     host.file = contents(b"safe", stamp_ns)  # it lies there when the daemon starts
     word = InterlockFile(tmp_path / "safe", 1.0, read=host.read, now_s=lambda: host.now_s)
     host.look()
@@ -190,7 +192,7 @@ def test_no_time_stamp_makes_a_word_new_or_old(host, tmp_path, stamp_ns):
     word.close()
 
 
-def test_a_word_that_lay_there_at_the_start_says_nothing(tmp_path):
+def test_permission_from_before_the_start_does_not_count(tmp_path):
     path = tmp_path / "safe"
     path.write_text("safe")
     future = time.time() + 30.0
@@ -206,7 +208,7 @@ def test_a_word_that_lay_there_at_the_start_says_nothing(tmp_path):
     word.close()
 
 
-def test_asking_does_not_wait_for_a_disk_that_hangs_and_the_word_ends(host, word):
+def test_hanging_disk_does_not_block_and_ends_the_permission(host, word):
     host.look()
     host.file = contents(b"safe", 1)
     until(word.safe)
@@ -225,7 +227,7 @@ def test_asking_does_not_wait_for_a_disk_that_hangs_and_the_word_ends(host, word
 
 
 @pytest.mark.parametrize(("kind", "words"), ODD)
-def test_the_vehicles_files_say_what_they_are(tmp_path, kind, words):
+def test_errors_name_the_file_of_the_vehicle(tmp_path, kind, words):
     path = odd(tmp_path / "word", kind)
     word, columns = InterlockFile(path, 1.0), ColumnsFile(path)
     until(lambda: words in word.fault)
@@ -236,7 +238,7 @@ def test_the_vehicles_files_say_what_they_are(tmp_path, kind, words):
     columns.close()
 
 
-def test_columns_that_were_found_late_are_of_no_use(host, tmp_path):
+def test_columns_read_late_are_not_used(host, tmp_path):
     file = ColumnsFile(tmp_path / "columns", 0.5, read=host.read, now_s=lambda: host.now_s)
     host.file = contents(b'{"a": 1}', 1)
     until(lambda: file.news() == {"a": 1.0} or file._watch.sight.data == host.file.data)
@@ -251,7 +253,7 @@ def test_columns_that_were_found_late_are_of_no_use(host, tmp_path):
     file.close()
 
 
-def test_a_watch_looks_by_a_clock_that_is_never_set(tmp_path):
+def test_file_checks_use_the_monotonic_clock(tmp_path):
     path = tmp_path / "word"
     path.write_text("1")
     watch = FileWatch(path, 64, 0.01)

@@ -1,4 +1,4 @@
-"""Tables as other programs and people write them: read with a note, or told in one line."""
+"""Tables written by other programs and people: read with a note, or refused in one line."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ def sensor(count: int = COUNT, rate_hz: float = RATE_HZ, seed: int = 1) -> dict[
         ),
     ],
 )
-def test_wrong_axes_are_why_it_has_not_converged(tmp_path, axes, signs, words):
-    """And not what follows from them: a rate or a unit that looks wrong."""
+def test_wrong_axes_are_reported_as_the_reason_for_no_convergence(tmp_path, axes, signs, words):
+    """Not their consequences: a rate or a unit that looks wrong."""
     made = sensor(4000)
     turned = dict(zip(MAG, [sign * made[MAG[k]] for k, sign in zip(axes, signs, strict=True)],
                       strict=True))  # fmt: skip
@@ -168,7 +168,7 @@ def test_a_gzip_that_is_cut_off_gives_its_whole_rows(tmp_path):
     assert "the gzip file is truncated after" in table.notes[0]
 
 
-def test_a_logger_that_was_started_again_writes_its_names_again(tmp_path):
+def test_repeated_header_of_a_restarted_logger_is_accepted(tmp_path):
     rows = PLAIN.splitlines()
     path = tmp_path / "t.csv"
     path.write_text("\n".join([*rows[:201], rows[0], *rows[221:]]) + "\n")
@@ -178,7 +178,7 @@ def test_a_logger_that_was_started_again_writes_its_names_again(tmp_path):
     assert "left out amid the rows: 1 more line of names" in table.notes[0]
 
 
-def test_few_rows_with_another_number_of_cells_are_left_out_and_many_are_not(tmp_path):
+def test_few_rows_with_a_wrong_number_of_cells_are_left_out(tmp_path):
     rows = PLAIN.splitlines()
     rows[100] = rows[100].rsplit(",", 3)[0]
     path = tmp_path / "t.csv"
@@ -206,7 +206,7 @@ def test_few_rows_with_another_number_of_cells_are_left_out_and_many_are_not(tmp
         (HEADER.encode() + b",mag_y_gauss\n", "mag_y_gauss twice"),
     ],
 )
-def test_what_cannot_be_read_is_told_in_one_line(tmp_path, content, words):
+def test_unreadable_table_is_refused_in_one_line(tmp_path, content, words):
     path = tmp_path / "t.csv"
     path.write_bytes(content)
     with pytest.raises(RecordingError) as caught:
@@ -242,7 +242,7 @@ G, DEG = 9.80665, np.pi / 180
         (("s", 1.0), ("mT", 10.0), ("rad/s", 1.0), ("g", G)),
     ],
 )
-def test_columns_names_and_units(tmp_path, time, mag, gyro, accel):
+def test_columns_can_be_given_with_names_and_units(tmp_path, time, mag, gyro, accel):
     unit = {"time": time[1], "mag": mag[1], "gyro": gyro[1], "accel": accel[1]}
     columns = foreign(unit, ("Mag", "Gyr", "Acc"))
     path = save(tmp_path / "t.csv", {k: [repr(float(x)) for x in v] for k, v in columns.items()})
@@ -259,7 +259,7 @@ def test_columns_names_and_units(tmp_path, time, mag, gyro, accel):
     assert table.rows.covariates == {}
 
 
-def test_a_minus_turns_the_sign_and_commas_of_names_are_escaped(tmp_path):
+def test_minus_inverts_a_column_and_commas_in_names_are_escaped(tmp_path):
     columns = sensor()
     cells = texts({**columns, MAG[1]: -columns[MAG[1]]})
     cells["field, z: [G]"] = cells.pop(MAG[2])
@@ -281,7 +281,7 @@ def test_counts_of_nanoseconds_lose_no_digit(tmp_path):
     np.testing.assert_allclose(table.rows.time_s, 0.05 * np.arange(COUNT), atol=1e-9)
 
 
-def test_milliseconds_since_1970_are_told_and_read(tmp_path):
+def test_milliseconds_since_1970_are_recognised_with_a_note(tmp_path):
     cells = texts(sensor())
     cells[TIME] = [str(1_700_000_000_000 + 50 * k) for k in range(COUNT)]
     path = save(tmp_path / "t.csv", cells)
@@ -328,13 +328,13 @@ def test_a_wrong_option_is_refused_by_its_entry(text, words):
     assert words in str(caught.value)
 
 
-def test_a_column_that_is_not_there_is_named_with_the_nearest(tmp_path):
+def test_missing_column_is_reported_with_the_nearest_name(tmp_path):
     path = save(tmp_path / "t.csv", texts(sensor()))
     with pytest.raises(RecordingError, match=r"no column mag_x_gaus .*is mag_x_gauss meant"):
         read_table(path, columns=parse_columns(["mag_x=mag_x_gaus:G"]))
 
 
-def test_the_message_holds_the_option_that_reads_the_table(tmp_path):
+def test_error_message_has_the_option_that_reads_the_table(tmp_path):
     unit = {"time": 1e-3, "mag": 1e-2, "gyro": DEG, "accel": G}
     columns = foreign(unit, ("mag_", "gyr_", "acc_"))
     named = {name.replace("mag_", "mag").replace("X", "_x_uT").replace("Y", "_y_uT")
@@ -365,7 +365,7 @@ def test_the_exporter_of_the_sdk(tmp_path):
     assert "VectorNav's SDK" in table.notes[0]
 
 
-def test_names_of_others_reach_nobody_as_they_are(tmp_path):
+def test_foreign_column_names_are_escaped(tmp_path):
     cells = texts(sensor())
     cells["\x1b[2J$x$"] = ["1"] * COUNT
     cells["y" * 1_000_000] = ["2"] * COUNT
@@ -498,7 +498,7 @@ def test_holes_of_the_acceleration_are_carried_over(tmp_path, rows):
     assert ": filled from the rows next to it, turned by the gyro" in table.notes[0]
 
 
-def test_a_long_hole_is_left_out_and_too_many_leave_the_acceleration_out(tmp_path):
+def test_long_gaps_of_the_acceleration_are_left_out(tmp_path):
     columns = sensor(4000)
     cells = texts(columns)
     for name in ACCEL:
@@ -515,7 +515,7 @@ def test_a_long_hole_is_left_out_and_too_many_leave_the_acceleration_out(tmp_pat
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("g", G), ("mg", 1e-3 * G)])
-def test_acceleration_in_g_is_said_and_taken(tmp_path, unit, factor):
+def test_acceleration_in_g_is_converted_with_a_note(tmp_path, unit, factor):
     columns = sensor()
     for name in ACCEL:
         columns[name] = columns[name] / factor
@@ -551,7 +551,7 @@ def test_parquet_with_nested_and_other_types(tmp_path):
     assert sorted(note.split()[1] for note in table.notes) == ["list", "nested", "text"]
 
 
-def test_a_required_column_that_is_nested_is_told(tmp_path):
+def test_nested_required_column_is_refused(tmp_path):
     body = {**sensor(), MAG[0]: [[1.0]] * COUNT}
     pyarrow.parquet.write_table(pyarrow.table(body), tmp_path / "t.parquet")
     with pytest.raises(RecordingError, match="column mag_x_gauss holds list"):
@@ -591,7 +591,7 @@ def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_gzip_that_unpacks_to_far_too_much_ends_in_one_line(tmp_path):
+def test_gzip_bomb_is_refused_in_one_line(tmp_path):
     bomb = zeros(tmp_path / "bomb.csv.gz")
     refused(limited("calibrate", bomb, gigabytes=1.5), "has no line end within its first")
     rows = zeros(tmp_path / "rows.csv.gz", PLAIN.encode())
@@ -612,7 +612,7 @@ def test_a_bomb_without_a_message_is_given_up(tmp_path):
 
 
 @pytest.mark.slow
-def test_parquet_that_unpacks_to_far_too_much_ends_in_one_line(tmp_path):
+def test_parquet_bomb_is_refused_in_one_line(tmp_path):
     names = [f"c{k}" for k in range(90)]
     schema = pyarrow.schema([(name, pyarrow.float64()) for name in (*REQUIRED, *names)])
     path = tmp_path / "bomb.parquet"
@@ -639,7 +639,7 @@ def test_a_span_of_years_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_file_with_a_name_that_is_no_text(tmp_path):
+def test_file_name_that_is_not_text_is_handled(tmp_path):
     name = os.fsencode(str(tmp_path)) + b"/\xff\x1b[31mred.csv"
     Path(os.fsdecode(name)).write_text(PLAIN)
     done = subprocess.run(
@@ -673,7 +673,7 @@ def test_a_slower_magnetometer_leaves_cells_empty(tmp_path, hold, first):
 
 
 @pytest.mark.parametrize("name", ["calibrate", "replay", "diagnose", "evaluate", "simulate"])
-def test_every_command_that_takes_a_recording_takes_names_of_columns(name):
+def test_every_command_with_a_recording_accepts_column_names(name):
     command = importlib.import_module(module_of(name)).command
     assert "--columns" in [text for option in command.params for text in option.opts]
 
@@ -733,7 +733,7 @@ def test_the_table_of_rostopic_is_read(tmp_path):
     assert any("those of ROS messages" in note for note in table.notes)
 
 
-def test_a_field_of_rostopic_that_is_in_gauss_is_told_and_the_option_reads_it(tmp_path):
+def test_rostopic_field_in_gauss_is_reported_and_read_with_the_option(tmp_path):
     path = save(tmp_path / "imu.csv", rostopic(1.0))
     with pytest.raises(RecordingError, match="it looks like gauss") as refused:
         read_table(path)
@@ -768,7 +768,7 @@ def test_units_in_brackets_are_read(tmp_path, time, mag, gyro, accel, factors):
     same(read_table(save(tmp_path / "phone.csv", cells)), sensor())
 
 
-def test_of_two_columns_that_could_be_meant_none_is_taken(tmp_path):
+def test_ambiguous_columns_are_not_used(tmp_path):
     cells = renamed(
         {
             TIME: ("Time (s)", 1.0),
@@ -792,9 +792,7 @@ def test_of_two_columns_that_could_be_meant_none_is_taken(tmp_path):
          "gyro_z=wz_dps:dps,accel_x=acc_x,accel_y=acc_y,accel_z=acc_z"),
     ],
 )  # fmt: skip
-def test_short_names_are_in_the_option_that_would_give_them(
-    tmp_path, time, mag, gyro, accel, option
-):
+def test_suggested_option_contains_short_column_names(tmp_path, time, mag, gyro, accel, option):
     cells = renamed(
         {
             TIME: (time, 1.0),
@@ -839,7 +837,7 @@ def test_other_lines_are_no_table(line):
     assert not is_table_text(f"{line}\n".encode() * 40)
 
 
-def test_a_force_of_zero_is_none(tmp_path):
+def test_specific_force_of_zero_counts_as_missing(tmp_path):
     cells = renamed({one: (one, 1.0) for one in (TIME, *MAG, *GYRO, *ACCEL)})
     for name in ACCEL:
         cells[name] = ["0"] * len(cells[name])
@@ -858,8 +856,8 @@ def lines_of_a_device(count: int = 400) -> list[bytes]:
 
 @pytest.mark.parametrize("cell", ['"{line}"', '"{line}\n"', '"{line}\r\n"'])
 @pytest.mark.parametrize("more", ["", "imu1_Frame,0.037773,-0.2727,2.653e-05,"])
-def test_rows_with_what_the_device_sent_are_that(tmp_path, cell, more):
-    """As drivers that students write keep them: time, values in some units, and the line."""
+def test_rows_with_device_lines_are_read_from_these_lines(tmp_path, cell, more):
+    """As drivers written by students store them: time, values in some units, and the line."""
     lines = [line.decode().strip() for line in lines_of_a_device()]
     rows = [
         f"{1763590172.75 + k / 20:.6f},{more}{cell.format(line=line)}\n"
@@ -909,7 +907,7 @@ def test_quoted_cells_of_several_lines_are_cells(tmp_path):
     )
 
 
-def test_a_quote_that_is_never_closed_swallows_no_rows(tmp_path):
+def test_unclosed_quote_loses_no_rows(tmp_path):
     rows = foreign_rows(tmp_path).read_text().splitlines()
     path = tmp_path / "inches.csv"
     path.write_text("\n".join([rows[0] + ",note", *(f'{row},5" pipe' for row in rows[1:])]) + "\n")

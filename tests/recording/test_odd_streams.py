@@ -1,4 +1,4 @@
-"""Byte streams as terminal programs, shells and drivers leave them, each with its right value."""
+"""Byte streams as written by terminal programs, shells and drivers, each with its correct value."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ TOLD = ("epoch", "counts", "csv")
     "kind",
     [pytest.param(kind, marks=() if kind in TOLD else pytest.mark.slow) for kind in STAMPS],
 )
-def test_a_time_in_front_of_each_line_is_its_arrival(tmp_path, kind):
+def test_time_at_the_start_of_a_line_is_its_arrival_time(tmp_path, kind):
     """Messages without a time of their own have the rate at which they came, not a factory's."""
     path = tmp_path / ("a.csv" if kind == "csv" else "a.txt")
     end = '"' if kind == "csv" else ""
@@ -153,7 +153,7 @@ def test_a_text_mode_is_undone(tmp_path):
     assert any("a text mode turned each LF of the packets into CR LF" in text for text in warnings)
 
 
-def test_a_true_stream_with_cr_lf_is_left_alone(tmp_path):
+def test_correct_stream_with_cr_lf_is_unchanged(tmp_path):
     path = tmp_path / "a.vnbin"
     path.write_bytes(b"".join(whole(k) + LINES[k].encode() for k in range(2000)))
     result = replay(path, Config())
@@ -191,7 +191,7 @@ def test_one_output_with_all_is_taken_before_two(tmp_path):
     assert facts.samples >= 1990
 
 
-def test_parts_without_a_time_are_told(tmp_path):
+def test_parts_without_a_time_are_reported(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text(
         "".join(

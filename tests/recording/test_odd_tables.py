@@ -1,7 +1,7 @@
-"""Tables with clocks, numbers, names and rows as loggers and spreadsheets leave them.
+"""Tables with clocks, numbers, names and rows as written by loggers and spreadsheets.
 
-Each has a right value: the readings and times of the sensor that wrote it, or the one line that
-says what the file is.
+Each has a correct result: the readings and times of its sensor, or the one line that says what the
+file is.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def of_day(seconds: float) -> str:
         (lambda t: f"{(43190.0 + t) % 43200:.3f}", "", "after half a day"),
     ],
 )
-def test_a_clock_that_begins_again_at_its_end_counts_on(tmp_path, stamp, unit, words):
+def test_wrapping_clock_is_unwrapped(tmp_path, stamp, unit, words):
     columns = cells() | {TIME: [stamp(t) for t in DATA["time_s"]]}
     table = read(tmp_path, text(columns), *([f"time=time_s{unit}"] if unit else []))
     assert table.starts == (0,)
@@ -125,7 +125,7 @@ def test_dates_in_any_order(tmp_path, form):
         are_the_readings(table)
 
 
-def test_a_date_that_could_be_two_is_told(tmp_path):
+def test_ambiguous_date_is_reported(tmp_path):
     start = datetime(2024, 3, 4, 23, 59, 50)
     form = "%d/%m/%Y %H:%M:%S.%f"
     stamps = [(start + timedelta(seconds=float(t))).strftime(form) for t in DATA["time_s"]]
@@ -133,7 +133,7 @@ def test_a_date_that_could_be_two_is_told(tmp_path):
         read(tmp_path, text(cells() | {TIME: stamps}))
 
 
-def test_a_zone_that_changes_is_no_hour(tmp_path):
+def test_change_of_the_time_zone_is_not_an_hour(tmp_path):
     start = datetime(2024, 10, 27, 2, 59, 40)
     stamps = [
         (start + timedelta(seconds=t - (0 if k < 400 else 3600))).isoformat(timespec="milliseconds")
@@ -146,7 +146,7 @@ def test_a_zone_that_changes_is_no_hour(tmp_path):
         assert table.starts == (0,)
 
 
-def test_times_whose_digits_were_lost_are_told(tmp_path):
+def test_times_with_lost_digits_are_reported(tmp_path):
     for stamps in (
         [f"{1.7e9 + t:g}" for t in DATA["time_s"]],
         [f"{float(np.float32(1.7e9 + t)):.1f}" for t in DATA["time_s"]],
@@ -277,7 +277,7 @@ def held(values: np.ndarray, rows: int) -> np.ndarray:
     return values[np.arange(len(values)) // rows * rows]
 
 
-def test_a_held_gyro_is_drawn_between_its_readings(tmp_path):
+def test_held_gyro_is_interpolated_between_its_readings(tmp_path):
     data = sensor(2400, 40.0)
     table = read(tmp_path, text(cells({**data, "gyro": held(data["gyro"], 4)})))
     assert "the gyro has a new reading only every 4 rows: between" in table.notes[0]
@@ -293,7 +293,7 @@ def test_a_held_gyro_is_drawn_between_its_readings(tmp_path):
     assert not [text for text in result.all_warnings() if "iron changed" in text]
 
 
-def test_empty_cells_of_a_slower_gyro_are_drawn_as_well(tmp_path):
+def test_empty_cells_of_a_slower_gyro_are_interpolated(tmp_path):
     columns = cells()
     for name in GYRO:
         columns[name] = [v if k % 4 == 0 else "" for k, v in enumerate(columns[name])]
@@ -311,7 +311,7 @@ def test_rows_that_repeat_all_readings_count_once(tmp_path):
     np.testing.assert_allclose(np.diff(table.rows.time_s), 0.15, atol=1e-6)
 
 
-def test_a_held_magnetometer_is_left_as_it_is(tmp_path):
+def test_held_magnetometer_is_unchanged(tmp_path):
     table = read(tmp_path, text(cells({**DATA, "mag": held(DATA["mag"], 5)})))
     assert len(table.rows) == COUNT
     assert table.notes == ()
@@ -325,7 +325,7 @@ def test_coarse_readings_at_rest_are_no_hold(tmp_path):
     assert not any("new reading" in note or "each counts once" in note for note in table.notes)
 
 
-def test_two_sensors_that_take_turns_are_told_by_their_column(tmp_path):
+def test_alternating_sensors_are_separated_by_their_column(tmp_path):
     other = {**sensor(COUNT, RATE_HZ, seed=5)}
     other["mag"] = other["mag"] + 0.1
     first, second = cells(), cells(other)
@@ -338,13 +338,13 @@ def test_two_sensors_that_take_turns_are_told_by_their_column(tmp_path):
 
 
 @pytest.mark.parametrize("levels", [["0"] * 400 + ["1"] * 400, ["0", "1"] * 400])
-def test_a_switch_is_no_other_sensor(tmp_path, levels):
+def test_switch_column_is_not_another_sensor(tmp_path, levels):
     table = read(tmp_path, text(cells() | {"switch": levels}))
     are_the_readings(table)
 
 
 @pytest.mark.parametrize("mark", ["-9999", "1e38", "65535"])
-def test_readings_that_no_sensor_has_are_left_out(tmp_path, mark):
+def test_impossible_readings_are_left_out(tmp_path, mark):
     columns = cells()
     for name in MAG:
         columns[name][100:103] = [mark] * 3
@@ -387,7 +387,7 @@ BYTES = b"\xfa\x05\x01\x00\x0e\x00" + bytes(range(46))
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("name", ["a.csv", "a.txt", "a.gz"])
-def test_other_files_are_told_by_their_content(tmp_path, content, words, name):
+def test_other_files_are_recognised_by_their_content(tmp_path, content, words, name):
     path = tmp_path / name
     if callable(content):
         content(path)

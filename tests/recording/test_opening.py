@@ -49,7 +49,7 @@ def test_tables(tmp_path):
     assert second.host_ns == stop.host_ns == 249_900_000_000
 
 
-def test_captures_skip_what_was_sent_and_keep_the_order(tmp_path):
+def test_captures_skip_sent_commands_and_keep_the_order(tmp_path):
     items = [
         LinkOpened(1, "/dev/ttyUSB0", 115200),
         RegistersKnown(2, {7: (40.0,)}),
@@ -70,7 +70,7 @@ def test_a_stop_that_was_recorded_is_not_doubled(tmp_path):
     ]
 
 
-def test_a_cut_capture_reads_to_its_end_and_says_so(tmp_path):
+def test_truncated_capture_is_read_to_its_end_with_a_note(tmp_path):
     capture(tmp_path / "c.mcap", Received(3, b"x" * 100))
     data = (tmp_path / "c.mcap").read_bytes()
     (tmp_path / "c.mcap").write_bytes(data[:-40])
@@ -93,7 +93,7 @@ def test_a_capture_of_a_silent_device_is_refused(tmp_path):
         (TABLE.encode(), RecordingKind.TABLE),
     ],
 )
-def test_an_unknown_name_is_judged_by_its_content(tmp_path, content, kind):
+def test_unknown_file_name_is_recognised_by_content(tmp_path, content, kind):
     (tmp_path / "a.logger_mixed_stream.gz").write_bytes(gzip.compress(content, mtime=0))
     assert open_recording(tmp_path / "a.logger_mixed_stream.gz").kind is kind
 
@@ -107,7 +107,7 @@ def test_an_unknown_name_is_judged_by_its_content(tmp_path, content, kind):
         ("a.csv", b"PAR1", None),
     ],
 )
-def test_a_wrong_name_does_not_hide_what_a_file_is(tmp_path, name, content, kind):
+def test_wrong_file_name_does_not_hide_the_content(tmp_path, name, content, kind):
     (tmp_path / name).write_bytes(content)
     if kind is None:
         with pytest.raises(RecordingError, match="is no Parquet table"):
@@ -137,7 +137,7 @@ def test_an_unused_rate_is_noted(tmp_path):
         ("a.txt", b"PK\x03\x04", "is a zip archive"),
     ],
 )
-def test_what_is_no_recording_ends_in_one_line(tmp_path, name, content, words):
+def test_file_that_is_no_recording_is_refused_in_one_line(tmp_path, name, content, words):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(RecordingError, match=words) as caught:
         open_recording(tmp_path / name)

@@ -1,4 +1,4 @@
-"""PX4 logs: the raw field comes back, and what the log has not ends in one line."""
+"""PX4 logs: the raw field is recovered, and missing topics are reported in one line."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_offset_and_scale_are_undone_and_the_gyro_is_averaged(tmp_path):
     assert "gyro offset [10.0, -20.0, 30.0] mrad/s" in recording.facts["undone"]
 
 
-def test_it_calibrates_as_the_table_of_the_same_values_does(tmp_path):
+def test_log_calibrates_as_a_table_of_the_same_values(tmp_path):
     import pyarrow
     import pyarrow.parquet
 
@@ -81,7 +81,7 @@ def test_it_calibrates_as_the_table_of_the_same_values_does(tmp_path):
     np.testing.assert_allclose(found.hard_iron_gauss, wanted.hard_iron_gauss, rtol=0, atol=1e-6)
 
 
-def test_what_the_library_writes_is_read(tmp_path):
+def test_log_written_by_the_library_is_read(tmp_path):
     path = good(tmp_path / "log.ulg")
     again = tmp_path / "again.ulg"
     pyulog.ULog(str(path)).write_ulog(str(again))
@@ -90,7 +90,7 @@ def test_what_the_library_writes_is_read(tmp_path):
     )
 
 
-def test_a_compass_that_is_turned_keeps_its_calibration_and_it_is_told(tmp_path):
+def test_rotated_compass_keeps_its_calibration_with_a_note(tmp_path):
     _, slow = data()
     path = good(tmp_path / "log.ulg", parameters={**CALIBRATED, "CAL_MAG0_ROT": 6})
     recording = open_recording(path)
@@ -99,7 +99,7 @@ def test_a_compass_that_is_turned_keeps_its_calibration_and_it_is_told(tmp_path)
     assert any("the compass is turned" in note for note in recording.notes)
 
 
-def test_before_version_1_9_the_field_is_in_sensor_combined(tmp_path):
+def test_field_is_in_sensor_combined_before_version_1_9(tmp_path):
     fast, _ = data()
     rows = zip(fast["time_s"], fast["gyro"], fast["accel"], fast["mag"], strict=True)
     path = ul.save(
@@ -114,7 +114,7 @@ def test_before_version_1_9_the_field_is_in_sensor_combined(tmp_path):
     np.testing.assert_allclose(found, fast["mag"][::5][: len(found)], atol=1e-6)
 
 
-def test_readings_that_repeat_are_left_out(tmp_path):
+def test_repeated_readings_are_left_out(tmp_path):
     fast, slow = data()
     held = np.repeat(slow["mag"], 5, axis=0)
     path = ul.save(
@@ -230,7 +230,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", list(WRONG), ids=lambda one: one.__name__)
-def test_a_log_that_is_wrong_ends_in_one_line(tmp_path, capsys, wrong):
+def test_bad_log_is_refused_in_one_line(tmp_path, capsys, wrong):
     path = tmp_path / "log.ulg"
     wrong(path)
     with pytest.raises(RecordingError) as refused:
@@ -241,7 +241,7 @@ def test_a_log_that_is_wrong_ends_in_one_line(tmp_path, capsys, wrong):
     assert capsys.readouterr() == ("", "")
 
 
-def test_of_two_compasses_the_first_is_used_and_told_or_the_one_that_is_chosen(tmp_path):
+def test_first_or_chosen_one_of_two_compasses_is_used(tmp_path):
     _, slow = data()
     path = good(tmp_path / "log.ulg", *ul.mags(slow["time_s"], 0.5 * slow["mag"], 77, number=1))
     assert any("holds 2 compasses: number 0" in note for note in open_recording(path).notes)
@@ -249,7 +249,7 @@ def test_of_two_compasses_the_first_is_used_and_told_or_the_one_that_is_chosen(t
     np.testing.assert_allclose(rows.raw_b_gauss, 0.5 * slow["mag"][: len(rows)], atol=1e-6)
 
 
-def test_without_the_library_one_line_says_what_to_install(tmp_path, monkeypatch):
+def test_missing_library_is_named_in_one_line(tmp_path, monkeypatch):
     path = good(tmp_path / "log.ulg")
     monkeypatch.setattr(formats.importlib.util, "find_spec", lambda _: None)
     with pytest.raises(RecordingError, match=r"pip install 'ahrsd\[px4\]'"):

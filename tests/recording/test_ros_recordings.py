@@ -60,7 +60,7 @@ def test_it_calibrates_to_the_truth(tmp_path):
     np.testing.assert_allclose(estimate.gyro_bias_rad_s, BIAS, atol=3e-4)
 
 
-def test_content_tells_the_format_whatever_the_name(tmp_path, container):
+def test_format_is_recognised_by_content(tmp_path, container):
     data = sensor()
     path = ros_files.save(tmp_path, container, [*imu(data), *magnetic(data)])
     other = path.rename(tmp_path / "log.txt")
@@ -110,7 +110,7 @@ def data_of(data):
     return data["time_s"], data["gyro"], data["accel"], data["mag"]
 
 
-def test_covariates_come_under_the_names_of_the_contract(tmp_path):
+def test_covariates_have_their_documented_names(tmp_path):
     data = sensor()
     more = []
     for k, t in enumerate(np.arange(0.0, 30.0, 0.5)):
@@ -132,7 +132,7 @@ def test_covariates_come_under_the_names_of_the_contract(tmp_path):
 
 
 @pytest.mark.parametrize("unit", ["G", "uT", "mG"])
-def test_a_field_that_is_not_in_tesla_is_told_and_the_option_reads_it(tmp_path, unit):
+def test_field_not_in_tesla_is_reported_and_read_with_the_option(tmp_path, unit):
     data = sensor()
     factor = {"G": 1.0, "uT": 100.0, "mG": 1000.0}[unit]
     path = ros_files.save(tmp_path, "mcap", [*imu(data), *magnetic(data, factor=factor)])
@@ -164,7 +164,7 @@ def test_an_axis_is_turned_by_the_option(tmp_path):
         pytest.param("mcap", "text", marks=pytest.mark.slow),
     ],
 )
-def test_what_the_device_sent_calibrates_as_its_byte_stream(tmp_path, container, kind):
+def test_recorded_device_bytes_calibrate_as_their_byte_stream(tmp_path, container, kind):
     stream = stream_of(kind)
     own = tmp_path / ("own.vnraw" if kind == "text" else "own.vnbin")
     own.write_bytes(b"".join(stream))
@@ -198,7 +198,7 @@ def test_a_real_stream_in_a_bag_calibrates_as_the_stream(recordings, tmp_path):
 
 
 def stream_of(kind: str) -> list[bytes]:
-    """What a VN-100 sent, message by message or in pieces."""
+    """Bytes of a VN-100, message by message or in pieces."""
     name = {"text": "clean_tumble_vnymr.vnraw.gz", "bytes": "clean_tumble_binary.vnraw.gz"}[kind]
     data = gzip.decompress((PROJECT / "fixtures" / "replays" / name).read_bytes())
     if kind == "text":
@@ -307,7 +307,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", list(WRONG), ids=lambda one: one.__name__)
-def test_a_recording_that_is_wrong_ends_in_one_line(tmp_path, container, wrong):
+def test_bad_recording_is_refused_in_one_line(tmp_path, container, wrong):
     path = wrong(tmp_path, container)
     words = WRONG[wrong]
     with pytest.raises(RecordingError) as refused:
@@ -343,7 +343,7 @@ def reading_without_definitions(folder: Path, raw: list[str]) -> Path:
 
 
 @pytest.mark.parametrize("end", ["", "\n", "\r\n"])
-def test_lines_of_the_device_are_found_in_messages_that_nobody_defined(tmp_path, end):
+def test_device_lines_are_found_in_messages_without_a_definition(tmp_path, end):
     sent = [one.decode().rstrip() for one in stream_of("text")]
     path = reading_without_definitions(tmp_path, [line + end for line in sent])
     recording = open_recording(path)
@@ -351,7 +351,7 @@ def test_lines_of_the_device_are_found_in_messages_that_nobody_defined(tmp_path,
     assert [one.host_ns for one in recording.sent][:2] == [ns_of(0.0), ns_of(0.05)]
 
 
-def test_a_definition_is_told_for_and_taken_from_beside_the_recording(tmp_path):
+def test_missing_definition_is_reported_and_read_from_the_folder_of_the_recording(tmp_path):
     data = sensor(300)
     path = reading_without_definitions(tmp_path, [""] * 300)
     with pytest.raises(RecordingError, match=r"put Reading\.msg beside it"):
@@ -367,7 +367,7 @@ def test_a_definition_is_told_for_and_taken_from_beside_the_recording(tmp_path):
         np.testing.assert_allclose(rows.gyro_b_rad_s, data["gyro"], rtol=1e-12)
 
 
-def test_a_definition_that_is_none_is_told(tmp_path):
+def test_invalid_definition_is_reported(tmp_path):
     path = reading_without_definitions(tmp_path, [""] * 30)
     (path.parent / "Reading.msg").write_text("float64[ x\n")
     with pytest.raises(RecordingError) as refused:
@@ -386,7 +386,7 @@ def test_a_huge_gap_is_a_gap(tmp_path, container):
     assert any("the clock was set" in note for note in table.notes)
 
 
-def test_a_database_of_another_program_is_told(tmp_path):
+def test_database_of_another_program_is_refused(tmp_path):
     path = tmp_path / "notes.db3"
     database = sqlite3.connect(path)
     database.execute("create table notes(text)")
@@ -396,7 +396,7 @@ def test_a_database_of_another_program_is_told(tmp_path):
         open_recording(path)
 
 
-def test_a_topic_that_is_not_there_is_told(tmp_path):
+def test_missing_topic_is_reported(tmp_path):
     path = good(tmp_path, "mcap")
     with pytest.raises(RecordingError, match=r"has no topic /mag; it has /imu/data, /imu/mag"):
         open_recording(path, choice=Choice(topics=("/mag",)))
@@ -411,7 +411,7 @@ def test_the_topic_is_chosen(tmp_path):
     np.testing.assert_allclose(read_table(out).rows.raw_b_gauss, other["mag"], rtol=1e-12)
 
 
-def test_without_the_library_one_line_says_what_to_install(tmp_path, monkeypatch):
+def test_missing_library_is_named_in_one_line(tmp_path, monkeypatch):
     path = good(tmp_path, "mcap")
     monkeypatch.setattr(formats.importlib.util, "find_spec", lambda _: None)
     with pytest.raises(RecordingError, match=r"pip install 'ahrsd\[ros\]'"):
@@ -421,7 +421,7 @@ def test_without_the_library_one_line_says_what_to_install(tmp_path, monkeypatch
 # -- convert ---------------------------------------------------------------------------------------
 
 
-def test_convert_keeps_the_samples_and_says_where_they_come_from(tmp_path):
+def test_convert_keeps_the_samples_and_reports_their_source(tmp_path):
     path, out = good(tmp_path, "bag"), tmp_path / "out.parquet"
     result = ahrsd("convert", path, "-o", out)
     assert result.exit_code == 0, result.output
@@ -439,7 +439,7 @@ def test_convert_keeps_the_samples_and_says_where_they_come_from(tmp_path):
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
 
 
-def test_convert_says_that_the_axes_differ(tmp_path):
+def test_convert_reports_different_axes(tmp_path):
     data = sensor(1200)
     turned = {**data, "mag": data["mag"] * [1.0, -1.0, -1.0]}
     path = ros_files.save(tmp_path, "mcap", [*imu(data), *magnetic(turned)])
@@ -447,7 +447,7 @@ def test_convert_says_that_the_axes_differ(tmp_path):
     assert "the gyro: negate its y and z" in result.output
 
 
-def test_degrees_too_slow_to_be_told_by_size_are_told_by_the_field(tmp_path):
+def test_slow_rates_in_degrees_are_recognised_by_the_field(tmp_path):
     data = sensor(2400, 20.0, turn=0.2)
     data["gyro"] = np.degrees(data["gyro"])
     path = ros_files.save(tmp_path, "mcap", [*imu(data), *magnetic(data)])
@@ -456,7 +456,7 @@ def test_degrees_too_slow_to_be_told_by_size_are_told_by_the_field(tmp_path):
     assert "deg/s" in result.output
 
 
-def test_list_says_what_is_inside(tmp_path, container):
+def test_list_shows_the_contents(tmp_path, container):
     result = ahrsd("convert", good(tmp_path, container), "--list")
     assert result.exit_code == 0
     assert "/imu/mag  sensor_msgs/msg/MagneticField  600 messages, 20 Hz" in result.output
@@ -470,8 +470,8 @@ def test_recordings_from_the_field_are_read(name, tmp_path):
 
 
 @pytest.mark.parametrize("stamp_ns", [0, None])
-def test_headers_without_times_or_of_two_clocks_leave_the_recorders(tmp_path, container, stamp_ns):
-    """A driver that stamps nothing, and one that stamps its Imu by the time since its start."""
+def test_recorder_times_are_used_without_consistent_header_times(tmp_path, container, stamp_ns):
+    """A driver without time stamps, and one that stamps its Imu with the time since its start."""
     data = sensor()
     since = 5 * 10**9 - ros_files.BEGAN_NS
     turned = [(t, k, ns, {**f, "stamp_ns": ns + since if stamp_ns is None else 0})
@@ -487,7 +487,7 @@ def test_headers_without_times_or_of_two_clocks_leave_the_recorders(tmp_path, co
     assert any(words in note for note in recording.notes)
 
 
-def test_of_two_gyros_the_one_that_does_not_turn_is_told(tmp_path, container):
+def test_constant_one_of_two_gyros_is_reported(tmp_path, container):
     data = sensor()
     still = {**data, "gyro": 7e-4 * np.random.default_rng(0).normal(size=data["gyro"].shape)}
     messages = [*imu(data, "/b/data"), *imu(still, "/a/data"), *magnetic(data, "/mag")]

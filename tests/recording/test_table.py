@@ -156,7 +156,7 @@ def doubled(*rows: int):
     return change
 
 
-def test_rows_written_twice_are_left_out_and_said(tmp_path):
+def test_duplicate_rows_are_left_out_with_a_note(tmp_path):
     values = columns()
     doubled(7, 7, 30)(values)
     table = read_table(save(tmp_path / "t.csv", values))
@@ -242,7 +242,7 @@ def test_a_wrong_table_is_refused_in_one_line(tmp_path, change, words):
         ),
     ],
 )
-def test_what_is_no_table_is_refused_in_one_line(tmp_path, name, content, words):
+def test_file_that_is_no_table_is_refused_in_one_line(tmp_path, name, content, words):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(RecordingError) as caught:
         read_table(tmp_path / name)
@@ -250,7 +250,7 @@ def test_what_is_no_table_is_refused_in_one_line(tmp_path, name, content, words)
     assert "\n" not in str(caught.value)
 
 
-def test_blanks_around_names_are_none_of_them(tmp_path):
+def test_blanks_around_column_names_are_ignored(tmp_path):
     path = save(tmp_path / "t.csv", columns())
     head, *rest = path.read_text().splitlines()
     path.write_text("\n".join([head.replace(",", ", "), *rest]) + "\n")

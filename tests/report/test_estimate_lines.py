@@ -1,4 +1,4 @@
-"""What an estimate says in lines for a person."""
+"""Text of an estimate for a person."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ahrsd.report.summary import estimate_lines
 ADVICE = "the gyro's scales may be off by a percent: turn about every axis, and back again"
 
 
-def test_what_makes_the_most_of_the_sigma_is_told_below_the_heading():
+def test_largest_contribution_to_sigma_is_reported_below_the_heading():
     found = estimate(heading_sigma_deg=1.7, widened_by=ADVICE)
     assert estimate_lines(found) == [
         "  hard iron  +50.00 +- 0.10, -30.00 +- 0.10, +40.00 +- 0.10 mG",
@@ -23,7 +23,7 @@ def test_what_makes_the_most_of_the_sigma_is_told_below_the_heading():
     assert len(estimate_lines(replace(found, widened_by=""))) == 3
 
 
-def test_where_axes_or_units_are_wrong_that_is_all_the_advice():
+def test_wrong_axes_or_units_are_the_only_advice():
     wrong = ("the magnetometer is turned against the gyro by 45.0 deg about its z",)
     found = estimate(heading_sigma_deg=41.0, widened_by=ADVICE, converged=False)
     lines = estimate_lines(found, wrong)
@@ -37,7 +37,7 @@ def test_where_axes_or_units_are_wrong_that_is_all_the_advice():
     assert said["warnings"] == [lines[3].strip()]
 
 
-def test_and_is_a_warning_for_programs():
+def test_wrong_axes_or_units_are_a_warning_in_json():
     found = estimate(heading_sigma_deg=1.7, widened_by=ADVICE)
     said = calibration_json("x", found, {}, method="magyc", samples=1, gyro_is_raw=True)
     assert said["warnings"] == [f"most of the heading's sigma: {ADVICE}"]

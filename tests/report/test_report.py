@@ -264,7 +264,7 @@ def test_texts_are_escaped(tmp_path):
     assert shown.text.count(evil) == 17
 
 
-def test_gates_that_hold_back_come_first_with_their_advice(tmp_path):
+def test_closed_gates_come_first_with_their_advice(tmp_path):
     gates = (
         GateResult("bounds", 1.2, 2.0, True, 0.0, "", "never shown"),
         GateResult("motion", 120.0, 280.0, False, 0.0, "deg", "drive a full turn"),
@@ -290,7 +290,7 @@ def test_registers_are_shown_with_the_lines_that_write_them(tmp_path):
     assert np.allclose(numbers, after.to_register(), atol=1e-7)
 
 
-def test_the_picture_has_the_size_asked_for_and_both_colours(tmp_path):
+def test_figure_has_the_requested_size_and_both_colours(tmp_path):
     before_after_figure(tmp_path / "picture.png", heading_error(), 900, 600)
     with Image.open(tmp_path / "picture.png") as image:
         assert image.size == (900, 600)
@@ -313,7 +313,7 @@ def test_matplotlib_is_loaded_only_to_draw():
     assert done.stdout == "False\n"
 
 
-def test_collector_keeps_what_happened():
+def test_collector_keeps_the_events():
     data = collected().report("x")
     assert [state.new for state in data.states] == ["CANDIDATE"]
     assert data.gates[0].ok
@@ -341,7 +341,7 @@ def test_collector_stays_bounded_over_a_long_run():
     assert len(data.warnings) == 200
 
 
-def test_medians_by_heading_leave_gaps_where_nobody_went():
+def test_medians_by_heading_have_gaps_at_unvisited_headings():
     middle, error = binned(np.array([1.0, 2.0, 3.0, 359.0]), np.array([1.0, 9.0, 2.0, 4.0]))
     assert middle[[0, -1]].tolist() == [5.0, 355.0]
     assert error[[0, -1]].tolist() == [2.0, 4.0]
@@ -374,7 +374,7 @@ def test_numbers_as_people_write_them(value, text):
     assert number(value, "deg") == text
 
 
-def test_time_goes_on_where_the_device_restarted():
+def test_time_continues_after_a_device_restart():
     """Nothing jumps back at a power cut: samples, estimates and states go on behind it."""
     collector = EventCollector()
     collector.add(seen(200, None))

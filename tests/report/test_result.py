@@ -41,7 +41,7 @@ def blind(*names: str) -> Estimate:
     return replace(ESTIMATE, observability=observed, converged=False)
 
 
-def test_every_key_of_the_contract_and_finite():
+def test_all_documented_keys_are_present_and_finite():
     found = calibration_json("a.vnraw", ESTIMATE, {}, heading=HeadingErrors(8.0, 0.5))
     assert faults(found, CALIBRATION) == []
     json.dumps(found, allow_nan=False)
@@ -74,7 +74,7 @@ def test_a_compensated_rate_is_not_written():
     assert set(found["registers"]) == {"23"}
 
 
-def test_what_cannot_be_written_is_said_and_left_out():
+def test_unwritable_registers_are_reported_and_left_out():
     strong = replace(ESTIMATE, hard_iron_gauss=np.array([2.0, 0.0, 0.0]))
     found = calibration_json("a", strong, {})
     assert found["registers"] == {}
@@ -92,7 +92,7 @@ def test_what_cannot_be_written_is_said_and_left_out():
         (replace(ESTIMATE, converged=False), "not converged: the data still allow more than one"),
     ],
 )  # fmt: skip
-def test_what_has_not_converged_has_a_reason_and_no_registers(estimate, reason):
+def test_unconverged_estimate_has_a_reason_and_no_registers(estimate, reason):
     found = calibration_json("a", estimate, {23: C23}, warnings=["first"])
     assert found["converged"] is False
     assert found["registers"] == {}
@@ -102,7 +102,7 @@ def test_what_has_not_converged_has_a_reason_and_no_registers(estimate, reason):
     assert why_not_converged(estimate) == [found["warnings"][-1]]
 
 
-def test_what_has_converged_needs_none():
+def test_converged_estimate_has_no_reason():
     assert why_not_converged(ESTIMATE) == []
 
 

@@ -1,4 +1,4 @@
-"""What a person reads at the end: numbers with units, reasons, nothing that means nothing."""
+"""Summary for a person at the end: numbers with units, reasons, and no meaningless figures."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_summary_of_a_stream(core):
     assert not [line for line in own if "nan" in line]
 
 
-def test_before_anything_came():
+def test_summary_of_an_empty_stream():
     core = Core(core_settings(Config()))
     assert summary_lines(core, "port")[0] == "port: 0 samples in 0.0 s (unknown rate)"
     summary = summary_json(core, "port")
@@ -63,12 +63,12 @@ def test_before_anything_came():
     assert "  no estimate: too few samples" in summary_lines(core, "port")
 
 
-def test_unknown_registers_are_said_and_known_ones_are_not(core):
+def test_only_unknown_registers_are_reported(core):
     assert any("registers are not known" in text for text in warnings_of(core))
     assert warnings_of(core, ["a", "a"]).count("a") == 1
 
 
-def test_numbers_never_show_a_minus_before_nothing(core):
+def test_zero_has_no_minus_sign(core):
     estimate = core.calibrator.estimate
     assert estimate is not None
     tiny = replace(
@@ -85,7 +85,7 @@ def test_numbers_never_show_a_minus_before_nothing(core):
     ]  # fmt: skip
 
 
-def test_what_the_motion_does_not_determine_is_no_number(core):
+def test_undetermined_parameters_have_no_number(core):
     estimate = core.calibrator.estimate
     assert estimate is not None
     observed = replace(estimate.observability, unobservable=("hard iron z", "soft iron zz"))

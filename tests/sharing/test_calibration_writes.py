@@ -1,4 +1,5 @@
-"""The owner writes what calibrates: refused by default, somebody's journaled change with `pass`.
+"""The owner writes calibration registers: refused by default, a journaled foreign change with
+`pass`.
 
 Judged by what the units hold and were sent (`cabled_units`).
 """
@@ -41,7 +42,7 @@ def writes(run: CabledRun) -> list[tuple[int, str]]:
     return run.cable.unit.writes
 
 
-def test_what_the_owner_writes_is_in_the_device_and_in_the_journal_before_it():
+def test_owner_write_is_journaled_before_it_reaches_the_device():
     run, order = shared(planted=False), []
     run.cable.unit.before = order.append
     run.listeners.append(
@@ -63,7 +64,7 @@ def test_what_the_owner_writes_is_in_the_device_and_in_the_journal_before_it():
     [(23, THEIRS), (25, THEIRS), (26, "0,1,0,-1,0,0,0,0,1"), (44, "1,3,5"), (43, "1,2,3"),
      (84, THEIRS)],
 )  # fmt: skip
-def test_each_register_that_calibrates_passes_for_the_owner_and_for_nobody_else(number, values):
+def test_each_calibration_register_passes_only_for_the_owner(number, values):
     run = shared(planted=False)
     assert say(run, f"VNWRG,{number},{values}", "log") == "VNERR,09"
     assert writes(run) == []
@@ -72,14 +73,14 @@ def test_each_register_that_calibrates_passes_for_the_owner_and_for_nobody_else(
     assert run.kinds() == ["CLIENT_WRITES"]
 
 
-def test_what_vendor_tools_do_and_what_the_device_lacks_stays_refused():
+def test_vendor_commands_and_missing_registers_stay_refused():
     run = shared(planted=False)
     for line in ("VNTAR", "VNSGB", "VNRFS", "VNFWU", "VNWRG,74,1,2,3,4,5,6,7"):
         assert say(run, line) == "VNERR,09"
     assert (writes(run), run.kinds()) == ([], [])
 
 
-def test_by_default_it_is_refused():
+def test_calibration_write_is_refused_by_default():
     run = shared((SharePolicy("owner", owner=True),), planted=False)
     assert say(run, f"VNWRG,23,{THEIRS}") == "VNERR,09"
     assert (writes(run), run.kinds()) == ([], [])
@@ -87,7 +88,7 @@ def test_by_default_it_is_refused():
 
 
 @pytest.mark.parametrize("mode", [Mode.PASSIVE, Mode.OBSERVE])
-def test_in_passive_and_observe_nothing_passes_and_the_start_says_so(mode):
+def test_nothing_passes_in_passive_and_observe_and_it_is_logged(mode):
     run = shared(planted=False, mode=mode)
     assert run.told(f"lets nothing pass in mode {mode.name.lower()}")
     for number in (23, 25, 84):
@@ -96,7 +97,7 @@ def test_in_passive_and_observe_nothing_passes_and_the_start_says_so(mode):
     assert not any(line.startswith("VNWRG") for line in run.cable.unit.log)
 
 
-def test_samples_follow_the_new_registers_as_after_any_change_by_others():
+def test_samples_are_un_mapped_through_the_new_registers():
     run, blocks = shared(planted=False), []
     run.listeners.append(lambda e: blocks.append(e) if isinstance(e, SamplesSeen) else None)
     run.run(5.0)
@@ -105,13 +106,15 @@ def test_samples_follow_the_new_registers_as_after_any_change_by_others():
     run.run(5.0)
     assert run.told("somebody changed registers [23]", "calibrated anew")
     strength = [((e.block.raw_b_gauss - IRON) ** 2).sum(axis=1) ** 0.5 for e in blocks]
-    assert max(float(abs(s - 0.4837).max()) for s in strength) < 0.02  # none un-mapped by others
+    assert (
+        max(float(abs(s - 0.4837).max()) for s in strength) < 0.02
+    )  # none un-mapped through other registers
     assert run.core.registers[23][9:] == (0.11, 0.01, 0.02)
     assert BIAS.shape == (3,)
 
 
 @pytest.mark.parametrize("state", ["TRIAL", "PROVEN", "COMMITTED"])
-def test_while_a_calibration_is_under_way_it_is_refused(state):
+def test_owner_write_is_refused_during_a_calibration_write(state):
     run = shared()
     run.approve()
     assert run.until("TRIAL", 30.0)
@@ -128,7 +131,7 @@ def test_while_a_calibration_is_under_way_it_is_refused(state):
     assert run.cable.unit.held() == NEW
 
 
-def test_while_a_trial_is_set_aside_it_is_refused():
+def test_owner_write_is_refused_while_a_trial_is_set_aside():
     run = shared()
     run.approve()
     assert run.until("TRIAL", 30.0)
@@ -139,8 +142,10 @@ def test_while_a_trial_is_set_aside_it_is_refused():
     assert run.cable.unit.held() == NEW
 
 
-def test_what_was_approved_is_not_written_over_the_owners_value():
-    """Approved while the vehicle is not safe; then the owner writes, and then it is."""
+def test_approved_values_do_not_overwrite_an_owner_write():
+    """Approved while the vehicle does not permit it; then the owner writes, and then it is
+    permitted.
+    """
     run = shared()
     assert run.until("QUALIFIED")
     run.safe = False
@@ -152,7 +157,7 @@ def test_what_was_approved_is_not_written_over_the_owners_value():
     assert run.cable.unit.held() == NEW
 
 
-def test_a_rollback_puts_back_what_the_owner_wrote():
+def test_rollback_restores_the_values_of_the_owner():
     run = shared()
     assert say(run, f"VNWRG,23,{THEIRS}") == f"VNWRG,23,{THEIRS}"
     assert say(run, "VNWNV") == "VNWNV"
@@ -165,8 +170,8 @@ def test_a_rollback_puts_back_what_the_owner_wrote():
 
 
 @pytest.mark.parametrize("ends", ["saved", "restart"])
-def test_nothing_is_written_over_what_the_owner_did_not_save(ends):
-    """A restart in that trial would bring values that are neither old nor new."""
+def test_unsaved_owner_values_are_not_overwritten(ends):
+    """A restart during a trial would give values that are neither old nor new."""
     run = shared()
     say(run, f"VNWRG,84,{THEIRS}")
     run.run(2.0)
@@ -191,7 +196,7 @@ def test_nothing_is_written_over_what_the_owner_did_not_save(ends):
 @pytest.mark.parametrize(
     "at", [pytest.param(at, marks=() if at % 3 == 1 else pytest.mark.slow) for at in range(1, 16)]
 )
-def test_another_unit_at_any_command_of_the_owners_write_is_not_written(number, at):
+def test_unit_exchanged_at_any_command_of_an_owner_write_is_not_written(number, at):
     run, heard = shared(planted=False), []
     first, spare = run.cable.units[FIRST], run.cable.units[SPARE]
 
@@ -207,12 +212,12 @@ def test_another_unit_at_any_command_of_the_owners_write_is_not_written(number, 
     assert len(heard) >= at
     known = {number: THEIRS} if spare.writes else {}
     assert spare.writes == list(known.items())
-    if spare.writes:  # once it was identified and read: by its own journal
+    if spare.writes:  # after it was identified and read: with its own journal
         assert "CLIENT_WRITES" in run.kinds(SPARE)
 
 
 @pytest.mark.parametrize("saves", [True, False])
-def test_what_the_owner_did_not_save_itself_is_not_saved_for_it(saves):
+def test_unsaved_owner_values_are_not_saved_by_the_daemon(saves):
     run = shared()
     say(run, f"VNWRG,25,{THEIRS}")
     run.run(2.0)
@@ -229,7 +234,7 @@ def test_what_the_owner_did_not_save_itself_is_not_saved_for_it(saves):
         assert any("somebody else changed register 25" in r for r in run.core.writeback.obstacles())
 
 
-def test_a_journal_that_cannot_be_written_lets_nothing_pass():
+def test_nothing_passes_without_a_writable_journal():
     run = shared(planted=False)
     handle = run.core.handle
 
@@ -244,7 +249,7 @@ def test_a_journal_that_cannot_be_written_lets_nothing_pass():
     assert writes(run) == []
 
 
-def test_a_client_that_leaves_while_its_write_is_journaled_leaves_nothing_behind():
+def test_write_of_a_client_that_left_is_dropped():
     run = shared(planted=False)
     run.core.clients.on_bytes(
         inputs.ClientSent(run.now_ns, "owner", "$VNWRG,84,1,0,0,0,1,0,0,0,1,0,0,1*XX\r\n"),
@@ -258,7 +263,7 @@ def test_a_client_that_leaves_while_its_write_is_journaled_leaves_nothing_behind
 
 
 def announced_and_not_sent(run: CabledRun, how: str) -> None:
-    """The journal has a write of the owner's, and then it is not sent: it left, or waited long."""
+    """A journaled owner write that is not sent, because the client left or it waited too long."""
     handle, held = run.core.handle, []
 
     def hold(item):
@@ -282,7 +287,7 @@ def announced_and_not_sent(run: CabledRun, how: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["leaves", "late"])
-def test_a_write_that_was_not_sent_after_all_is_journaled_again_when_it_is(how):
+def test_unsent_owner_write_is_journaled_again_when_sent(how):
     run, order = shared(planted=False), []
     announced_and_not_sent(run, how)
     run.cable.unit.before = order.append
@@ -296,7 +301,7 @@ def test_a_write_that_was_not_sent_after_all_is_journaled_again_when_it_is(how):
 
 
 @pytest.mark.parametrize("how", ["leaves", "late"])
-def test_a_write_that_was_not_sent_holds_nothing_up(how):
+def test_unsent_owner_write_does_not_block_a_calibration(how):
     run = shared()
     announced_and_not_sent(run, how)
     run.approve()
@@ -304,7 +309,7 @@ def test_a_write_that_was_not_sent_holds_nothing_up(how):
     assert run.cable.unit.held() == NEW
 
 
-def test_what_somebody_changed_meanwhile_is_in_the_journal_before_it_is_written_over():
+def test_foreign_change_is_journaled_before_it_is_overwritten():
     """The register changes between the journal's answer and the write."""
     run, meanwhile = shared(planted=False), "1,0,0,0,1,0,0,0,1,0.3,0.2,0.1"
     changed: list[str] = []
@@ -326,7 +331,7 @@ def test_what_somebody_changed_meanwhile_is_in_the_journal_before_it_is_written_
 
 
 @pytest.mark.parametrize("answered", ["refused", "lost", "link"])
-def test_whatever_was_answered_the_device_is_read_again(answered):
+def test_device_is_read_again_after_any_answer(answered):
     run = shared(planted=False)
     unit, answer = run.cable.unit, run.cable.unit.answer
 
@@ -353,7 +358,7 @@ def test_whatever_was_answered_the_device_is_read_again(answered):
 
 
 @pytest.mark.parametrize("held", ["before", "after"])
-def test_a_program_that_was_killed_behind_it_takes_neither_value_for_strange(held):
+def test_both_values_are_known_after_a_kill(held):
     run = shared(planted=False)
     say(run, f"VNWRG,23,{THEIRS}")
     if held == "before":
@@ -364,7 +369,7 @@ def test_a_program_that_was_killed_behind_it_takes_neither_value_for_strange(hel
     assert not again.told("neither the factory's nor in the journal")
 
 
-def test_a_replay_takes_the_same_decisions():
+def test_replay_decides_the_same():
     run = shared(planted=False)
     say(run, f"VNWRG,23,{THEIRS}")
     run.run(5.0)

@@ -1,4 +1,4 @@
-"""What a client may have: the whole table, register by register and word by word."""
+"""What a client may send: the whole table, by register and command."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ MATRIX = "1,0,0,0,1,0,0,0,1,0,0,0"
 
 
 def refused(body: str, policy: SharePolicy) -> Refusal:
-    """The refusal of a write: at once, or where the register, which is read, holds otherwise."""
+    """The refusal of a write: at once, or, for a register that is read first, if it holds
+    another value.
+    """
     answer = parse_client_command(body, policy)
     if isinstance(answer, ClientCommand):
         number = int(body.split(",")[1])
@@ -36,7 +38,7 @@ def refused(body: str, policy: SharePolicy) -> Refusal:
 
 @pytest.mark.parametrize("policy", [OWNER, LISTENER], ids=["owner", "listener"])
 @pytest.mark.parametrize("number", [23, 25, 26, 43, 44, 74, 84])
-def test_what_calibrates_is_written_for_nobody(policy, number):
+def test_calibration_registers_are_refused_for_every_client(policy, number):
     row = REGISTERS[number]
     values = next(iter(row.defaults.values()))
     refusal = refused(f"VNWRG,{format_reply(number, values)}", policy)
@@ -46,7 +48,7 @@ def test_what_calibrates_is_written_for_nobody(policy, number):
 
 
 @pytest.mark.parametrize("number", [23, 25, 26, 43, 44, 74, 84])
-def test_what_calibrates_passes_for_an_owner_whose_share_says_so_from_mode_stage_on(number):
+def test_calibration_registers_pass_for_a_permitted_owner_from_mode_stage(number):
     values = next(iter(REGISTERS[number].defaults.values()))
     body = f"VNWRG,{format_reply(number, values)}"
     passing = SharePolicy("/a", owner=True, calibration_writes="pass")
@@ -59,7 +61,7 @@ def test_what_calibrates_passes_for_an_owner_whose_share_says_so_from_mode_stage
     assert refused(body, nobody).code == 0x09
 
 
-def test_nothing_else_becomes_possible_by_it():
+def test_permission_for_calibration_changes_nothing_else():
     passing = SharePolicy("/a", owner=True, calibration_writes="pass")
     for number in REGISTERS:
         for values in REGISTERS[number].defaults.values():
@@ -74,8 +76,8 @@ def test_nothing_else_becomes_possible_by_it():
 
 
 @pytest.mark.parametrize("number", sorted(REGISTERS))
-def test_each_register_has_one_answer(number):
-    """Reads are for everybody, writes for the owner, and nothing guarded goes out."""
+def test_each_register_has_one_rule(number):
+    """Reads are permitted to all, writes to the owner, and protected registers are never sent."""
     read = parse_client_command(f"VNRRG,{number:02d}", LISTENER)
     assert isinstance(read, ClientCommand)
     assert read.command == Read(number)
@@ -103,7 +105,7 @@ def test_each_register_has_one_answer(number):
         ("VNKAD,0", Kind.WRITE), ("VNASY,0", Kind.STREAM), ("VNASY,1", Kind.STREAM),
     ],
 )  # fmt: skip
-def test_words_of_the_owner(body, kind):
+def test_commands_of_the_owner(body, kind):
     answer = parse_client_command(body, OWNER)
     assert isinstance(answer, ClientCommand)
     assert answer.kind is kind
@@ -115,7 +117,7 @@ FOR_NOBODY = ["VNRFS", "VNTAR", "VNSGB", "VNSFB", "VNSIH", "VNSPS", "VNFWU", "VN
 
 
 @pytest.mark.parametrize("word", FOR_NOBODY)
-def test_words_for_nobody(word):
+def test_commands_refused_for_every_client(word):
     answer = parse_client_command(word, OWNER)
     assert (answer.code, word in answer.why) == (0x09, True)
     if word in ("VNRFS", "VNTAR", "VNSGB"):
@@ -131,11 +133,11 @@ def test_words_for_nobody(word):
         ("VNWRG,07,20,1,4", 0x06), ("", 0x04),
     ],
 )  # fmt: skip
-def test_wrong_lines_get_the_error_of_the_device(body, code):
+def test_wrong_lines_get_the_error_code_of_the_device(body, code):
     assert parse_client_command(body, OWNER).code == code
 
 
-def test_policies():
+def test_save_and_reset_can_be_refused_by_policy():
     strict = SharePolicy("/a", owner=True, save="refuse", reset="refuse")
     assert "save" in parse_client_command("VNWNV", strict).why
     assert "reset" in parse_client_command("VNRST", strict).why
@@ -150,7 +152,7 @@ def test_policies():
         "VNWRG,06,0,1", "VNWRG,75,1,20,01,0721", "VNWRG,75,3,40,29,7FFF,0210,000C",
     ],
 )  # fmt: skip
-def test_what_real_drivers_set_at_their_start_goes_out(body):
+def test_start_up_settings_of_real_drivers_are_sent(body):
     answer = parse_client_command(body, OWNER)
     assert isinstance(answer, ClientCommand), answer
     assert answer.kind is Kind.WRITE

@@ -1,4 +1,4 @@
-"""Two clients at random moments of a write-back; the long form is clients.py."""
+"""Two clients at random moments of a write; the long form is clients.py."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_nothing_that_must_not_be(seed):
+def test_random_clients_break_no_rule(seed):
     history = played(seed)
     assert history.wrong == {}, history.run.notes[-10:]
     assert history.asked > 200
@@ -26,15 +26,17 @@ def test_nothing_that_must_not_be(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_nothing_that_must_not_be_where_the_owner_may_write_what_calibrates(seed):
+def test_random_clients_break_no_rule_when_the_owner_may_calibrate(seed):
     history = ClientHistory(seed, passes=True)
     history.play()
     assert history.wrong == {}, history.run.notes[-10:]
     assert history.let_through > 0
 
 
-def test_a_rollback_over_what_the_owner_wrote_would_be_seen(monkeypatch):
-    """The owner may write in the middle of a trial, and then that is undone, over it."""
+def test_check_detects_a_rollback_over_owner_values(monkeypatch):
+    """The owner may write in the middle of a trial, which is then undone and overwrites the
+    owner's values.
+    """
     undo = flow.roll_back
 
     def end_the_trial(self):
@@ -44,16 +46,16 @@ def test_a_rollback_over_what_the_owner_wrote_would_be_seen(monkeypatch):
     monkeypatch.setattr(WriteBack, "client_write_refusal", lambda self, number: "")
     monkeypatch.setattr(flow.Flow, "on_client_wrote", end_the_trial)
     monkeypatch.setattr(flow, "roll_back", lambda what, **_: undo(what, only_ours=False))
-    hits = (9, 15, 16)  # of the first two dozen: such a write must fall into a trial
+    hits = (9, 15, 16)  # from the first two dozen: such a write must occur in a trial
     assert any(played(seed, passes=True).wrong["overwritten"] > 0 for seed in hits)
 
 
-def test_a_save_in_the_middle_of_a_trial_would_be_seen(monkeypatch):
+def test_check_detects_a_save_in_a_trial(monkeypatch):
     monkeypatch.setattr(WriteBack, "client_save_refusal", "")
     assert any(played(seed).wrong["flash"] > 0 for seed in range(4))
 
 
-def test_a_client_that_may_write_what_calibrates_would_be_seen(monkeypatch):
+def test_check_detects_a_client_calibration_write(monkeypatch):
     monkeypatch.setattr(arbiter, "GUARDED", ())
     monkeypatch.setitem(WRITES, Purpose.CLIENT, (23, 25, 84))
     assert played(0).wrong["calibration"] > 0
@@ -67,7 +69,7 @@ class Crossed(Arbiter):
         return [replace(answer, client=other[answer.client]) for answer in super().take_answers()]
 
 
-def test_an_answer_to_the_wrong_client_would_be_seen():
+def test_check_detects_an_answer_to_the_wrong_client():
     history = ClientHistory(0)
     history.run.core.clients.arbiter = Crossed(SHARES)
     history.play()

@@ -1,4 +1,4 @@
-"""Whole messages for clients: every byte once, in order, replies kept back, however it is cut."""
+"""Whole messages for clients: every byte once, in order, without replies, for any chunks."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def out(splitter: MessageSplitter, chunk: bytes) -> list[bytes]:
     return [*([ahead] if ahead else []), *splitter.feed(chunk)]
 
 
-def test_the_next_message_comes_out_ahead_and_once():
+def test_completed_message_is_forwarded_early_and_once():
     splitter, one = MessageSplitter(), packet(bytes(range(8)))
-    assert splitter.completed_message(TEXT) == b""  # nothing is known of the line yet
+    assert splitter.completed_message(TEXT) == b""  # not synchronised yet
     assert splitter.feed(TEXT) == [TEXT]
     for message in (TEXT, one):
         splitter.feed(message)
@@ -46,7 +46,7 @@ def test_the_next_message_comes_out_ahead_and_once():
 
 
 @pytest.mark.parametrize("body", REPLIES)
-def test_a_reply_never_comes_out_ahead(body):
+def test_reply_is_never_forwarded_early(body):
     splitter = MessageSplitter()
     splitter.feed(TEXT)
     assert out(splitter, sentence(body)) == []
@@ -54,7 +54,7 @@ def test_a_reply_never_comes_out_ahead(body):
     assert splitter.replies == 1
 
 
-def test_a_message_comes_out_with_its_last_byte_and_not_before():
+def test_message_is_forwarded_with_its_last_byte():
     splitter = MessageSplitter()
     assert splitter.feed(TEXT[:-1]) == []
     assert splitter.feed(TEXT[-1:]) == [TEXT]
@@ -64,7 +64,7 @@ def test_a_message_comes_out_with_its_last_byte_and_not_before():
 
 
 @pytest.mark.parametrize("body", REPLIES)
-def test_a_reply_between_messages_is_kept_back(body):
+def test_reply_between_messages_is_withheld(body):
     splitter = MessageSplitter()
     assert splitter.feed(TEXT + sentence(body) + TEXT) == [TEXT, TEXT]
     assert splitter.replies == 1
@@ -72,14 +72,14 @@ def test_a_reply_between_messages_is_kept_back(body):
     assert not is_reply("VNYMR,1")
 
 
-def test_a_damaged_reply_is_no_reply():
+def test_damaged_reply_is_forwarded_as_bytes():
     bad = b"$VNRRG,01,VN-100*00\r\n"
     splitter = MessageSplitter()
     assert b"".join(splitter.feed(TEXT + bad + TEXT) + splitter.flush()) == TEXT + bad + TEXT
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_every_byte_but_the_replies_comes_out_once_and_in_order(seed):
+def test_every_byte_except_replies_is_forwarded_once_in_order(seed):
     rng = np.random.default_rng(seed)
     stream, wanted = b"", b""
     for _ in range(80):
@@ -88,7 +88,7 @@ def test_every_byte_but_the_replies_comes_out_once_and_in_order(seed):
             stream += sentence(REPLIES[rng.integers(0, len(REPLIES))])
             continue
         noise = rng.integers(0, 256, size=rng.integers(0, 20), dtype=np.uint8).tobytes()
-        # a byte that begins a message may swallow what follows, as on a real line
+        # a byte that starts a message may absorb the next ones, as on a real line
         harmless = noise.replace(b"\xfa", b"").replace(b"$", b"")
         piece = [TEXT, TEXT, packet(rng.bytes(8)), harmless][kind - 1]
         stream, wanted = stream + piece, wanted + piece
@@ -98,7 +98,7 @@ def test_every_byte_but_the_replies_comes_out_once_and_in_order(seed):
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_how_the_bytes_are_cut_changes_nothing(seed):
+def test_messages_do_not_depend_on_the_chunks(seed):
     rng = np.random.default_rng(seed)
     stream = rng.integers(0, 256, size=3000, dtype=np.uint8).tobytes() + TEXT * 3 + rng.bytes(500)
     outs = []

@@ -1,4 +1,4 @@
-"""Sentences of NMEA 0183, whole lines; checksums as published or by an arithmetic of the test."""
+"""NMEA 0183 sentences, whole lines; checksums as published or computed in the test."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ def checked(line: bytes) -> str:
     return body.decode()
 
 
-def test_the_heading_of_the_published_example():
+def test_heading_sentence_equals_the_published_example():
     assert hdm(93.8) == b"$HCHDM,093.8,M*2B\r\n"  # of gpsd's list of sentences
 
 
-def test_a_heading_that_is_not_known_is_an_empty_field():
+def test_unknown_heading_is_an_empty_field():
     assert hdm(None) == b"$HCHDM,,M*07\r\n"
 
 
@@ -31,7 +31,7 @@ def test_a_heading_that_is_not_known_is_an_empty_field():
     [(0.0, "000.0"), (359.94, "359.9"), (359.96, "000.0"), (359.99, "000.0"), (360.0, "000.0"),
      (-0.01, "000.0"), (-90.0, "270.0"), (7.26, "007.3"), (725.0, "005.0")],
 )  # fmt: skip
-def test_a_heading_is_three_digits_and_one_and_never_360(heading_deg, printed):
+def test_heading_format_is_ddd_d_and_never_360(heading_deg, printed):
     assert checked(hdm(heading_deg)) == f"HCHDM,{printed},M"
 
 
@@ -41,17 +41,17 @@ def test_pitch_roll_and_temperature():
     assert checked(line) == "YXXDR,A,1.4,D,PITCH,A,-0.3,D,ROLL,C,24.6,C,TEMP"
 
 
-def test_what_is_not_known_is_empty_and_a_sensor_that_is_not_there_is_left_out():
+def test_unknown_values_are_empty_and_missing_sensors_left_out():
     assert checked(xdr(attitude_transducers(None, None, None))) == "YXXDR,A,,D,PITCH,A,,D,ROLL"
     assert checked(xdr(attitude_transducers(-0.04, 179.96, -40.0))) == (
         "YXXDR,A,0.0,D,PITCH,A,180.0,D,ROLL,C,-40.0,C,TEMP"
     )
 
 
-def test_the_longest_line_of_ours_fits():
+def test_longest_line_fits():
     assert len(xdr(attitude_transducers(-90.0, -180.0, -100.0))) <= 82
 
 
-def test_the_published_example_of_other_transducers():
+def test_transducer_sentence_equals_the_published_example():
     fields = [Transducer("C", 23.15, "C", "WTHI")]
     assert checked(xdr(fields)) == "YXXDR,C,23.1,C,WTHI"

@@ -1,7 +1,7 @@
-"""A client saves or resets in the middle of a trial: undone, saved, written again. Judged by the
-units.
+"""A client saves or resets in the middle of a trial: values undone, saved, and written again.
 
-`cabled_units` shares no code with the project; what is asserted is what a unit holds and was sent.
+Judged by the units. `cabled_units` shares no code with the project; asserted is what a unit holds
+and was sent.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def held(saved: dict[int, str]) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize("binary", [True, pytest.param(False, marks=SLOW)])
-def test_the_trial_goes_on_behind_the_save(binary):
+def test_trial_restarts_after_a_client_save(binary):
     run = on_trial(binary=binary)
     unit = run.cable.unit
     run.run(10.0)
@@ -72,11 +72,11 @@ def test_the_trial_goes_on_behind_the_save(binary):
     assert [held(one) for one in unit.saves][:1] == [ONE]
 
 
-def test_what_was_proven_is_on_trial_again():
+def test_proven_values_are_on_trial_again():
     run = on_trial()
     run.run(1.0)
     assert run.until(lambda: "PROVEN" in run.states), run.notes
-    run.safe = False  # nothing is saved meanwhile
+    run.safe = False  # nothing is saved in between
     run.run(1.0)
     run.safe = True
     save(run)
@@ -85,7 +85,7 @@ def test_what_was_proven_is_on_trial_again():
     assert run.cable.unit.held("flash") == ONE
 
 
-def test_a_second_save_sets_it_aside_again_until_the_days_writes_are_used_up():
+def test_repeated_saves_set_the_trial_aside_within_the_daily_budget():
     run = on_trial()
     for _ in range(5):
         run.run(3.0)
@@ -101,7 +101,7 @@ def test_a_second_save_sets_it_aside_again_until_the_days_writes_are_used_up():
 
 
 @pytest.mark.parametrize("what", ["unsafe", "unheard", "disarm", "gone", "killed link", "stop"])
-def test_where_a_write_would_not_begin_the_trial_is_over(what):
+def test_trial_ends_when_a_write_would_not_be_permitted(what):
     run = on_trial()
     save(run)
     if what == "unsafe":
@@ -126,7 +126,7 @@ def test_where_a_write_would_not_begin_the_trial_is_over(what):
     assert run.cable.units[FIRST].held("flash") == ONE
 
 
-def test_an_operator_who_wants_it_back_has_it_back_for_good():
+def test_rollback_by_an_operator_ends_the_trial():
     run = on_trial()
     save(run)
     assert run.state == "SET_ASIDE"
@@ -138,7 +138,7 @@ def test_an_operator_who_wants_it_back_has_it_back_for_good():
     assert "PREPARING" not in run.states[run.states.index("SET_ASIDE") :]
 
 
-def test_a_rollback_by_hand_while_it_is_being_undone_counts_too():
+def test_rollback_by_an_operator_during_the_undo_counts():
     run = on_trial()
     run.say("owner", "VNWNV")
     assert run.until("ROLLING_BACK", 2.0)
@@ -149,7 +149,7 @@ def test_a_rollback_by_hand_while_it_is_being_undone_counts_too():
     assert run.cable.unit.held() == ONE
 
 
-def test_a_lock_in_between_stays():
+def test_lock_while_set_aside_stays():
     run = on_trial()
     save(run)
     run.feed(inputs.Operator(run.now_ns, "lock", "because"))
@@ -171,7 +171,7 @@ def reset(run: CabledRun) -> None:
         for binary in (True, False)
     ],
 )
-def test_a_reset_in_a_trial_alone_or_behind_a_save_and_the_trial_goes_on(binary, saved_s):
+def test_trial_restarts_after_a_client_reset(binary, saved_s):
     """As ntnu's driver saves and resets at every start; another one may only reset."""
     run = on_trial(binary=binary)
     unit = run.cable.unit
@@ -195,7 +195,7 @@ def test_a_reset_in_a_trial_alone_or_behind_a_save_and_the_trial_goes_on(binary,
     assert not binary or run.until("CONFIRMED", 20.0), run.notes  # a text stream tells no time
 
 
-def test_behind_a_reset_nothing_is_written_before_the_device_was_read_and_judged_again():
+def test_device_is_read_and_judged_again_before_a_write_after_a_reset():
     run = on_trial()
     save(run)
     since = len(run.cable.unit.log)
@@ -211,7 +211,7 @@ def test_behind_a_reset_nothing_is_written_before_the_device_was_read_and_judged
 
 
 @pytest.mark.parametrize("starts", [10, pytest.param(100, marks=SLOW)])
-def test_a_driver_that_saves_and_resets_at_each_of_its_starts_in_trials(starts):
+def test_driver_that_saves_and_resets_often_keeps_the_old_values(starts):
     """Six writes a day; then the old values stay, whatever the driver does."""
     run = on_trial(rollbacks_to_lock=10**6)
     unit = run.cable.unit
@@ -242,7 +242,7 @@ def test_a_driver_that_saves_and_resets_at_each_of_its_starts_in_trials(starts):
 @pytest.mark.parametrize(
     "after_s", [pytest.param(0.05, marks=SLOW), 0.4, pytest.param(1.2, marks=SLOW)]
 )
-def test_what_ends_a_trial_that_a_reset_set_aside(what, after_s):
+def test_events_that_end_a_trial_set_aside_by_a_reset(what, after_s):
     run = on_trial()
     unit = run.cable.unit
     save(run)
@@ -286,7 +286,7 @@ def test_what_ends_a_trial_that_a_reset_set_aside(what, after_s):
         pytest.param(False, b"", marks=SLOW),
     ],
 )
-def test_a_reset_that_the_device_refuses_or_does_not_answer_ends_the_trial(saved, answer):
+def test_refused_or_unanswered_reset_ends_the_trial(saved, answer):
     run = on_trial()
     unit, usual = run.cable.unit, run.cable.unit.answer
     unit.answer = lambda line: answer if line.startswith(b"$VNRST") else usual(line)
@@ -299,7 +299,7 @@ def test_a_reset_that_the_device_refuses_or_does_not_answer_ends_the_trial(saved
     assert "CLIENT_RESET" not in run.kinds()
 
 
-def test_a_device_that_does_not_come_back_from_its_reset_has_thirty_seconds():
+def test_trial_ends_when_the_device_is_absent_for_thirty_seconds():
     run = on_trial()
     save(run)
     reset(run)
@@ -309,7 +309,7 @@ def test_a_device_that_does_not_come_back_from_its_reset_has_thirty_seconds():
     assert run.kinds().count("PREPARED") == 1
 
 
-def test_a_driver_in_a_loop_of_resets_keeps_nothing_set_aside_for_ever():
+def test_reset_loop_ends_the_trial():
     run = on_trial()
     save(run)
     for _ in range(20):
@@ -329,7 +329,7 @@ def test_a_driver_in_a_loop_of_resets_keeps_nothing_set_aside_for_ever():
         for at in range(1 + k, 75, 5)
     ],
 )
-def test_anything_at_any_command_behind_a_save_and_a_reset(what, at):
+def test_no_unproven_value_is_saved_for_events_after_a_save_and_reset(what, at):
     """Never a write of other than the journaled values, and nothing unproven in any flash."""
     run, heard, done = on_trial(), [], []
     unit = run.cable.unit
@@ -363,7 +363,7 @@ def test_anything_at_any_command_behind_a_save_and_a_reset(what, at):
         assert unit.ram[23] in (theirs, ONE[0])
 
 
-def test_another_program_that_writes_in_between_is_not_written_over():
+def test_foreign_value_written_while_set_aside_is_not_overwritten():
     run = on_trial()
     theirs = "1.02,0,0,0,1.01,0,0,0,1,0.11,0.01,0.02"
     save(run)
@@ -374,8 +374,10 @@ def test_another_program_that_writes_in_between_is_not_written_over():
 
 
 @pytest.mark.parametrize("asked", [False, True])
-def test_a_unit_that_comes_back_with_values_on_trial_is_not_saved_for_a_client(asked):
-    """It kept its power while another one had the cable, and nobody has asked who is there now."""
+def test_returning_unit_with_trial_values_is_not_saved_for_a_client(asked):
+    """It kept its power while another unit had the cable, and its identity has not been read
+    again.
+    """
     run = on_trial()
     first, spare = run.cable.units[FIRST], run.cable.units[SPARE]
     run.cable.unit = spare
@@ -392,7 +394,7 @@ def test_a_unit_that_comes_back_with_values_on_trial_is_not_saved_for_a_client(a
     assert spare.saves == []
 
 
-def test_a_save_that_the_device_refuses_ends_the_trial():
+def test_refused_save_ends_the_trial():
     run = on_trial()
     unit, answer = run.cable.unit, run.cable.unit.answer
 
@@ -410,7 +412,7 @@ def test_a_save_that_the_device_refuses_ends_the_trial():
     assert run.states.count("PREPARING") == 1
 
 
-def test_a_client_that_is_gone_before_its_save_leaves_the_old_values():
+def test_client_that_left_before_its_save_leaves_the_old_values():
     run = on_trial()
     run.say("owner", "VNWNV")
     assert run.until("ROLLING_BACK", 2.0)
@@ -420,8 +422,8 @@ def test_a_client_that_is_gone_before_its_save_leaves_the_old_values():
     assert run.states.count("PREPARING") == 1
 
 
-def test_what_speaks_against_the_values_is_not_forgotten_by_a_save():
-    """A trial that a figure speaks against when the client comes is over."""
+def test_save_does_not_clear_evidence_against_the_values():
+    """A trial with a bad figure is over when the client saves."""
     run, heard = on_trial(), []
     moved = IRON + np.array([0.03, 0.0, 0.0])
     run.core.calibrator = PlantedCalibrator(
@@ -436,7 +438,7 @@ def test_what_speaks_against_the_values_is_not_forgotten_by_a_save():
     assert "SET_ASIDE" not in run.states
 
 
-def test_registers_that_the_owner_saved_are_the_users_in_the_second_write():
+def test_registers_saved_by_the_owner_are_kept_in_the_second_write():
     run = on_trial()
     run.say("owner", "VNWRG,07,40")
     run.run(1.0)
@@ -456,7 +458,7 @@ def opened_again(run: CabledRun) -> None:
     run.run(5.0)
 
 
-def test_where_the_journal_was_lost_in_a_trial_nothing_is_saved_before_a_restart():
+def test_nothing_is_saved_before_a_restart_when_the_journal_was_lost():
     cable = on_trial().cable  # and killed there
     run = CabledRun(cable, shares=SHARES, planted=False, journal_error="it is gone")
     run.say("owner", "VNWNV")
@@ -471,8 +473,8 @@ def test_where_the_journal_was_lost_in_a_trial_nothing_is_saved_before_a_restart
     assert run.cable.unit.held("flash") == ONE
 
 
-def test_values_of_a_trial_that_come_back_by_themselves_are_not_saved_for_a_client():
-    """A device that told of the old values and still holds a new one, as it shows later."""
+def test_reappearing_trial_values_are_not_saved_for_a_client():
+    """The device reported the old values but still holds a new one, as a later read shows."""
     run = on_trial()
     unit = run.cable.unit
     run.feed(inputs.Operator(run.now_ns, "rollback", ""))
@@ -490,7 +492,7 @@ def test_values_of_a_trial_that_come_back_by_themselves_are_not_saved_for_a_clie
     assert unit.held("flash") == ONE
 
 
-def test_what_was_proven_and_saved_may_be_saved_for_a_client_again():
+def test_committed_values_may_be_saved_for_a_client():
     run = on_trial()
     assert run.until("PROVEN"), run.notes
     run.park(30.0)
@@ -500,7 +502,7 @@ def test_what_was_proven_and_saved_may_be_saved_for_a_client_again():
     assert [held(one) for one in run.cable.unit.saves] == [NEW, NEW]
 
 
-def test_a_replay_takes_the_same_decisions():
+def test_replay_decides_the_same():
     run = on_trial()
     save(run)
     assert run.until("TRIAL", 10.0), run.notes

@@ -1,4 +1,4 @@
-"""Clients beside the daemon, on units that share no code with it: what they get, what they cannot.
+"""Clients of the daemon, on units that share no code with it: what they receive and cannot do.
 
 Judged by what the units hold and were sent (`cabled_units`), and by the answers.
 """
@@ -25,7 +25,7 @@ from ahrsd.writeback.states import Mode
 OWNER, LOG = SharePolicy("owner", owner=True), SharePolicy("log")
 ONE = ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2
 NEW = ("1,0,0,0,1,0,0,0,1,0.05,-0.03,0.04", "1,0,0,0,1,0,0,0,1,0.01,-0.02,0.005")
-#: what the test's units know of the registers that drivers set
+#: values in the test's units of the registers that drivers set
 KNOWN = {0: "", 32: "3,0,0,0,0,0,0,100000000,0"}
 
 
@@ -38,7 +38,7 @@ def shared(**options) -> CabledRun:
 
 
 def start(run: CabledRun, lines: tuple[str, ...], client: str = "owner") -> list[str]:
-    """A driver's start, each line behind the answer to the one before."""
+    """The start of a driver: each line is sent after the answer to the previous one."""
     answers = []
     for line in lines:
         run.say(client, line)
@@ -48,7 +48,7 @@ def start(run: CabledRun, lines: tuple[str, ...], client: str = "owner") -> list
 
 
 @pytest.mark.parametrize("lines", [ROS2_DAWONN, SDK, ARDUPILOT], ids=["dawonn", "sdk", "ardupilot"])
-def test_every_question_of_a_drivers_start_is_answered_right(lines):
+def test_every_command_of_a_driver_start_is_answered_correctly(lines):
     run = shared(planted=False, mode=Mode.OBSERVE)
     answers = start(run, lines)
     unit = run.cable.unit
@@ -78,16 +78,16 @@ def test_two_drivers_at_once_get_their_own_answers():
     assert not any("ERR" in answer for answer in answers)
 
 
-def test_the_daemons_own_questions_go_on_beside_a_client_that_asks_all_the_time():
+def test_checks_of_the_daemon_continue_with_a_busy_client():
     run = shared(planted=False, mode=Mode.OBSERVE)
     for k in range(400):
         run.say("log", f"VNRRG,{(30, 75, 85)[k % 3]}")
         run.run(0.1)
-    assert run.cable.unit.log.count("VNRRG,84") >= 2  # the look, every ten seconds
+    assert run.cable.unit.log.count("VNRRG,84") >= 2  # the check, every ten seconds
     assert set(run.answers("log")) == {f"VNRRG,{n},{run.cable.unit.ram[n]}" for n in (30, 75, 85)}
 
 
-def test_settings_of_the_owner_are_not_saved_with_a_calibration_and_live_on_behind_it():
+def test_owner_settings_are_not_saved_with_a_calibration_and_are_restored():
     # each command takes a whole step of this cable, fifty times what it takes on a wire
     run = shared(still=StillPolicy(gyro_rad_s=0.02, max_age_s=20.0))
     unit = run.cable.unit
@@ -104,7 +104,7 @@ def test_settings_of_the_owner_are_not_saved_with_a_calibration_and_live_on_behi
     assert (unit.ram[7], unit.ram[85]) == ("40", "0,8,8,8,8,0,3,3,3,0")
 
 
-def test_what_the_owner_saves_itself_is_the_users_from_then_on():
+def test_settings_saved_by_the_owner_become_those_of_the_user():
     run = shared()
     unit = run.cable.unit
     assert start(run, ("VNWRG,07,40", "VNWNV")) == ["VNWRG,07,40", "VNWNV"]
@@ -118,7 +118,7 @@ def test_what_the_owner_saves_itself_is_the_users_from_then_on():
 
 
 @pytest.mark.parametrize("state", ["TRIAL", "PROVEN"])
-def test_a_save_of_the_owner_saves_nothing_unproven(state):
+def test_owner_save_contains_no_unproven_values(state):
     """A driver that saves at every start, in the middle of a trial."""
     run = shared()
     unit = run.cable.unit
@@ -135,7 +135,7 @@ def test_a_save_of_the_owner_saves_nothing_unproven(state):
     assert run.kinds()[-3:] == ["ROLLBACK", "ROLLED_BACK", "CLIENT_SAVED"]
 
 
-def test_nothing_is_saved_for_the_owner_while_the_device_holds_what_nobody_knows():
+def test_owner_save_is_refused_while_the_device_holds_unproven_values():
     """Somebody wrote one register in a trial: the other still holds a value that is not proven."""
     run = shared()
     unit = run.cable.unit
@@ -149,7 +149,7 @@ def test_nothing_is_saved_for_the_owner_while_the_device_holds_what_nobody_knows
 
 
 @pytest.mark.parametrize("times", [30, pytest.param(100, marks=pytest.mark.slow)])
-def test_a_driver_that_saves_and_resets_often_leaves_the_registers_as_they_were(times):
+def test_driver_that_saves_and_resets_often_leaves_the_registers_unchanged(times):
     run = shared(planted=False, mode=Mode.OBSERVE)
     unit = run.cable.unit
     before = dict(unit.flash)
@@ -172,7 +172,7 @@ def test_a_driver_that_saves_and_resets_often_leaves_the_registers_as_they_were(
     "at",
     [pytest.param(at, marks=[] if at % 4 == 3 else pytest.mark.slow) for at in range(1, 60, 3)],
 )
-def test_a_save_of_the_owner_at_any_command_of_a_write_saves_nothing_unproven(at):
+def test_owner_save_at_any_command_of_a_write_contains_no_unproven_values(at):
     run, heard = shared(), []
     unit = run.cable.unit
 
@@ -200,8 +200,8 @@ def test_a_save_of_the_owner_at_any_command_of_a_write_saves_nothing_unproven(at
 
 @pytest.mark.parametrize("mode", [Mode.PASSIVE, Mode.OBSERVE, Mode.COMMIT])
 @pytest.mark.parametrize("client", ["owner", "log"])
-def test_a_register_scan_of_the_vendors_sdk_keeps_every_register_and_changes_none(mode, client):
-    """It reads each register and writes it back: what may be written is the configuration."""
+def test_register_scan_of_the_vendor_sdk_changes_nothing(mode, client):
+    """It reads each register and writes it back; the configuration decides what may be written."""
     run = shared(planted=False, mode=mode)
     kept = {}
     for number in (23, 25, 26, 30, 44, 75, 84, 85):
@@ -216,7 +216,7 @@ def test_a_register_scan_of_the_vendors_sdk_keeps_every_register_and_changes_non
         assert run.cable.unit.writes == []
 
 
-def test_a_write_of_something_else_behind_it_is_refused_and_told_once_more():
+def test_write_of_another_value_is_refused_and_reported():
     run = shared(planted=False)
     assert start(run, (f"VNWRG,23,{ONE[0]}", f"VNWRG,23,{NEW[0]}")) == [
         f"VNWRG,23,{ONE[0]}", "VNERR,09",
@@ -225,7 +225,7 @@ def test_a_write_of_something_else_behind_it_is_refused_and_told_once_more():
     assert run.cable.unit.held() == ONE
 
 
-def test_a_write_is_compared_with_what_the_device_holds_at_that_moment():
+def test_client_write_is_compared_with_the_present_register():
     """During a trial the register holds the new values, and the old ones would undo it."""
     run = shared()
     run.approve()
@@ -237,7 +237,7 @@ def test_a_write_is_compared_with_what_the_device_holds_at_that_moment():
 
 
 @pytest.mark.parametrize("mode", [Mode.PASSIVE, Mode.OBSERVE])
-def test_no_client_changes_what_calibrates(mode):
+def test_no_client_changes_calibration_registers(mode):
     run = shared(planted=False, mode=mode)
     values = "2,0,0,0,1,0,0,0,1,0.1,0.1,0.1"
     for client in ("owner", "log"):
@@ -251,7 +251,7 @@ def test_no_client_changes_what_calibrates(mode):
     assert not any(line.startswith(("VNWRG", "VNT", "VNS", "VNRFS")) for line in run.cable.unit.log)
 
 
-def test_in_passive_only_what_clients_ask_goes_out():
+def test_only_client_commands_are_sent_in_passive():
     run = shared(planted=False, mode=Mode.PASSIVE)
     run.run(30.0)
     assert run.cable.unit.log == []
@@ -261,7 +261,7 @@ def test_in_passive_only_what_clients_ask_goes_out():
     assert run.cable.unit.log == ["VNRRG,01", "VNRRG,23"]
 
 
-def test_a_reset_of_the_owner_in_a_trial_is_known_of():
+def test_owner_reset_in_a_trial_is_noticed():
     run = shared()
     run.approve()
     assert run.until("TRIAL", 30.0)
@@ -271,7 +271,7 @@ def test_a_reset_of_the_owner_in_a_trial_is_known_of():
     assert run.kinds()[-3:] == ["ROLLBACK", "ROLLED_BACK", "CLIENT_RESET"]
 
 
-def test_a_link_that_goes_with_a_question_on_the_wire_leaves_nothing_stuck():
+def test_lost_link_with_a_pending_command_blocks_nothing():
     run = shared(planted=False, mode=Mode.OBSERVE)
     run.cable.unit.before = lambda _: setattr(run.cable, "_silent_s", 0.3)
     run.say("log", "VNRRG,30")
@@ -283,7 +283,7 @@ def test_a_link_that_goes_with_a_question_on_the_wire_leaves_nothing_stuck():
     assert start(run, ("VNRRG,30",), "log") == [f"VNRRG,30,{run.cable.unit.ram[30]}"]
 
 
-def test_a_replay_takes_the_same_decisions():
+def test_replay_decides_the_same():
     run = shared()
     start(run, ROS2_DAWONN)
     run.approve()

@@ -1,4 +1,6 @@
-"""Up, from the device's attitude and from the specific force, where the attitude is known."""
+"""The vertical from the device's attitude and from the specific force, where the attitude is
+known.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,7 @@ def off_deg(up, true):
     return np.degrees(np.arccos(np.clip(np.sum(up * true, axis=1), -1.0, 1.0)))
 
 
-def test_the_devices_own_attitude_is_taken_as_it_is():
+def test_device_attitude_is_used_directly():
     yaw, pitch, roll = np.radians([[10.0, 200.0], [12.0, -80.0], [-25.0, 170.0]])
     nothing = np.full((2, 3), np.nan)
     up = Tilt().up(np.zeros(2), nothing, nothing, (pitch, roll))
@@ -42,7 +44,7 @@ def test_the_devices_own_attitude_is_taken_as_it_is():
     assert has_heading(up).tolist() == [True, False]  # the x axis points down
 
 
-def test_a_vehicle_that_turns_rolls_and_pitches_is_followed():
+def test_vertical_is_followed_in_turns_roll_and_pitch():
     t, rate, force, true = motion(30.0)
     up = Tilt().up(t, rate, force)
     settled = t >= SETTLED_S + 1.0 / RATE_HZ
@@ -50,14 +52,14 @@ def test_a_vehicle_that_turns_rolls_and_pitches_is_followed():
     assert off_deg(up[settled], true[settled]).max() < 0.3
 
 
-def test_how_the_samples_are_cut_changes_nothing():
+def test_vertical_does_not_depend_on_the_block_size():
     t, rate, force, _ = motion(10.0)
     whole, tilt = Tilt().up(t, rate, force), Tilt()
     parts = [tilt.up(t[k : k + 7], rate[k : k + 7], force[k : k + 7]) for k in range(0, len(t), 7)]
     assert np.array_equal(np.concatenate(parts), whole, equal_nan=True)
 
 
-def test_braking_for_a_second_moves_it_by_less_than_a_plumb_line():
+def test_braking_disturbs_the_vertical_less_than_the_accelerometer():
     t, rate, force, true = motion(20.0)
     _, _, braking, _ = motion(20.0, accel_n=(-2.0, 0.0, 0.0))
     now = (t >= 12.0) & (t < 13.0)
@@ -68,7 +70,7 @@ def test_braking_for_a_second_moves_it_by_less_than_a_plumb_line():
     assert off_deg(up, true)[t > 12.0].max() < 2.5
 
 
-def test_without_gravity_for_long_nobody_knows_and_after_a_gap_it_settles_again():
+def test_vertical_is_unknown_after_long_disturbance_and_settles_again_after_a_gap():
     t, rate, force, _ = motion(40.0)
     force[(t > 10.0)] *= 1.5  # shaken: never 1 g
     up = Tilt().up(t, rate, force)
@@ -83,7 +85,7 @@ def test_without_gravity_for_long_nobody_knows_and_after_a_gap_it_settles_again(
 
 
 @pytest.mark.parametrize("force", [np.nan, 0.0])
-def test_a_stream_without_a_specific_force_has_no_up(force):
+def test_no_vertical_without_specific_force(force):
     t, rate, _, _ = motion(10.0)
     up = Tilt().up(t, rate, np.full((len(t), 3), force))
     assert np.isnan(up).all()

@@ -82,7 +82,7 @@ def test_disturbances_reach_the_file(run, tmp_path):
         (("swim", "-o", "x.csv"), "'swim' is not one of"),
     ],
 )
-def test_bad_use_is_one_line(run, tmp_path, monkeypatch, capsys, arguments, said):
+def test_bad_use_is_refused_in_one_line(run, tmp_path, monkeypatch, capsys, arguments, said):
     monkeypatch.chdir(tmp_path)
     assert run("simulate", *arguments) == 2
     assert said in capsys.readouterr().err

@@ -17,7 +17,7 @@ def field_difference(**wanted):
     return made(**wanted).samples.raw_b_gauss - made().samples.raw_b_gauss
 
 
-def test_outliers_are_as_many_and_as_large_as_asked():
+def test_outliers_have_the_requested_number_and_size():
     size = np.linalg.norm(field_difference(outlier_fraction=0.1, outlier_gauss=0.2), axis=1)
     assert 60 < np.count_nonzero(size > 1e-9) < 140
     assert size[size > 1e-9] == pytest.approx(0.2)
@@ -31,7 +31,7 @@ def test_a_magnet_passes_and_leaves_nothing():
     assert size[452:].max() < 1e-12
 
 
-def test_a_step_stays_and_the_truth_is_what_holds_afterwards():
+def test_step_stays_and_the_truth_is_that_after_it():
     step = field_difference(step_at_s=20.0, step_gauss=0.03)
     assert np.abs(step[:500]).max() < 1e-12
     assert np.linalg.norm(step[500:], axis=1) == pytest.approx(0.03)
@@ -61,6 +61,6 @@ def test_the_first_samples_are_the_beginning():
     assert np.array_equal(part.field_b, whole.field_b[:300])
 
 
-def test_a_fraction_that_is_none_is_refused():
+def test_invalid_fraction_is_refused():
     with pytest.raises(ValueError, match=r"outlier_fraction is 1\.5"):
         Disturbances(outlier_fraction=1.5)

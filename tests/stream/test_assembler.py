@@ -1,4 +1,4 @@
-"""Messages to raw samples: clock, gaps, registers, damage, and which message is the stream."""
+"""Messages to raw samples: clock, gaps, registers, damage, and which message is used."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def known() -> RegisterEpochs:
 
 
 class TestTime:
-    def test_device_time_is_the_time(self):
+    def test_samples_have_the_device_time(self):
         stream = Stream(RegisterEpochs())
         blocks = feed(stream, BINARY, range(40)) + stream.flush()
         assert joined(blocks, "time_s") == pytest.approx(np.arange(40) / 40.0)
@@ -77,7 +77,7 @@ class TestTime:
         assert stream.health().drop_rate == pytest.approx(40 / 80)
         assert stream.facts.duration_s == pytest.approx(79 / 40)
 
-    def test_the_loss_that_we_caused_is_forgiven_once(self):
+    def test_loss_caused_by_the_program_is_excused_once(self):
         stream = Stream(RegisterEpochs())
         feed(stream, BINARY, range(20))
         stream.forgive()
@@ -88,7 +88,7 @@ class TestTime:
         stream.flush()
         assert stream.health().drop_rate == pytest.approx(40 / 100)
 
-    def test_a_restart_begins_anew_and_never_goes_back(self):
+    def test_restart_starts_a_new_run_and_time_never_decreases(self):
         stream = Stream(RegisterEpochs())
         blocks = feed(stream, BINARY, range(400, 420)) + feed(stream, BINARY, range(20))
         blocks += stream.flush()
@@ -107,14 +107,14 @@ class TestTime:
 
 
 class TestWithoutTime:
-    def test_the_rate_that_is_said(self):
+    def test_given_rate_is_used(self):
         stream = Stream(RegisterEpochs(), 50.0)
         blocks = feed(stream, VNYMR, range(100)) + stream.flush()
         assert joined(blocks, "time_s") == pytest.approx(np.arange(100) / 50.0)
         assert stream.facts.rate_source == "as given"
         assert "50 Hz (as given)" in next(w for w in stream.warnings if "no time" in w)
 
-    def test_the_factorys_rate_is_assumed_and_said(self):
+    def test_factory_rate_is_assumed_with_a_warning(self):
         stream = Stream(RegisterEpochs())
         feed(stream, VNYMR, range(20))
         assert stream.facts.rate_hz == 40.0
@@ -126,7 +126,7 @@ class TestWithoutTime:
         feed(stream, VNYMR, range(20), host=True)
         assert (stream.facts.rate_hz, stream.facts.rate_source) == (20.0, "register 7")
 
-    def test_arrival_times_say_it_live(self):
+    def test_rate_is_found_from_arrival_times_live(self):
         stream = Stream(known())
         blocks = feed(stream, VNYMR, range(99), host=True)
         assert blocks == []
@@ -135,7 +135,7 @@ class TestWithoutTime:
         assert stream.facts.rate_source == "arrival times"
         assert len(joined(blocks, "time_s")) >= 110
 
-    def test_a_damaged_message_is_one_step_that_is_not_bridged(self):
+    def test_damaged_message_is_a_gap_of_one_step(self):
         stream = Stream(RegisterEpochs(), 40.0)
         blocks = feed(stream, VNYMR, range(20))
         stream.damaged(Skipped(0, bytes(100), Cause.CHECKSUM))
@@ -145,7 +145,7 @@ class TestWithoutTime:
         assert stream.health().crc_error_rate == pytest.approx(1 / 41)
         assert stream.health().drop_rate == pytest.approx(1 / 41)
 
-    def test_longer_damage_is_more_messages(self):
+    def test_longer_damage_counts_as_several_messages(self):
         stream = Stream(RegisterEpochs(), 40.0)
         feed(stream, VNYMR, range(20))
         stream.damaged(Skipped(0, bytes(610), Cause.BROKEN))
@@ -153,7 +153,7 @@ class TestWithoutTime:
         stream.flush()
         assert stream.gaps[0].length_s == pytest.approx(6 / 40)
 
-    def test_lines_of_other_devices_are_no_loss(self):
+    def test_lines_of_other_devices_are_not_losses(self):
         stream = Stream(RegisterEpochs(), 40.0)
         feed(stream, VNYMR, range(20))
         stream.damaged(Skipped(0, b"$GPGGA,1,2,3*00\r\n" * 100, Cause.NOISE))
@@ -188,7 +188,7 @@ class TestWithoutTime:
         assert blocks[0].time_s[0] == 0.0
         assert stream.gaps == []
 
-    def test_a_message_whose_content_is_none_counts_as_lost(self):
+    def test_message_with_invalid_content_counts_as_lost(self):
         stream = Stream(RegisterEpochs(), 40.0)
         feed(stream, VNYMR, range(20))
         stream.undecodable()
@@ -197,7 +197,7 @@ class TestWithoutTime:
         assert len(stream.gaps) == 1
         assert stream.facts.damaged == 1
 
-    def test_what_is_missing_without_a_trace_is_cut_and_said(self):
+    def test_messages_missing_without_a_trace_are_gaps_with_a_warning(self):
         stream = Stream(RegisterEpochs(), 40.0)
         still = {f"gyro_{a}_rad_s": 0.0 for a in "xyz"} | {"pitch_rad": 0.0, "roll_rad": 0.0}
         for yaw in (0.0, 0.5, 1.0, 1.5):
@@ -212,7 +212,7 @@ class TestWithoutTime:
 
 
 class TestRegisters:
-    def test_samples_are_as_the_sensor_read_them(self):
+    def test_samples_are_the_raw_readings_of_the_sensor(self):
         """Independent of `decompensation`: out = R C (m - B) for 23 and 84, put in, m comes out."""
         C, B = np.reshape(REGISTERS[23][:9], (3, 3)), np.array(REGISTERS[23][9:])
         R, B84 = np.reshape(REGISTERS[26], (3, 3)), np.array(REGISTERS[84][9:])
@@ -225,7 +225,7 @@ class TestRegisters:
         assert joined(blocks, "raw_b_gauss") == pytest.approx(np.tile(m, (20, 1)))
         assert joined(blocks, "gyro_b_rad_s") == pytest.approx(np.tile(w, (20, 1)))
 
-    def test_a_change_in_the_middle_changes_the_un_mapping_there(self):
+    def test_register_change_changes_the_un_mapping_from_there_on(self):
         epochs = RegisterEpochs()
         stream = Stream(epochs)
         blocks = feed(stream, BINARY, range(40), host=True) + stream.flush()
@@ -238,7 +238,7 @@ class TestRegisters:
         assert raw[40] == pytest.approx(Affine.from_register(REGISTERS[23]).undo(unrotated))
         assert np.isfinite(joined(blocks, "dt_s")[1:]).all()  # the stream itself goes on
 
-    def test_while_nobody_knows_them_samples_are_left_out_and_not_bridged(self):
+    def test_samples_are_omitted_while_the_registers_are_unknown(self):
         epochs = RegisterEpochs()
         stream = Stream(epochs)
         blocks = feed(stream, BINARY, range(40), host=True) + stream.flush()
@@ -251,7 +251,7 @@ class TestRegisters:
 
 
 class TestWhichMessage:
-    def test_a_better_message_takes_over_and_nothing_is_mixed(self):
+    def test_better_message_replaces_the_used_one_without_mixing(self):
         stream = Stream(RegisterEpochs())
         feed(stream, VNYMR, range(40))
         assert stream.compensated_mag
@@ -264,14 +264,14 @@ class TestWhichMessage:
         assert blocks[0].gap_before
         assert list(stream.warnings) == [f"VNYMR was left out when {BINARY.name} began"]
 
-    def test_a_worse_one_does_not(self):
+    def test_worse_message_does_not_replace_the_used_one(self):
         stream = Stream(RegisterEpochs())
         feed(stream, BINARY, range(40))
         assert feed(stream, VNYMR, range(40)) == []
         assert stream.by_layout == {BINARY.name: 40, "VNYMR": 40}
         assert stream.facts.layout == BINARY.name
 
-    def test_a_worse_one_takes_over_where_the_better_one_is_gone(self):
+    def test_worse_message_is_used_after_the_better_one_stopped(self):
         stream = Stream(RegisterEpochs())
         feed(stream, BINARY, range(40))
         for k in range(0, 1000, 200):  # both in turn: the better one stays
@@ -283,13 +283,13 @@ class TestWhichMessage:
         assert stream.take_replaced()
         assert f"{BINARY.name} was left out when VNYMR began" in stream.warnings
 
-    def test_without_a_magnetometer_it_says_what_to_do(self):
+    def test_stream_without_a_magnetometer_is_refused_with_advice(self):
         stream = Stream(RegisterEpochs())
         assert feed(stream, MESSAGES["VNYPR"], range(5)) == []
         with pytest.raises(NoSamplesError, match=r"VNYPR carries no magnetometer.*configure VNYMR"):
             stream.check()
 
-    def test_nothing_came_is_not_its_business(self):
+    def test_empty_stream_is_not_an_error_of_the_assembler(self):
         Stream(RegisterEpochs()).check()
 
 
@@ -306,7 +306,7 @@ class TestUnusable:
         (gap,) = stream.gaps
         assert gap.length_s == pytest.approx(5 / 40)
 
-    def test_values_that_are_not_finite_never_come_through(self):
+    def test_non_finite_values_are_dropped(self):
         stream = Stream(RegisterEpochs())
         feed(stream, BINARY, range(20))
         feed(stream, BINARY, range(20, 21), uncomp_mag_y_gauss=float("nan"))
@@ -315,7 +315,7 @@ class TestUnusable:
         assert np.isfinite(joined(blocks, "raw_b_gauss")).all()
 
 
-def test_blocks_go_by_the_count_of_messages():
+def test_block_size_follows_from_the_number_of_messages():
     one, other = Stream(RegisterEpochs(), 40.0), Stream(RegisterEpochs(), 40.0)
     sizes = [len(block) for block in feed(one, VNYMR, range(100))]
     assert set(sizes[1:]) == {10}
@@ -343,7 +343,7 @@ def test_a_table_is_counted_with_its_gaps():
     assert stream.health().drop_rate == pytest.approx(40 / 200)
 
 
-def test_a_run_of_months_keeps_the_first_and_the_newest_gaps_and_counts_all():
+def test_gap_list_is_bounded_and_all_gaps_are_counted():
     bounded, whole = Stream(RegisterEpochs(), keep_gaps=3), Stream(RegisterEpochs())
     ticks = [k for k in range(2000) if k % 100 >= 10]  # ten messages are missing, twenty times
     for stream in (bounded, whole):
@@ -358,7 +358,7 @@ def test_a_run_of_months_keeps_the_first_and_the_newest_gaps_and_counts_all():
     assert bounded.facts == whole.facts
 
 
-def test_names_of_messages_are_bounded_and_every_message_is_counted():
+def test_list_of_message_names_is_bounded_and_every_message_is_counted():
     stream = Stream(RegisterEpochs())
     feed(stream, BINARY, range(10))
     for field in range(100):  # other layouts, none of any use
@@ -372,7 +372,7 @@ def test_names_of_messages_are_bounded_and_every_message_is_counted():
     assert stream.by_layout[BINARY.name] == 20
 
 
-def test_a_rate_that_is_found_again_is_warned_of_once():
+def test_repeated_rate_gives_one_warning():
     stream = Stream(RegisterEpochs())
     for begin, rate in ((0, 40.0), (5000, 50.0), (10000, 20.0)):
         stream.registers = {7: (rate,)}

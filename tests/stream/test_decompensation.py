@@ -1,4 +1,4 @@
-"""Un-mapping against an independent forward model of the device's compensation chain."""
+"""Un-mapping compared with an independent forward model of the device's compensation chain."""
 
 from dataclasses import dataclass
 
@@ -112,7 +112,7 @@ def test_hsi_is_undone_for_compensated_fields_only() -> None:
     assert "moving target" in compensation.warnings[0]
 
 
-def test_the_manuals_numbers() -> None:
+def test_example_of_the_manual() -> None:
     """vn100-protocol.md 5.2: the worked example, both ways."""
     values = (1.02, 0.01, 0.0, 0.01, 0.98, 0.0, 0.0, 0.0, 1.01, 0.05, -0.03, 0.10)
     compensation = Compensation.from_registers({23: values})
@@ -128,7 +128,7 @@ def test_missing_registers_are_named() -> None:
     assert any("47 was not read" in text for text in applied)
 
 
-def test_uncompensated_columns_win() -> None:
+def test_uncompensated_columns_are_preferred() -> None:
     extractor = Extractor(PACKET)
     row = (7.0, *[1.0] * 3, 2.0, 3.0, 4.0, *[9.8] * 3, 0.1, 0.2, 0.3, 25.0, 0.0)
     extracted = extract(extractor, [row, row])
@@ -142,7 +142,7 @@ def test_uncompensated_columns_win() -> None:
     assert extractor.warnings == ()
 
 
-def test_compensated_stream_is_used_and_said() -> None:
+def test_compensated_stream_is_used_with_a_warning() -> None:
     extractor = Extractor(VNYMR)
     assert not extractor.has_time
     assert extractor.gyro_compensated
@@ -170,7 +170,9 @@ def test_no_messages_make_empty_arrays() -> None:
         (message("VNERR"), "magnetometer"),
     ],
 )
-def test_a_stream_that_cannot_do_says_what_would(layout: Message, quantity: str) -> None:
+def test_insufficient_stream_is_refused_with_a_suitable_message(
+    layout: Message, quantity: str
+) -> None:
     with pytest.raises(MissingQuantityError, match=rf"{layout.name} carries no {quantity}.*VNIMU"):
         Extractor(layout)
 
@@ -269,8 +271,10 @@ def test_samples_under_unknown_registers_are_dropped_and_leave_a_gap() -> None:
     assert blocks[1].dt_s[1:] == pytest.approx(0.1)
 
 
-def test_a_change_between_an_instant_and_its_arrival_leaves_the_sample_out() -> None:
-    """The instant is an estimate by the clock; a host that lags hears it behind the change."""
+def test_sample_is_omitted_when_registers_change_before_its_arrival() -> None:
+    """The instant is estimated by the clock; a delayed host receives the sample after the
+    change.
+    """
     time_s = np.asarray(np.arange(9) * 0.1, float)
     arrived_s = np.maximum(time_s, [0.0, 0.1, 0.4, 0.4, 0.4, 0.5, 0.6, 0.7, 0.8])
     epochs = RegisterEpochs()
@@ -287,8 +291,8 @@ def test_a_change_between_an_instant_and_its_arrival_leaves_the_sample_out() -> 
     assert np.isnan(blocks[1].dt_s[0])
 
 
-def test_what_arrives_over_a_new_link_is_not_un_mapped_by_what_was_before_it() -> None:
-    """A sample may be dated before the link: its bytes waited in the port."""
+def test_samples_of_a_new_link_are_not_un_mapped_by_earlier_registers() -> None:
+    """A sample may be dated before the link, because its bytes waited in the port."""
     time_s = np.asarray(np.arange(9) * 0.1, float)
     epochs = RegisterEpochs()
     epochs.begin(0.15, Compensation.unknown())

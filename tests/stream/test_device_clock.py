@@ -85,7 +85,7 @@ def test_accelerated_run(speed: float) -> None:
     assert clock.jumps == 0
 
 
-def test_device_restart_begins_a_new_line() -> None:
+def test_device_restart_starts_a_new_clock_line() -> None:
     device_s = np.concatenate([np.arange(100.0, 130.0, 0.01), np.arange(1.5, 30.0, 0.01)])
     host_s = arrivals(even(len(device_s), 0.01))
     clock = fed(device_s, host_s)
@@ -105,7 +105,7 @@ def test_host_jump_is_noticed_and_followed(leap_s: float) -> None:
     assert clock.host_s(device_s[-1]) == pytest.approx(truth_s, abs=5e-3)
 
 
-def test_a_stall_of_the_host_is_not_a_jump() -> None:
+def test_stall_of_the_host_is_not_a_clock_jump() -> None:
     device_s = np.arange(0.0, 60.0, 0.02)
     host_s = arrivals(device_s)
     host_s[1500:1560] = host_s[1560]  # 1.2 s of samples arrive at once
@@ -122,7 +122,7 @@ def test_non_finite_and_repeated_times_are_ignored() -> None:
     assert clock.host_s(1.0) == 11.0
 
 
-def test_memory_is_bounded_by_a_curve_that_is_all_hull() -> None:
+def test_memory_is_bounded_when_every_point_is_on_the_hull() -> None:
     device_s = np.arange(0.0, 900.0, 0.05)
     clock = fed(device_s, 1000.0 + device_s + 1e-9 * device_s**2)  # convex: each point on the hull
     assert len(clock._hull) <= HULL_POINTS
@@ -163,7 +163,7 @@ def test_gap_is_recorded_and_never_bridged() -> None:
         assert [(gap.at_s, gap.length_s) for gap in gaps] == [pytest.approx((0.49, 1.51))]
 
 
-def test_duplicates_are_dropped_and_a_fall_starts_anew() -> None:
+def test_duplicates_are_dropped_and_a_backward_step_starts_a_new_run() -> None:
     steps = StreamTimeline().extend(np.array([1.0, 1.1, 1.1, 1.2, 0.1, 0.2]))
     assert steps.keep.tolist() == [True, True, False, True, True, True]
     assert steps.first.tolist() == [True, False, False, False, True, False]

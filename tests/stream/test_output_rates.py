@@ -1,4 +1,4 @@
-"""How often messages without a time come: by the register of that output, then by arrivals."""
+"""Rate of messages without a time: from the register of their output, then from arrivals."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ HELD = {75: (3, 16, 0x14, 0x073E, 0x0004), 6: (0,), 7: (40,), 76: (0, 1, 0), 77:
         (sentence_layout("VNYMR", count=True), {6: (14,), 7: (20,)}, (20.0, "register 7")),
     ],
 )
-def test_only_the_register_of_that_output_says_its_rate(layout, registers, rate):
+def test_rate_is_taken_only_from_the_register_of_that_output(layout, registers, rate):
     assert rate_by_registers(layout, registers) == rate
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 40.0, 50.0, 200.0])
-def test_bunches_of_an_adapter_do_not_change_the_rate(rate_hz):
+def test_rate_of_bunched_arrivals_is_right(rate_hz):
     times = np.arange(round(12 * max(rate_hz, 10.0))) / rate_hz
     arrivals = (np.ceil(times / 0.016) * 0.016).tolist()  # as its latency timer lets them go
     assert rate_of_arrivals(AUTOPILOT, arrivals, [0] * len(arrivals)) == rate_hz
 
 
-def test_lost_messages_are_counted_and_few_arrivals_say_nothing():
+def test_rate_accounts_for_lost_messages_and_needs_enough_arrivals():
     times = np.arange(400) / 50.0
     kept = np.ones(400, bool)
     kept[10:400:7] = False
@@ -62,7 +62,7 @@ def test_lost_messages_are_counted_and_few_arrivals_say_nothing():
     assert rate_of_arrivals(AUTOPILOT, [5.0] * 3000, [0] * 3000) is None
 
 
-def test_rates_are_those_that_the_device_offers():
+def test_rate_is_rounded_to_one_that_the_device_offers():
     assert offered_rate(AUTOPILOT, 53.1) == pytest.approx(800 / 15)
     assert offered_rate(VNYMR, 40.3) == 40.0
     assert offered_rate(VNYMR, 30.0) == 30.0
@@ -77,7 +77,7 @@ def watched(comes_hz: float, believed_hz: float, seconds: float = 30.0) -> float
     return None
 
 
-def test_a_watch_believes_arrivals_that_contradict_time_after_time():
+def test_rate_changes_after_repeated_contradiction_by_arrivals():
     assert watched(50.0, 50.0) is None
     assert watched(50.0, 53.3) is None
     assert watched(50.0, 40.0) == pytest.approx(50.0, rel=0.02)
@@ -85,7 +85,7 @@ def test_a_watch_believes_arrivals_that_contradict_time_after_time():
     assert watched(50.0, 40.0, 5.0) is None
 
 
-def test_a_clock_that_stands_says_no_rate():
+def test_constant_clock_gives_no_rate():
     watch = RateWatch()
     assert all(watch.look(100.0, 0, 50.0) is None for _ in range(5000))
 
@@ -126,7 +126,7 @@ def test_a_binary_output_in_no_register_has_the_rate_of_its_arrivals():
     assert (stream.facts.rate_hz, stream.facts.rate_source) == (20.0, "arrival times")
 
 
-def test_a_rate_that_the_arrivals_contradict_is_given_up_with_what_was_made_by_it():
+def test_contradicted_rate_is_replaced_and_its_samples_are_dropped():
     stream = known({**HELD, 75: (1, 8, 0x14, 0x073E, 0x0004)})
     fed(stream, AUTOPILOT, 100.0 + np.arange(700) / 50.0)
     assert stream.facts.rate_hz == 50.0
@@ -152,7 +152,7 @@ def test_a_pause_in_the_arrivals_is_a_gap(pause_s, gap_s):
     assert [block.gap_before for block in blocks].count(True) == 2
 
 
-def test_messages_of_other_models_are_named_and_no_loss():
+def test_messages_of_other_models_are_counted_and_are_not_losses():
     stream = known({6: (14,), 7: (40,)})
     for k in range(100):
         host_s = 100.0 + k / 40.0

@@ -1,4 +1,4 @@
-"""The rate, and missing messages, from the device's own attitude."""
+"""The rate and missing messages, from the device's attitude."""
 
 from __future__ import annotations
 
@@ -38,27 +38,27 @@ def motion(rate_hz: float, seconds: float, size: float = 1.0) -> tuple[np.ndarra
 
 
 @pytest.mark.parametrize("rate_hz", [20.0, 40.0, 100.0])
-def test_the_rate_is_found(rate_hz):
+def test_rate_is_found(rate_hz):
     assert rate_from_attitude(*motion(rate_hz, 60.0)) == rate_hz
 
 
-def test_an_odd_rate_is_found_and_not_rounded():
+def test_unusual_rate_is_found_and_not_rounded():
     assert rate_from_attitude(*motion(33.0, 60.0)) == pytest.approx(33.0, rel=0.01)
 
 
-def test_lost_messages_do_not_change_it():
+def test_lost_messages_do_not_change_the_rate():
     ypr, rate = motion(40.0, 120.0)
     lost = np.random.default_rng(1).random(len(ypr)) < 0.03
     assert rate_from_attitude(ypr[~lost], rate[~lost]) == 40.0
 
 
-def test_a_sensor_that_did_not_turn_says_nothing():
+def test_no_rate_without_turns():
     ypr, rate = motion(40.0, 60.0, size=0.02)
     assert rate_from_attitude(ypr, rate) is None
     assert rate_from_attitude(*(part[:150] for part in motion(40.0, 60.0))) is None
 
 
-def test_a_few_strong_turns_will_do_and_a_bias_does_not_hurt():
+def test_rate_is_found_from_few_turns_with_a_bias():
     still_ypr, still_rate = motion(10.0, 60.0, size=0.0)
     ypr, rate = motion(10.0, 6.0, size=2.0)
     ypr = np.vstack([ypr, np.tile(ypr[-1], (len(still_ypr), 1))])
@@ -66,7 +66,7 @@ def test_a_few_strong_turns_will_do_and_a_bias_does_not_hurt():
     assert rate_from_attitude(ypr, rate) == 10.0
 
 
-def test_an_attitude_that_does_not_follow_the_rate_says_nothing():
+def test_no_rate_when_attitude_and_gyro_disagree():
     ypr, rate = motion(40.0, 60.0)
     dice = np.random.default_rng(2)
     assert rate_from_attitude(ypr, rate * dice.uniform(0.3, 3.0, size=(len(rate), 1))) is None
@@ -86,7 +86,7 @@ def test_bytes_without_a_message():
     assert rate_of([]) is None
 
 
-def test_which_messages_carry_what_is_needed():
+def test_messages_with_attitude_and_rate_are_recognised():
     layout = MESSAGES["VNYMR"]
     assert attitude_columns(layout) == [0, 1, 2, 9, 10, 11]
     assert attitude_columns(MESSAGES["VNIMU"]) is None
@@ -99,13 +99,13 @@ def test_which_messages_carry_what_is_needed():
 
 
 class TestTurnWatch:
-    def test_nothing_is_missing_where_nothing_is(self):
+    def test_no_messages_are_missing_in_a_complete_stream(self):
         watch = TurnWatch()
         found = watch.look(*motion(40.0, 60.0), 0.025)
         assert found.sum() == 0
         assert (watch.places, watch.missing) == (0, 0)
 
-    def test_a_block_that_is_missing_is_seen_and_about_counted(self):
+    def test_missing_block_is_found_with_its_approximate_length(self):
         ypr, rate = motion(40.0, 60.0)
         keep = np.r_[0:800, 860:2400]
         watch = TurnWatch()
@@ -114,7 +114,7 @@ class TestTurnWatch:
         assert 30 <= found[800] <= 90
         assert watch.places == 1
 
-    def test_blocks_do_not_matter(self):
+    def test_result_does_not_depend_on_the_block_size(self):
         ypr, rate = motion(40.0, 60.0)
         keep = np.r_[0:500, 530:1300, 1360:2400]
         whole, pieces = TurnWatch(), TurnWatch()
@@ -124,7 +124,7 @@ class TestTurnWatch:
         assert np.array_equal(one, np.concatenate(other))
         assert whole.missing == pieces.missing > 0
 
-    def test_what_was_forgotten_is_not_compared(self):
+    def test_samples_before_a_reset_are_not_compared(self):
         ypr, rate = motion(40.0, 60.0)
         watch = TurnWatch()
         watch.look(ypr[:100], rate[:100], 0.025)

@@ -285,8 +285,8 @@ def page(machine):
 
 
 @pytest.mark.timeout(240)
-def test_the_page_beside_it(machine):
-    """It shows as a stranger to the daemon; with the drop-in it may say an operator's word."""
+def test_page_unit_runs_with_the_daemon(machine):
+    """It reads as an unprivileged client; with the drop-in it may send operator commands."""
     machine.run("ip", "link", "set", "lo", "up")
     machine.run("systemctl", "start", "ahrsd", "ahrsd-page")
     device = emulate(machine)

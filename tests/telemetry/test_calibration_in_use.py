@@ -1,4 +1,4 @@
-"""Which calibration a share applies, and how well its heading is known, as things change."""
+"""Which calibration a share applies, and the uncertainty of its heading, as conditions change."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ NOW = ChoiceFacts("unit", FACTORY, State.QUALIFIED, PROPOSAL, estimate(), truste
 
 
 def block(raw, registers):
-    """One sample at rest whose raw field is given."""
+    """One sample at rest with this raw field."""
     nothing = np.zeros((1, 3))
     times = np.zeros(1)
     return SampleBlock(times, times, times, np.array([raw]), np.array([BIAS]), nothing)
 
 
-def test_before_anything_is_known_it_is_the_registers_and_no_heading_is_known():
+def test_registers_are_used_without_a_known_heading_before_an_estimate():
     nothing = replace(NOW, state=State.OBSERVING, proposal=None, estimate=None)
     found = Chooser(qualified=True).choose(nothing)
     assert (found.by, found.candidate, found.heading_sigma_deg) == (REGISTERS, None, None)
@@ -37,7 +37,7 @@ def test_before_anything_is_known_it_is_the_registers_and_no_heading_is_known():
     assert gyro[0].tolist() == pytest.approx(BIAS.tolist())
 
 
-def test_a_qualified_candidate_is_applied_here():
+def test_qualified_candidate_is_applied():
     found = Chooser(qualified=True).choose(NOW)
     assert (found.by, found.candidate) == (QUALIFIED, PROPOSAL.id)
     assert found.heading_sigma_deg == pytest.approx(0.05, abs=1e-3)
@@ -46,7 +46,7 @@ def test_a_qualified_candidate_is_applied_here():
     assert gyro[0].tolist() == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
 
 
-def test_where_only_registers_are_wanted_it_is_not_and_their_error_is_the_sigma():
+def test_candidate_is_not_applied_when_only_registers_are_requested():
     found = Chooser(qualified=False).choose(NOW)
     assert (found.by, found.candidate) == (REGISTERS, None)
     # the level part of the iron across a level field of 0.4837 cos 60 deg
@@ -57,7 +57,7 @@ def test_where_only_registers_are_wanted_it_is_not_and_their_error_is_the_sigma(
     assert found.levelling_rate(one)[0].tolist() == pytest.approx([0.0] * 3, abs=1e-9)
 
 
-def test_once_written_the_registers_have_it():
+def test_registers_are_used_after_the_candidate_was_written():
     chooser = Chooser(qualified=True)
     chooser.choose(NOW)
     found = chooser.choose(replace(NOW, registers=WRITTEN, state=State.TRIAL))
@@ -67,7 +67,7 @@ def test_once_written_the_registers_have_it():
     assert mag[0].tolist() == pytest.approx([0.24, 0.0, 0.42], abs=1e-6)
 
 
-def test_a_gate_that_turns_red_again_does_not_take_it_back():
+def test_closed_gate_does_not_withdraw_the_candidate():
     chooser = Chooser(qualified=True)
     chooser.choose(NOW)
     again = replace(NOW, state=State.CANDIDATE, proposal=None)
@@ -90,7 +90,7 @@ def test_a_gate_that_turns_red_again_does_not_take_it_back():
     ],
     ids=str,
 )
-def test_what_speaks_against_it_takes_it_back_for_good(change):
+def test_contradiction_withdraws_the_candidate_permanently(change):
     chooser = Chooser(qualified=True)
     chooser.choose(NOW)
     later = replace(NOW, state=State.CANDIDATE, proposal=None)
@@ -107,12 +107,12 @@ def test_what_speaks_against_it_takes_it_back_for_good(change):
     ],
     ids=str,
 )
-def test_an_estimate_that_is_none_yet_says_nothing_of_the_heading(change):
+def test_unconverged_estimate_gives_no_heading_sigma(change):
     found = Chooser(qualified=True).choose(replace(NOW, **change))
     assert found.heading_sigma_deg is None
 
 
-def test_vectors_are_in_the_frame_of_the_devices_outputs():
+def test_vectors_are_in_the_output_frame_of_the_device():
     turned = (0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # x of the vehicle is y of the sensor
     known = replace(NOW, registers={**FACTORY, 26: turned}, state=State.OBSERVING, proposal=None)
     mag, _, _ = Chooser(qualified=True).choose(known).vectors(block([0.1, 0.2, 0.3], FACTORY))

@@ -1,4 +1,4 @@
-"""What to drive next: the circle first, then the tilt that shows most of what is missing."""
+"""Driving advice: the circle first, then the tilt that shows most of the missing directions."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def status(directions, gates=SHUT, heading_deg=None, **changes):
 
 
 def all_but(wanted):
-    """Everything was shown but the cells of these attitudes and their neighbours."""
+    """Everything was shown except the cells of these attitudes and their neighbours."""
     middle = cell_centres()
     hidden = np.zeros(len(middle), dtype=bool)
     for attitude in wanted:
@@ -28,7 +28,7 @@ def all_but(wanted):
     return "".join("0" if one else "1" for one in hidden)
 
 
-def test_a_level_circle_is_one_ring_and_no_tilt():
+def test_level_circle_covers_the_ring_and_no_tilt():
     shown = shown_of(status(cells(level_ring)))
     assert shown.level_share == 1.0
     assert shown.tilted_share == 0.0
@@ -38,7 +38,7 @@ def test_a_level_circle_is_one_ring_and_no_tilt():
     assert half.level_share == pytest.approx(0.5, abs=0.06)
 
 
-def test_what_cannot_be_said_is_not_said():
+def test_no_advice_without_the_necessary_data():
     assert shown_of({"motion": None}) is None
     assert shown_of(status("")) is None
     assert shown_of(status(cells(level_ring), dip_deg=None)) is None
@@ -46,7 +46,7 @@ def test_what_cannot_be_said_is_not_said():
     assert shown_of({"motion": {"heading_deg": 10.0}}) is None  # an older daemon
 
 
-def test_a_sensor_that_hangs_upside_down_shows_the_same_share():
+def test_inverted_sensor_covers_the_same_share():
     upright = status(cells(lambda f, a: level_ring(f, a) and a < 180.0))
     turned = cells(lambda f, a: level_ring(180.0 - f, a) and a < 180.0)
     hanging = status(turned, down_b=[0.0, 0.0, -1.0])
@@ -65,8 +65,8 @@ def test_a_sensor_that_hangs_upside_down_shows_the_same_share():
         ((270.0, -15.0, 0.0), "face west and roll to the left by up to 30 deg, if the vehicle can"),
     ],
 )
-def test_the_attitude_that_is_missing_is_the_one_that_is_named(attitude, words):
-    """The words are checked against where that attitude really sees the field."""
+def test_missing_attitude_is_advised(attitude, words):
+    """The text is compared with the direction of the field in that attitude."""
     assert drive_next(status(all_but([attitude]))) == words
 
 
@@ -78,13 +78,13 @@ def test_the_attitude_that_is_missing_is_the_one_that_is_named(attitude, words):
         ((270.0, 15.0, 0.0), "face west and roll to the right"),
     ],
 )
-def test_in_the_south_where_the_field_points_up(attitude, words):
+def test_advice_on_the_southern_hemisphere(attitude, words):
     south = status(all_but([(*attitude, -60.0)]), dip_deg=-60.0)
     assert drive_next(south).startswith(words)
     assert shown_of(south).ring_deg == 150.0
 
 
-def test_the_turn_is_told_from_where_the_vehicle_faces():
+def test_advised_turn_is_relative_to_the_present_heading():
     missing = all_but([(90.0, -25.0, 0.0)])
     assert drive_next(status(missing, heading_deg=10.0)) == (
         "face east (80 deg to the right) and roll to the left by up to 30 deg, if the vehicle can"
@@ -96,7 +96,7 @@ def test_the_turn_is_told_from_where_the_vehicle_faces():
     assert "east (as now)" in drive_next(status(missing, heading_deg=100.0))
 
 
-def test_the_circle_comes_first_and_a_tilt_only_where_a_gate_wants_it():
+def test_circle_is_advised_first_and_tilt_only_for_a_gate():
     ring = cells(level_ring)
     assert drive_next(status(ring, next_="turn left about 120 deg more")) == (
         "turn left about 120 deg more"
@@ -108,7 +108,7 @@ def test_the_circle_comes_first_and_a_tilt_only_where_a_gate_wants_it():
     assert drive_next({"motion": None}).startswith("drive two full circles")
 
 
-def test_the_gates_that_a_tilt_helps_are_those_whose_advice_says_so():
+def test_gates_helped_by_tilt_are_those_whose_advice_mentions_it():
     tilt = ("{e.motion.more_tilt}", "{e.would_tell}")
     advised = {g.gate for g in GATES if any(words in g.advice for words in tilt)}
     assert advised == HELPED_BY_TILT

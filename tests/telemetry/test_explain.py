@@ -1,4 +1,4 @@
-"""Words for every state, and one thing to do next."""
+"""Text for every state, and one next step."""
 
 import pytest
 
@@ -46,11 +46,11 @@ GATE = {
 }
 
 
-def test_every_state_has_words():
+def test_every_state_has_a_description():
     assert set(STATES) == {state.value for state in State}
 
 
-def test_a_shut_gate_is_shown_with_value_limit_age_and_advice():
+def test_closed_gate_is_shown_with_value_limit_age_and_advice():
     held = {"state": "CANDIDATE", "proposal": None}
     held["holds"] = ["gate heldout_heading.rms: turn again elsewhere", "the mode is observe"]
     lines = explain_lines(explain_json(status(gates=[GATE], write_back=held)))
@@ -66,7 +66,7 @@ def test_a_shut_gate_is_shown_with_value_limit_age_and_advice():
     ]
 
 
-def test_a_red_gate_that_guards_another_step_holds_nothing():
+def test_closed_gate_of_another_step_is_not_shown():
     waiting = {"state": "QUALIFIED", "holds": ["an operator must approve 12ab34cd"]}
     waiting["proposal"] = {"id": "12ab34cd"}
     explained = explain_json(status(gates=[GATE | {"gate": "step.auto"}], write_back=waiting))
@@ -74,7 +74,7 @@ def test_a_red_gate_that_guards_another_step_holds_nothing():
     assert explained["next"].endswith("ahrsd operator approve 12ab34cd")
 
 
-def test_gates_that_were_not_measured_say_so_together_where_the_reason_is_one():
+def test_unmeasured_gates_with_one_reason_share_a_line():
     missing = [
         GATE | {"gate": name, "value": None, "for_s": None, "advice": advice}
         for name, advice in (("a.rms", "turn"), ("b.held", "tilt"), ("a.max", "turn"))
@@ -131,14 +131,14 @@ def test_gates_that_were_not_measured_say_so_together_where_the_reason_is_one():
         ),
     ],
 )
-def test_what_to_do_next(changes, words):
+def test_next_step_follows_from_the_status(changes, words):
     assert words in explain_json(status(**changes))["next"]
 
 
 STUCK = "the magnetometer gives the same value on all axes"
 
 
-def test_a_sensor_an_estimator_and_a_file_that_are_wrong_are_said():
+def test_faults_of_sensor_estimator_and_file_are_reported():
     failed = {"state": "FAILED", "reason": "LinAlgError: Singular matrix", "failures": 2}
     changes = {
         "sensors": [STUCK],
@@ -158,7 +158,7 @@ def test_a_sensor_an_estimator_and_a_file_that_are_wrong_are_said():
     )
 
 
-def test_without_an_interlock_the_key_is_named():
+def test_missing_interlock_is_reported_with_its_key():
     unheard = WriteBack(WriteBackPolicy()).obstacles()[-2]
     held = {"state": "CANDIDATE", "holds": [unheard], "proposal": None}
     (text,) = explain_json(status(interlock="none", write_back=held))["others"]
@@ -167,7 +167,7 @@ def test_without_an_interlock_the_key_is_named():
     assert text == unheard
 
 
-def test_without_an_interlock_that_is_the_thing_to_do_and_not_to_wait_for_a_word():
+def test_next_step_without_an_interlock_is_to_configure_one():
     unheard = WriteBack(WriteBackPolicy()).obstacles()[-2]
     held = {
         "state": "QUALIFIED",
@@ -179,14 +179,14 @@ def test_without_an_interlock_that_is_the_thing_to_do_and_not_to_wait_for_a_word
     assert explain_json(status(interlock="not safe", **passed))["next"] == unheard
 
 
-def test_one_thing_holds_and_two_hold():
+def test_number_of_obstacles_to_a_write_is_reported():
     back = {"state": "QUALIFIED", "holds": ["a"]}
     assert "; 1 thing holds a write (" in write_back_line(status(write_back=back))
     back["holds"] = ["a", "b"]
     assert "; 2 things hold a write (" in write_back_line(status(write_back=back))
 
 
-def test_the_status_shows_the_candidate_that_is_to_be_looked_at():
+def test_status_shows_the_candidate_to_be_reviewed():
     proposal = {
         "id": "12ab34cd",
         "lines": ["$VNWRG,23,1.1*XX", "$VNWRG,84,1*XX"],
@@ -200,7 +200,7 @@ def test_the_status_shows_the_candidate_that_is_to_be_looked_at():
     assert candidate_lines(status()) == []
 
 
-def test_the_status_says_how_the_estimator_broke_off():
+def test_status_reports_a_failure_of_the_estimator():
     found = {"state": "RUNNING", "reason": "", "failures": 0, "begins_anew_in_s": 0.0}
     assert estimator_line({"estimator": found}) == "estimator: "
     found |= {"failures": 1, "reason": "LinAlgError: Singular matrix"}
@@ -214,7 +214,7 @@ def test_the_status_says_how_the_estimator_broke_off():
     )
 
 
-def test_what_is_left_over_is_shown_with_the_estimate():
+def test_remaining_residual_is_shown_with_the_estimate():
     text = "the residual follows the attitude: 0.4 mG; run `ahrsd diagnose` on the recording"
     explained = explain_json(status(estimate={"warnings": [text]}))
     assert explained["warnings"] == [text]

@@ -1,4 +1,4 @@
-"""Corrected and nmea shares of a core on a cable, against the attitude that the cable gave it."""
+"""Corrected and NMEA shares of a core on a simulated cable, compared with the true attitude."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LINK = LinkFacts("cable", 115200, is_open=True)
 
 @dataclass
 class Outlet:
-    """What was written, and whether somebody reads."""
+    """Written data, and whether there is a reader."""
 
     share: ShareSection
     wanted: bool = True
@@ -87,7 +87,7 @@ class Told:
 
 
 def true_heading_deg(R_nb):
-    """Of the x axis, from north to the east, by the level part of the axis."""
+    """Heading of the x axis from north to east, by the level part of the axis."""
     return math.degrees(math.atan2(R_nb[1, 0], R_nb[0, 0])) % 360.0
 
 
@@ -95,7 +95,7 @@ def proposal_distance_deg(one, other):
     return abs((one - other + 180.0) % 360.0 - 180.0)
 
 
-def test_corrected_says_the_true_field_rate_and_heading_once_a_candidate_qualified():
+def test_corrected_share_has_true_values_after_a_candidate_qualified():
     told = Told("corrected", calibration="qualified")
     told.until("QUALIFIED")
     told.outlet.lines.clear()
@@ -121,7 +121,7 @@ def test_corrected_says_the_true_field_rate_and_heading_once_a_candidate_qualifi
     assert state["sigma_hard_iron_gauss"] == pytest.approx([1e-4] * 3)
 
 
-def test_by_itself_a_share_has_what_is_in_the_device_until_somebody_approves():
+def test_share_uses_the_registers_until_an_approval_by_default():
     told = Told("corrected")
     told.until("QUALIFIED")
     told.go(5.0)
@@ -129,7 +129,7 @@ def test_by_itself_a_share_has_what_is_in_the_device_until_somebody_approves():
     assert told.outlet.records()[-1]["magnetic_heading_deg"] is None  # it is wrong by degrees
 
 
-def test_when_the_candidate_is_written_the_values_stay_and_the_registers_make_them():
+def test_values_are_continuous_when_the_candidate_is_written():
     told = Told("corrected", mode=Mode.COMMIT, calibration="qualified")
     told.until("QUALIFIED")
     told.go(1.0)
@@ -148,7 +148,7 @@ def test_when_the_candidate_is_written_the_values_stay_and_the_registers_make_th
     assert told.outlet.records("state")[-1]["candidate"] is None
 
 
-def test_before_that_no_heading_is_told_and_the_values_are_the_devices_own():
+def test_share_has_device_values_and_no_heading_before_an_estimate():
     told = Told("corrected", calibration="registers", max_heading_sigma_deg=1.0)
     told.until("QUALIFIED")
     told.go(10.0)
@@ -157,21 +157,21 @@ def test_before_that_no_heading_is_told_and_the_values_are_the_devices_own():
         assert (sample["calibration"], sample["magnetic_heading_deg"]) == ("registers", None)
         iron = np.array([0.05, -0.03, 0.04])
         assert np.allclose(sample["mag_body_gauss"], R_nb.T @ FIELD_N + iron, atol=6e-3)
-    assert told.outlet.records()[-1]["heading_sigma_deg"] > 10.0  # and it is told why
+    assert told.outlet.records()[-1]["heading_sigma_deg"] > 10.0  # with a reason
 
 
-def test_records_are_numbered_without_a_hole_and_each_sample_comes_once():
+def test_records_are_numbered_without_gaps_and_each_sample_comes_once():
     told = Told("corrected", calibration="qualified")
     told.go(20.0)
     assert [json.loads(line)["seq"] for line in told.outlet.lines] == told.outlet.numbers
     assert told.outlet.numbers == list(range(1, len(told.outlet.numbers) + 1))
     times = [sample["time_s"] for sample in told.outlet.records()]
     assert times == sorted(set(times))
-    assert len(times) >= 19 * 20  # nothing waits for its block to be full
+    assert len(times) >= 19 * 20  # no sample waits until its block is full
     assert json.loads(told.outlet.newest)["record"] == "state"
 
 
-def test_the_fields_are_those_of_the_reference():
+def test_fields_are_those_of_the_documentation():
     page = (Path(__file__).parents[2] / "docs" / "reference" / "socket.md").read_text()
     part = page[page.index("## Corrected samples") : page.index("## Prometheus")]
     told = Told("corrected", calibration="qualified")
@@ -183,7 +183,7 @@ def test_the_fields_are_those_of_the_reference():
         assert sorted(fields) == sorted(named)
 
 
-def test_a_device_that_is_gone_is_told_within_two_seconds():
+def test_missing_device_is_reported_within_two_seconds():
     told = Told("corrected", calibration="qualified")
     told.until("QUALIFIED")
     told.run.feed(inputs.LinkLost(told.run.now_ns, "unplugged"))
@@ -195,14 +195,14 @@ def test_a_device_that_is_gone_is_told_within_two_seconds():
     assert told.outlet.records() == []
 
 
-def test_nobody_who_reads_costs_nothing():
+def test_share_without_readers_computes_nothing():
     told = Told("corrected", calibration="qualified")
     told.outlet.wanted = False
     told.go(5.0)
     assert told.outlet.records() == []
 
 
-def test_nmea_is_a_true_heading_ten_times_a_second_and_an_empty_one_when_the_device_is_gone():
+def test_nmea_share_sends_heading_at_ten_hertz_and_empty_fields_without_a_device():
     told = Told("nmea", calibration="qualified")
     told.go(3.0)
     assert set(told.outlet.lines[::2]) == {b"$HCHDM,,M*07\r\n"}
@@ -233,7 +233,7 @@ def test_nmea_is_a_true_heading_ten_times_a_second_and_an_empty_one_when_the_dev
     assert len(told.outlet.lines) == 3
 
 
-def test_in_passive_a_candidate_for_the_stream_as_it_is_is_applied_too():
+def test_candidate_is_applied_in_passive_mode():
     told = Told("corrected", binary=False, mode=Mode.PASSIVE, calibration="qualified")
     told.until("QUALIFIED")
     told.outlet.lines.clear()

@@ -1,4 +1,4 @@
-"""Prometheus reads what the status says."""
+"""Prometheus metrics of the status."""
 
 import re
 import urllib.request
@@ -80,7 +80,7 @@ def scraped():
     server.close()
 
 
-def test_values_and_labels(scraped):
+def test_metrics_have_values_and_labels(scraped):
     found = scraped(STATUS)
     assert found["ahrsd_samples_total", ()] == 98.0
     assert found["ahrsd_link_up", ()] == 1.0
@@ -99,7 +99,7 @@ def test_values_and_labels(scraped):
     assert {name.removesuffix("_total") for name, _ in found} == {row.name for row in METRICS}
 
 
-def test_before_there_is_an_estimate_its_numbers_are_absent(scraped):
+def test_metrics_of_the_estimate_are_absent_before_it(scraped):
     assert scraped(None) == {}
     found = scraped(STATUS | {"estimate": None, "stream": STATUS["stream"] | {"rate_hz": None}})
     assert ("ahrsd_heading_sigma_degrees", ()) not in found
@@ -107,14 +107,14 @@ def test_before_there_is_an_estimate_its_numbers_are_absent(scraped):
     assert found["ahrsd_messages_total", ()] == 100.0
 
 
-def test_a_port_that_is_taken_is_an_error_for_the_daemon_to_log(scraped):
+def test_occupied_port_raises_an_error(scraped):
     server = MetricsServer(0)
     with pytest.raises(OSError, match="in use"):
         MetricsServer(server.port)
     server.close()
 
 
-def test_every_metric_is_in_the_docs():
+def test_every_metric_is_documented():
     page = Path(__file__).parents[2] / "docs" / "reference" / "socket.md"
     text = page.read_text(encoding="utf-8")
     listed = dict(re.findall(r"^\| `(ahrsd_\w+)[^`]*` \| (\w+) \|", text, re.MULTILINE))

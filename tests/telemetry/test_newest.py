@@ -1,4 +1,4 @@
-"""Samples are told before their block is full: each once, in order, as the block will have them."""
+"""Samples are available before their block is full: each once, in order, as in the block."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def message(layout, at_s, draw):
 
 
 def told(times, layout=BINARY):
-    """What is told, looked at after each message, and the blocks; times of the device in s."""
+    """Samples looked up after each message, and the blocks; device times in s."""
     epochs, newest, draw = RegisterEpochs(), Newest(), np.random.default_rng(1)
     epochs.begin(0.0, Compensation.unknown())
     stream, records, blocks = Stream(epochs, 40.0), [], []
@@ -36,7 +36,7 @@ def told(times, layout=BINARY):
     return [samples_record(part, PRESENT) for part in parts], blocks
 
 
-def test_each_sample_is_told_once_as_its_block_has_it():
+def test_each_sample_is_returned_once_with_the_values_of_its_block():
     records, blocks = told(np.arange(81) / 40.0)
     assert len(records) > 60  # one by one, but for the first few, when the rate is not known
     for name in ("time_s", "raw_b_gauss", "gyro_b_rad_s"):
@@ -50,20 +50,20 @@ def test_each_sample_is_told_once_as_its_block_has_it():
     assert np.allclose(corrected, PRESENT.apply(raw), rtol=0, atol=0)
 
 
-def test_a_gap_is_told_before_the_first_sample_behind_it():
+def test_gap_is_returned_before_the_first_sample_after_it():
     records, _ = told([*(np.arange(40) / 40.0), *(5.0 + np.arange(40) / 40.0)])
     behind = [record["time_s"][0] for record in records if record["gap_before"]]
     assert behind == [0.0, 5.0]
 
 
-def test_a_device_that_restarted_is_told_from_its_start():
+def test_samples_after_a_restart_begin_with_the_first():
     records, _ = told([*(50.0 + np.arange(40) / 40.0), *(np.arange(40) / 40.0)])
     said = np.concatenate([record["time_s"] for record in records])
     assert np.count_nonzero(said < 10.0) == 40
     assert np.count_nonzero(said > 10.0) == 40
 
 
-def test_looking_changes_nothing_and_without_device_time_there_is_nothing_to_see():
+def test_lookup_has_no_side_effects_and_is_empty_without_device_time():
     draw = np.random.default_rng(2)
     seen, unseen = Stream(RegisterEpochs()), Stream(RegisterEpochs())
     for k in range(100):

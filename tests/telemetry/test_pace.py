@@ -1,4 +1,6 @@
-"""The countdown: what grows does so evenly, what falls does so by its share, and no guess."""
+"""The countdown: linear for growing quantities, exponential for falling ones, and no guess
+otherwise.
+"""
 
 import math
 
@@ -22,7 +24,7 @@ from ahrsd.telemetry.driving import LEVEL, TILTED, Pace, about, left_s
         (60.0, 100.0, 300.0, 300.0, 0.0),
     ],
 )
-def test_time_at_the_present_rate(span_s, first, last, goal, expected):
+def test_remaining_time_at_the_present_rate(span_s, first, last, goal, expected):
     assert left_s(span_s, first, last, goal) == (
         None if expected is None else pytest.approx(expected)
     )
@@ -35,7 +37,7 @@ def status(at_s, *gates, directions=""):
     return {"at_s": at_s, "gates": list(gates), "motion": motion(directions)}
 
 
-def test_gates_are_followed_until_they_open():
+def test_gates_have_a_remaining_time_until_they_open():
     pace = Pace()
     for at_s in range(0, 61, 10):
         coverage = gate("motion.heading", 100.0 + at_s, 200.0)
@@ -49,7 +51,7 @@ def test_gates_are_followed_until_they_open():
     assert pace.left_s("observability.heading_sigma") is None
 
 
-def test_nobody_says_when_all_are_open_where_one_stands_still():
+def test_no_total_time_when_one_gate_makes_no_progress():
     pace = Pace()
     for at_s in (0.0, 30.0, 60.0):
         pace.take(status(at_s, gate("a.moves", at_s, 100.0), gate("a.stands", 1.0, 2.0)))
@@ -60,7 +62,7 @@ def test_nobody_says_when_all_are_open_where_one_stands_still():
     assert pace.slowest([]) is None
 
 
-def test_the_count_of_what_is_not_measured_follows_from_the_others():
+def test_count_of_unmeasured_gates_is_ignored():
     pace = Pace()
     for at_s in (0.0, 60.0):
         pace.take(status(at_s, gate("a.moves", at_s, 100.0), gate("evidence.complete", 7.0, 0.0)))
@@ -69,14 +71,14 @@ def test_the_count_of_what_is_not_measured_follows_from_the_others():
     assert pace.standing(both) == []
 
 
-def test_a_device_that_restarted_is_followed_anew():
+def test_rates_are_reset_after_a_restart():
     pace = Pace()
     for at_s in (500.0, 560.0, 3.0):
         pace.take(status(at_s, gate("motion.heading", 100.0 + at_s / 10, 200.0)))
     assert pace.left_s("motion.heading") is None
 
 
-def test_the_rate_is_that_of_the_newest_minutes():
+def test_rate_is_that_of_the_newest_minutes():
     pace = Pace()
     for at_s in range(0, 601, 10):
         value = 0.2 * at_s if at_s <= 300 else 60.0
@@ -84,7 +86,7 @@ def test_the_rate_is_that_of_the_newest_minutes():
     assert pace.left_s("motion.heading") is None  # nothing new for five minutes
 
 
-def test_what_was_shown_counts_down_as_well():
+def test_covered_directions_have_a_remaining_time():
     pace = Pace()
     for at_s in (0.0, 30.0, 60.0):
         ring = cells(lambda f, a, at_s=at_s: level_ring(f, a) and a < 3.0 * at_s)
@@ -93,7 +95,7 @@ def test_what_was_shown_counts_down_as_well():
     assert pace.left_s(TILTED) is None
 
 
-def test_the_words_are_as_coarse_as_what_is_known():
+def test_remaining_time_is_rounded_coarsely():
     assert about(3.0) == "about 10 s at the present rate"
     assert about(41.0) == "about 50 s at the present rate"
     assert about(65.0) == "about 1 min at the present rate"
@@ -107,7 +109,7 @@ def held_out(at_s, turning_deg_s, windows=0.0):
     return body | {"readings": {"gyro_b_rad_s": rate}}
 
 
-def test_held_out_segments_come_every_two_minutes_while_the_vehicle_turns():
+def test_held_out_segments_are_expected_every_two_minutes_of_turning():
     turning, resting = Pace(), Pace()
     for at_s in (0.0, 10.0):
         turning.take(held_out(at_s, 12.0))

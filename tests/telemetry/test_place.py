@@ -1,4 +1,4 @@
-"""Where the daemon lives: one way to say it, and hints that work when they are pasted."""
+"""Location of the daemon: one way to give it, and commands in hints that work when pasted."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def place(given: Path | None) -> DaemonPlace:
     return DaemonPlace(Config(), given or Path("/var/lib/ahrsd"), None, given is not None)
 
 
-def test_hints_name_the_daemon_that_was_named(tmp_path):
+def test_hints_contain_the_given_location_of_the_daemon(tmp_path):
     text = "look at it (`ahrsd status`), then: ahrsd operator approve 3b08c2b4"
     assert place(None).pasted(text) == text
     folder = tmp_path / "of a boat"
@@ -52,11 +52,11 @@ def load(name: str) -> click.Command:
 
 
 @pytest.mark.parametrize("name", TALK)
-def test_every_command_that_talks_to_the_daemon_takes_the_same_options(name):
+def test_every_client_command_has_the_same_options(name):
     assert {"--config", "--state-directory"} <= option_names(load(name))
 
 
-def test_every_hint_to_a_command_that_talks_to_the_daemon_is_completed():
+def test_every_hint_to_a_client_command_is_completed():
     """Whatever command a text of the package names with backquotes: it is known to `pasted`."""
     assert set(TALK) <= set(COMMANDS)
     registers = load("registers")
@@ -72,9 +72,7 @@ def test_every_hint_to_a_command_that_talks_to_the_daemon_is_completed():
 
 
 @pytest.mark.parametrize("name", ["b.zip", "b.tar", "b.tgz", "b.tar.gz"])
-def test_a_bundle_without_a_daemon_is_in_the_format_of_its_name_and_says_what_it_lacks(
-    run, tmp_path, capsys, name
-):
+def test_bundle_without_a_daemon_is_made_and_lists_what_is_missing(run, tmp_path, capsys, name):
     state = tmp_path / "state"
     state.mkdir()
     (state / "journal-1.jsonl").write_text("{}\n")
@@ -95,11 +93,11 @@ def test_a_bundle_without_a_daemon_is_in_the_format_of_its_name_and_says_what_it
             assert archive.getnames() == expected
 
 
-def test_a_bundle_of_an_unknown_format_is_refused(run, tmp_path, capsys):
+def test_bundle_of_an_unknown_format_is_refused(run, tmp_path, capsys):
     assert run("bundle", "-o", tmp_path / "b.rar") == 2
     assert "must end in .tar.gz, .tgz, .tar, .zip" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_help_of_bundle_names_its_formats():
+def test_help_of_bundle_lists_its_formats():
     assert ".zip" in inspect.getsource(running_daemon)

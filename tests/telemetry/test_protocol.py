@@ -1,4 +1,4 @@
-"""Lines of the socket: every request is answered or refused in words; nothing else can happen."""
+"""Lines of the socket: every request is answered, or refused with a reason."""
 
 import json
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from ahrsd.telemetry.protocol import BadRequest, Outbox, SocketRequest, line_of, parse_request
 
 
-def test_requests():
+def test_requests_are_parsed():
     assert parse_request(b'{"ask": "status"}') == SocketRequest("status")
     assert parse_request(b'{"ask":"watch","of":["samples"]}') == SocketRequest(
         "watch", frozenset({"samples"})
@@ -33,13 +33,13 @@ def test_requests():
         (b"\xff\xfe", "not a JSON object"),
     ],
 )
-def test_what_is_no_request_is_refused_in_words(line, words):
+def test_invalid_request_is_refused_with_a_reason(line, words):
     with pytest.raises(BadRequest, match=words):
         parse_request(line)
 
 
 @given(st.binary(max_size=200))
-def test_any_bytes_are_a_request_or_refused(line):
+def test_any_bytes_are_parsed_or_refused(line):
     try:
         assert parse_request(line).ask in ("status", "explain", "watch")
     except BadRequest as error:
@@ -58,7 +58,7 @@ def test_every_line_is_strict_json(value):
     assert json.loads(line, parse_constant=pytest.fail)["array"] == [1.0, None]
 
 
-def test_a_full_outbox_drops_whole_records_and_says_which():
+def test_full_outbox_drops_whole_records_and_reports_them():
     box = Outbox(limit_bytes=200)
     line = line_of({"record": "x", "fill": "y" * 60})
     for seq in range(1, 6):
@@ -73,7 +73,7 @@ def test_a_full_outbox_drops_whole_records_and_says_which():
 
 
 @given(st.lists(st.tuples(st.integers(1, 90), st.integers(0, 150)), max_size=60))
-def test_an_outbox_is_bounded_and_every_record_arrives_or_is_in_a_gap(steps):
+def test_outbox_is_bounded_and_every_record_arrives_or_is_in_a_gap(steps):
     box, seen, limit = Outbox(limit_bytes=300), bytearray(), 300
     for seq, (size, read) in enumerate(steps, start=1):
         box.record(

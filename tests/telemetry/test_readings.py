@@ -1,4 +1,4 @@
-"""Heading now and as it would be, against attitudes that are known."""
+"""Present and predicted heading, compared with known attitudes."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def seen(heading_deg, proposed=None, accel=True, rows=4):
     return SamplesSeen(block, Affine.identity(), proposed)
 
 
-def test_the_heading_as_it_would_be_is_the_true_one():
+def test_predicted_heading_is_the_true_one():
     found = readings(seen(123.0, Affine(np.eye(3), IRON)), 1010.3)
     assert found["heading_would_be_deg"] == pytest.approx(123.0)
     wrong = np.degrees(np.arctan2(
@@ -42,7 +42,7 @@ def test_the_heading_as_it_would_be_is_the_true_one():
     assert found["age_s"] == pytest.approx(0.225)
 
 
-def test_lines_say_what_is_known():
+def test_lines_contain_known_values():
     status = {
         "readings": plain(readings(seen(350.0, Affine(np.eye(3), IRON)), 1010.1)),
         "estimate": {"heading_sigma_deg": 0.42},
@@ -55,7 +55,7 @@ def test_lines_say_what_is_known():
     ]
 
 
-def test_lines_do_not_say_what_is_not_known():
+def test_lines_omit_unknown_values():
     early = {"readings": plain(readings(seen(350.0), 1010.1)), "estimate": None}
     assert heading_line(early).endswith("not known before it has converged")
     blind = {"readings": plain(readings(seen(350.0, accel=False), 1010.1)), "estimate": None}
@@ -67,7 +67,7 @@ def test_lines_do_not_say_what_is_not_known():
     assert heading_line({"readings": None}) == "heading: no samples yet"
 
 
-def test_a_sensor_that_reads_nothing_has_no_heading():
+def test_sensor_without_readings_has_no_heading():
     dead = seen(350.0)
     dead.block.accel_b_m_s2[:] = 0.0
     dead.block.raw_b_gauss[:] = np.nan
@@ -79,6 +79,6 @@ def test_a_sensor_that_reads_nothing_has_no_heading():
     ]
 
 
-def test_turns_go_the_short_way():
+def test_turn_is_the_shorter_one():
     assert turned_deg(350.0, 10.0) == 20.0
     assert turned_deg(10.0, 350.0) == -20.0

@@ -1,4 +1,4 @@
-"""How `ahrsd status` says a share and what went wrong on the wire, whole lines."""
+"""Lines of `ahrsd status` about shares and transmission errors."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ NOTHING = dict.fromkeys(
         ({"port": "/p", "open": True}, "/p in use, 0 commands"),
     ],
 )  # fmt: skip
-def test_a_share_is_one_line(share, line):
+def test_share_is_one_line(share, line):
     assert share_lines({"shares": [{**NOTHING, **share}]}) == [f"share: {line}"]
 
 
@@ -53,6 +53,6 @@ def test_a_share_is_one_line(share, line):
         ({"faults": 1}, "errors: 1 VNERR"),
     ],
 )
-def test_what_went_wrong_on_the_wire_is_counted_in_english(counts, line):
+def test_transmission_errors_are_counted_in_words(counts, line):
     none = dict.fromkeys(("rejected", "skipped_bytes", "gaps", "restarts", "faults"), 0)
     assert errors_line({"stream": none | counts}) == line

@@ -1,4 +1,4 @@
-"""The socket beside the real daemon and an emulated device."""
+"""The socket with the real daemon and an emulated device."""
 
 import json
 import socket
@@ -31,7 +31,7 @@ def served(live, tmp_path):
 
 
 class Asking:
-    """A program that speaks to the socket by itself, as any language may."""
+    """A program that uses the socket directly, as in any language."""
 
     def __init__(self, path):
         self.socket = socket.socket(socket.AF_UNIX)
@@ -91,7 +91,7 @@ def test_status_explain_and_watch_of_a_running_daemon(served):
     assert all(len(one["raw_b_gauss"]) == len(one["time_s"]) for one in some)
 
 
-def test_readers_that_never_read_cost_no_sample(served):
+def test_blocked_readers_lose_no_sample(served):
     live, path = served
     until_status(path)
     with ExitStack() as sleepers:
@@ -107,7 +107,7 @@ def test_readers_that_never_read_cost_no_sample(served):
     assert facts.samples == pytest.approx(facts.expected, abs=1.0)
 
 
-def test_a_request_that_is_none_is_answered_and_the_connection_lives(tmp_path):
+def test_invalid_request_is_answered_and_the_connection_stays_open(tmp_path):
     server = SocketServer(tmp_path / "s")
     try:
         with Asking(tmp_path / "s") as asked:
@@ -137,7 +137,7 @@ def test_too_many_clients_and_a_second_daemon_are_refused(tmp_path):
         server.close()
 
 
-def test_what_a_dead_daemon_left_is_replaced(tmp_path):
+def test_socket_of_a_dead_daemon_is_replaced(tmp_path):
     path = tmp_path / "s"
     dead = socket.socket(socket.AF_UNIX)
     dead.bind(str(path))
@@ -147,12 +147,12 @@ def test_what_a_dead_daemon_left_is_replaced(tmp_path):
         server.close()
 
 
-def test_no_daemon_is_one_clear_line(tmp_path):
+def test_missing_daemon_is_a_one_line_error(tmp_path):
     with pytest.raises(DeviceError, match=r"no daemon answers .*; is `ahrsd run` running"):
         DaemonConnection(tmp_path / "none")
 
 
-def test_a_slow_reader_gets_a_gap_record(tmp_path):
+def test_slow_reader_gets_a_gap_record(tmp_path):
     server = SocketServer(tmp_path / "s", limit_bytes=20_000)
     try:
         with Asking(tmp_path / "s") as asked:
@@ -176,7 +176,7 @@ def test_a_slow_reader_gets_a_gap_record(tmp_path):
     assert json.dumps(seqs[0])  # plain values
 
 
-def test_clients_that_leave_while_records_come_end_nothing(tmp_path):
+def test_disconnecting_clients_do_not_stop_the_server(tmp_path):
     server = SocketServer(tmp_path / "s")
     try:
         server.status({"number": 0})
@@ -193,8 +193,8 @@ def test_clients_that_leave_while_records_come_end_nothing(tmp_path):
         server.close()
 
 
-def test_a_daemon_that_ends_before_it_read_the_question_has_ended(tmp_path):
-    """The kernel tells that end of a connection as a reset."""
+def test_daemon_that_ends_before_reading_a_request_is_reported_as_ended(tmp_path):
+    """The kernel reports that end of a connection as a reset."""
     with closing(socket.socket(socket.AF_UNIX)) as listening:
         listening.bind(str(tmp_path / "socket"))
         listening.listen()

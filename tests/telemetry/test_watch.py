@@ -1,4 +1,4 @@
-"""The live view: what fits on a terminal, the cause first."""
+"""The live view: fits a terminal, with the cause first."""
 
 from collections import deque
 
@@ -55,7 +55,7 @@ def shown(count, **changes):
     return captured.get()
 
 
-def test_gates_that_hold_are_listed_with_what_to_do_and_what_happened():
+def test_closed_gates_are_listed_with_advice_and_events():
     text = shown(2)
     assert "family.gate0" in text
     assert "family.gate1" in text
@@ -72,7 +72,7 @@ READINGS = {
 }  # fmt: skip
 
 
-def test_what_matters_stands_in_the_first_24_lines_of_80_columns():
+def test_essentials_are_in_the_first_24_lines_of_80_columns():
     text = shown(20, readings=READINGS, motion=motion(cells(level_ring)))
     first = text.splitlines()[:23]
     for words in (
@@ -89,7 +89,7 @@ def test_what_matters_stands_in_the_first_24_lines_of_80_columns():
     assert max(map(len, first)) <= 80
 
 
-def test_gates_that_cannot_be_measured_yet_for_one_reason_share_a_line():
+def test_unmeasured_gates_with_one_reason_share_a_line():
     body = status(4)
     for one in body["gates"][1:4]:
         one.update(value=None, advice="keep turning")
@@ -99,7 +99,7 @@ def test_gates_that_cannot_be_measured_yet_for_one_reason_share_a_line():
     assert "family.gate2" not in text.split("ahrsd")[0]
 
 
-def test_the_rest_is_a_key_away():
+def test_further_lines_can_be_scrolled():
     console, scroll = Console(width=80, height=24, force_terminal=False), Scroll()
     whole = screen(status(30), deque(), Pace())
     total = len(console.render_lines(whole))
@@ -128,7 +128,7 @@ def test_the_rest_is_a_key_away():
     assert scroll.ended
 
 
-def test_a_large_terminal_shows_all_of_it():
+def test_large_terminal_shows_everything():
     console, scroll = Console(width=120, height=200, force_terminal=False), Scroll()
     whole = screen(status(3), deque(), Pace())
     scroll.key("down")
@@ -136,7 +136,7 @@ def test_a_large_terminal_shows_all_of_it():
     assert scroll.top == 0
 
 
-def test_it_counts_down_to_the_last_gate():
+def test_countdown_to_the_last_gate_is_shown():
     pace, body = Pace(), status(1)
     for at_s in (0.0, 30.0, 60.0):
         body["gates"][0] |= {"value": at_s, "limit": 300.0}
@@ -145,11 +145,11 @@ def test_it_counts_down_to_the_last_gate():
     assert countdown(body, Pace()) == ""
 
 
-def test_motion_that_was_not_seen_yet_says_so():
+def test_missing_motion_is_reported():
     assert motion_line(status(1)) == "motion: none yet; next: drive"
 
 
-def test_lines_of_what_happened():
+def test_lines_of_events():
     assert event_line({"record": "note", "level": "warning", "text": "gone"}) == "warning: gone"
     assert "QUALIFIED" in event_line(
         {"record": "state", "old": "CANDIDATE", "new": "QUALIFIED", "reason": "all"}

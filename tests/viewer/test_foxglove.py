@@ -45,7 +45,7 @@ ESTIMATE = {
 }
 
 
-def test_samples_are_told_each_at_its_own_time_on_the_wall_clock():
+def test_samples_have_their_wall_clock_time():
     said = Topics(wall_offset_s=1e9).of(SAMPLES, 100.1)
     raw = [one for one in said if one.topic == "/magnetometer/raw"]
     assert [one.unix_ns for one in raw] == [1_000_000_100_000_000_000, 1_000_000_100_005_000_000]
@@ -55,7 +55,7 @@ def test_samples_are_told_each_at_its_own_time_on_the_wall_clock():
     assert rates[0] == {"x": 0.01, "y": 0.02, "z": 0.03}
 
 
-def test_a_cloud_holds_what_was_met_and_does_not_grow_at_rest():
+def test_point_cloud_has_all_directions_and_does_not_grow_at_rest():
     topics, clouds = Topics(0.0), []
     rng = np.random.default_rng(3)
     for k in range(300):
@@ -80,7 +80,7 @@ def test_an_estimate_with_its_sigmas():
     assert said.content["heading_sigma_deg"] == 0.7
 
 
-def test_a_status_says_attitude_and_what_holds_a_write(pytestconfig):
+def test_status_has_attitude_and_obstacles_to_a_write(pytestconfig):
     status = json.loads((pytestconfig.rootpath / "tests/page/qualified.json").read_text())
     attitude, write_back = Topics(0.0).of({**status, "record": "status"}, 5.0)
     assert attitude.content == {
@@ -94,7 +94,7 @@ def test_a_status_says_attitude_and_what_holds_a_write(pytestconfig):
     assert write_back.content["gates_shut"] == sum(not gate["ok"] for gate in status["gates"])
 
 
-def test_the_log_and_what_this_program_lost():
+def test_log_includes_records_lost_by_this_program():
     topics = Topics(0.0)
     note = {"record": "note", "host_s": 3.0, "level": "warning", "text": "the link was lost"}
     assert topics.of(note, 9.0)[0].content == ("warning", "the link was lost")
@@ -175,7 +175,7 @@ def test_a_foxglove_reads_every_topic_and_can_write_to_none(shown):
     assert process.wait(PATIENCE_S) == 0
 
 
-def test_without_a_daemon_it_says_so_once_and_waits(tmp_path):
+def test_missing_daemon_is_reported_once_and_awaited(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-m", "ahrsd", "foxglove", "--port", "0", "--state-directory", tmp_path],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -190,7 +190,7 @@ def test_without_a_daemon_it_says_so_once_and_waits(tmp_path):
     assert process.returncode == 0
 
 
-def test_a_port_that_is_taken_ends_in_one_line_and_75():
+def test_occupied_port_is_refused_in_one_line_with_code_75():
     with closing(socket.create_server(("127.0.0.1", 0))) as other:
         port = other.getsockname()[1]
         done = CliRunner().invoke(group, ["foxglove", "--port", str(port)])
@@ -199,13 +199,13 @@ def test_a_port_that_is_taken_ends_in_one_line_and_75():
     assert f"127.0.0.1 port {port}: Address already in use; --port" in str(done.exception)
 
 
-def test_an_address_that_is_none():
+def test_invalid_address_is_refused():
     done = CliRunner().invoke(group, ["foxglove", "--address", "rov.local"])
     assert done.exit_code == 2
     assert "--address rov.local: must be an IP address" in done.output
 
 
-def test_each_time_that_the_daemon_goes_is_said(tmp_path):
+def test_each_loss_of_the_daemon_is_reported(tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-m", "ahrsd", "foxglove", "--port", "0", "--state-directory", tmp_path],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

@@ -1,4 +1,4 @@
-"""The sink: nothing that happens to the viewer, its process or its disk reaches the caller."""
+"""The sink: no fault of the viewer, its process or its disk reaches the caller."""
 
 from __future__ import annotations
 
@@ -326,7 +326,7 @@ def test_points_show_the_newest_estimate_before_there_is_a_proposal(tmp_path):
     assert np.allclose(norm[100:, 1], FIELD_GAUSS, atol=0.03)
 
 
-def test_states_and_register_writes_are_told(story):
+def test_states_and_register_writes_are_recorded(story):
     states = [row[0] for row in values(story["/daemon/state"], "StateChange:state")]
     assert states == ["OBSERVING", *(new for _, _, new, _ in STORY)]
     log = [row[0] for row in values(story["/log/registers"], "text")]
@@ -340,14 +340,14 @@ def test_the_file_opens_with_its_own_layout(tmp_path):
     assert len(reader(tmp_path / "empty.rrd").blueprints()) == 1
 
 
-def test_clocks_that_are_not_known_yet_are_left_out(tmp_path):
+def test_unknown_clocks_are_left_out(tmp_path):
     record([Noted(math.nan, 3.0, "error", "no | text")], tmp_path / "run.rrd")
     notes = columns(tmp_path / "run.rrd")["/log/notes"]
     assert "device_time" not in notes.column_names
     assert seconds(notes, "host_time").tolist() == [3.0]
 
 
-def test_a_file_that_cannot_be_written_is_one_error_that_names_it(tmp_path):
+def test_unwritable_file_is_one_error_with_its_name(tmp_path):
     with pytest.raises(OSError, match=r"absent/run\.rrd.*No such file"):
         record([], tmp_path / "absent" / "run.rrd")
 
@@ -469,7 +469,7 @@ def test_nothing_is_sent_or_stored_about_the_user(tmp_path, monkeypatch):
     assert list(home.rglob("*")) == []
 
 
-def test_a_stopped_process_costs_events_but_no_time(tmp_path):
+def test_stopped_process_loses_events_and_does_not_block(tmp_path):
     with opened(tmp_path / "run.rrd") as sink:
         wait_for((tmp_path / "run.rrd").exists)
         os.kill(sink.pid, signal.SIGSTOP)
@@ -517,7 +517,7 @@ def readable(path: Path) -> dict[str, pyarrow.Table]:
         return {}  # being written
 
 
-def test_an_unwritable_path_is_counted_and_harms_nobody(tmp_path):
+def test_unwritable_path_is_counted_without_further_effect(tmp_path):
     with opened(tmp_path / "absent" / "run.rrd") as sink:
         took_s = push_all(sink, simulated_events(20.0))
         wait_for(lambda: sink.counters.faults >= 1)
@@ -538,7 +538,7 @@ def test_a_disk_that_fills_up_is_counted_and_tried_again(small_disk):
     assert sink.counters.faults >= 1
 
 
-def test_a_nearly_full_disk_is_left_to_those_who_need_it(small_disk):
+def test_nothing_is_written_to_a_nearly_full_disk(small_disk):
     limits = RerunLimits(reserve_bytes=1 << 20)
     with opened(small_disk / "run.rrd", limits=limits) as sink:
         push_all(sink, simulated_events(5.0))
@@ -591,7 +591,7 @@ def test_the_live_viewer_is_served_on_this_machine_only():
         assert sink.counters == SinkCounters()
 
 
-def test_next_part_never_takes_a_name_in_use(tmp_path):
+def test_next_part_never_has_an_existing_name(tmp_path):
     path = tmp_path / "run.rrd"
     assert free_part(path) == path
     for name in ("run.rrd", "run.split2.rrd", "run.split7.rrd", "run.splitx.rrd", "other.rrd"):

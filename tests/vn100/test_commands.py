@@ -1,4 +1,4 @@
-"""What can be said to the device at all, and how long an answer may take."""
+"""Which commands can be constructed, and how long an answer may take."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ def test_impossible_reads_and_writes_cannot_be_constructed():
         Write(23, (float("nan"), *IDENTITY[1:]))
 
 
-def test_a_slow_line_gets_more_patience():
+def test_reply_time_grows_for_a_slow_line():
     assert reply_time_s(921600) < 0.3 < reply_time_s(115200) < 0.5 < 2.0 < reply_time_s(9600)
 
 
-def test_a_word_is_answered_by_its_own_argument_only():
+def test_reply_must_have_the_argument_of_the_command():
     assert RESUME.answered_by(Reply("VNASY", None, ("1",)))
     assert not RESUME.answered_by(Reply("VNASY", None, ("0",)))
     assert not RESUME.answered_by(Reply("VNKMD", None, ("1",)))
     assert Word("VNWNV").answered_by(Reply("VNWNV", None, ()))
 
 
-def test_a_port_is_asked_for_and_must_be_in_the_reply():
+def test_reply_must_have_the_requested_port():
     assert Read(6, 1).body == "VNRRG,06,1"
     assert Read(6, 1).answered_by(Reply("VNRRG", 6, ("14", "1")))
     assert not Read(6, 1).answered_by(Reply("VNRRG", 6, ("14",)))

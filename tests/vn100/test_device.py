@@ -105,7 +105,7 @@ def test_a_read_returns_its_values_and_the_tap_sees_every_byte(scripted):
     assert all(isinstance(event, Measurement) for event in events)
 
 
-def test_by_default_nothing_but_reads_gets_out(scripted):
+def test_only_reads_are_permitted_by_default(scripted):
     with Device(SerialPort(scripted.path, 115200)) as device:
         for procedure in (write_verified(23, IDENTITY), quiet(read(23))):
             with pytest.raises(NotPermitted):
@@ -134,7 +134,7 @@ def hang(seconds):
     yield Pause(seconds)
 
 
-def test_what_takes_too_long_is_cancelled_and_the_output_resumed(scripted):
+def test_timeout_cancels_the_procedure_and_resumes_the_output(scripted):
     with Device(SerialPort(scripted.path, 115200), everything) as device:
         begin_s = time.monotonic()
         with pytest.raises(TookTooLong, match=r"0\.2 s"):
@@ -161,7 +161,7 @@ def test_ctrl_c_resumes_the_output_before_it_goes_on(scripted):
         assert scripted.heard[-1] == b"$VNASY,1*4E"
 
 
-def test_even_an_interrupted_clean_up_resumes_the_output_at_the_end(scripted):
+def test_interrupted_clean_up_resumes_the_output(scripted):
     def impatient(event):
         if isinstance(event, Measurement) and len(scripted.heard) >= 2 and len(pressed) < 2:
             pressed.append(True)
@@ -197,6 +197,6 @@ def test_faults_reach_the_caller(scripted):
     assert DeviceFault(0x0A) in events
 
 
-def test_a_word_and_a_write_have_names_for_people():
+def test_commands_have_readable_names():
     assert str(Word("VNASY", (0,))) == "VNASY,0"
     assert str(Write(23, IDENTITY)) == "write of register 23"

@@ -1,4 +1,4 @@
-"""A line that sends back what is sent: an echo of a command is no answer to it."""
+"""A line that echoes what is sent: the echo of a command is not its answer."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def outcome(events):
 
 
 @pytest.mark.parametrize("end", [b"\r\n", b"\r", b"\r\r\n"])
-def test_the_identity_is_the_devices_and_the_echo_is_told_once(end):
+def test_identity_is_read_despite_an_echo_that_is_reported_once(end):
     events = Line(end=end).run(identify())
     identity = outcome(events).result
     assert (identity.model, identity.firmware, identity.serial) == (
@@ -76,7 +76,7 @@ def test_the_identity_is_the_devices_and_the_echo_is_told_once(end):
     assert events.count(LineEchoes()) == 1
 
 
-def test_a_line_that_does_not_echo_is_not_said_to():
+def test_no_echo_is_reported_on_a_line_without_one():
     def procedure():
         values = yield from read_registers((1, 0))
         with pytest.raises(NoReply):  # answered without the port: reads like the command
@@ -89,7 +89,7 @@ def test_a_line_that_does_not_echo_is_not_said_to():
     assert LineEchoes() not in events
 
 
-def test_the_echo_of_a_write_does_not_confirm_it():
+def test_echo_of_a_write_does_not_confirm_it():
     def procedure():
         yield from read_registers((1,))
         yield Write(23, NEW)
@@ -100,7 +100,7 @@ def test_the_echo_of_a_write_does_not_confirm_it():
     assert isinstance(error, NoReply)
 
 
-def test_a_verified_write_goes_through():
+def test_verified_write_succeeds_on_an_echoing_line():
     def procedure():
         yield from read_registers((1,))
         return (yield from write_verified(23, NEW))
@@ -112,7 +112,7 @@ def test_a_verified_write_goes_through():
     assert isinstance(outcome(line.run(procedure())), ProcedureFailed)
 
 
-def test_a_save_that_is_only_echoed_is_no_save():
+def test_echo_of_a_save_does_not_confirm_it():
     def procedure():
         yield from read_registers((1,))
         yield from save_settings()

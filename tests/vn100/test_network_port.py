@@ -43,7 +43,7 @@ def until(condition, seconds=10.0):
 
 
 @pytest.mark.parametrize("telnet", [False, True], ids=["socket", "rfc2217"])
-def test_the_device_is_heard_and_asked(emulator, telnet):
+def test_device_is_received_and_queried_over_the_network(emulator, telnet):
     with DeviceServer(emulator.link, telnet=telnet) as server:
         found = detect_baud(server.url, may_query=True)
         assert found.baud == 115200
@@ -56,9 +56,7 @@ def test_the_device_is_heard_and_asked(emulator, telnet):
 
 
 @pytest.mark.parametrize("telnet", [False, True], ids=["socket", "rfc2217"])
-def test_a_connection_that_ends_is_a_lost_link_and_the_next_opening_finds_it_again(
-    emulator, telnet
-):
+def test_closed_connection_is_a_lost_link_and_can_be_reopened(emulator, telnet):
     with DeviceServer(emulator.link, telnet=telnet) as server:
         with SerialPort(server.url, 115200) as port:
             until(port.read)
@@ -69,7 +67,7 @@ def test_a_connection_that_ends_is_a_lost_link_and_the_next_opening_finds_it_aga
             until(again.read)
 
 
-def test_a_server_that_is_not_there_is_a_port_to_wait_for():
+def test_missing_server_is_an_absent_port():
     with socket.create_server(("127.0.0.1", 0)) as gone:
         url = f"socket://127.0.0.1:{gone.getsockname()[1]}"
     with pytest.raises(PortAbsent, match=r"is the device server on, is it on this network\?"):
@@ -77,7 +75,7 @@ def test_a_server_that_is_not_there_is_a_port_to_wait_for():
 
 
 @pytest.mark.parametrize("wrong", ["socket://nowhere", "socket://:4001", "rfc2217://a:b"])
-def test_a_url_without_a_host_or_port_says_what_is_expected(wrong):
+def test_incomplete_url_is_refused_with_the_expected_form(wrong):
     with pytest.raises(PortUnusable, match=r"expected (socket|rfc2217)://HOST:PORT"):
         SerialPort(wrong, 115200)
 
@@ -91,5 +89,5 @@ def test_a_url_without_a_host_or_port_says_what_is_expected(wrong):
         ("socket:", "socket:"),
     ],
 )
-def test_a_path_has_its_slashes_back(given, text):
+def test_url_slashes_are_restored(given, text):
     assert spelled(given) == text

@@ -131,7 +131,7 @@ def run(device, procedure, allow=lambda _: True):
     return end.result
 
 
-def test_identify():
+def test_identify_reads_model_firmware_and_serial_number():
     device = Device()
     assert run(device, identify()) == Identity(
         "VN-100S-CR", 7, 100130608, "3.1.0.0", profile_of("3.1.0.0")
@@ -139,14 +139,14 @@ def test_identify():
     assert device.log == ["VNRRG,01", "VNRRG,02", "VNRRG,03", "VNRRG,04"]
 
 
-def test_an_unreadable_hardware_revision_does_not_matter():
+def test_unreadable_hardware_revision_is_ignored():
     device = Device()
     device.ram[2] = "7B"
     identity = run(device, identify())
     assert (identity.hardware, identity.serial) == (None, 100130608)
 
 
-def test_identify_survives_what_an_earlier_program_left_half_sent():
+def test_identify_works_after_a_partial_command_of_another_program():
     device = Device()
     spoilt = iter([b"$VNERR,04*75\r\n"])
     answer = device.answer
@@ -199,7 +199,7 @@ def test_a_write_is_echoed_and_read_back_through_the_devices_own_rounding():
     ]
 
 
-def test_a_device_that_keeps_something_else_is_found_out_and_left_talking():
+def test_altered_write_fails_verification_and_output_is_resumed():
     device = Device()
     device.keeps[23] = NO_CALIBRATION
     with pytest.raises(VerifyFailed) as caught:
@@ -210,7 +210,7 @@ def test_a_device_that_keeps_something_else_is_found_out_and_left_talking():
     assert device.async_on
 
 
-def test_a_write_whose_echo_never_comes_is_judged_by_the_fresh_read():
+def test_write_without_a_reply_is_verified_by_a_read():
     device = Device()
     device.deaf.add("VNWRG,84")
     with pytest.raises(VerifyFailed):
@@ -242,7 +242,7 @@ def test_output_is_on_again_after_every_refusal(code, command):
     assert device.log[-1] == "VNASY,1"
 
 
-def test_output_is_asked_for_again_when_pausing_it_got_no_answer():
+def test_output_is_resumed_when_the_pause_was_not_answered():
     device = Device()
     device.deaf.add("VNASY,0")
     device.async_on = False  # it was carried out, the answer got lost
@@ -259,7 +259,7 @@ def test_saving_sends_one_vnwnv():
     assert device.log == ["VNWNV"]
 
 
-def test_settings_are_put_back_in_an_order_that_always_fits():
+def test_settings_are_restored_in_an_order_that_fits_the_baud_rate():
     device = Device()
     device.ram.update({6: "14", 7: "40", 75: "1,16,15,0001,000C,0014", 76: "2,80,01,0008"})
     saved = run(device, read_registers(SESSION_SETTINGS))
@@ -276,7 +276,7 @@ def test_settings_are_put_back_in_an_order_that_always_fits():
     ]
 
 
-def test_what_needs_no_restoring_is_not_written():
+def test_unchanged_settings_are_not_written():
     device = Device()
     saved = run(device, read_registers(CONFIGURATION[:9]))
     device.log.clear()
@@ -284,7 +284,7 @@ def test_what_needs_no_restoring_is_not_written():
     assert all(line.startswith("VNRRG") for line in device.log)
 
 
-def test_one_setting_that_cannot_be_put_back_does_not_keep_the_others_out():
+def test_failed_setting_does_not_prevent_the_restoration_of_others():
     device = Device()
     saved = run(device, read_registers((6, 7, 44)))
     device.ram.update({6: "0", 7: "100", 44: "1,3,5"})
@@ -296,7 +296,7 @@ def test_one_setting_that_cannot_be_put_back_does_not_keep_the_others_out():
     assert device.async_on
 
 
-def test_differences_names_old_and_new():
+def test_differences_have_old_and_new_values():
     assert differences({23: NEW_23, 75: (0, 1, 0)}, {23: NEW_23, 75: (0, 1, 0)}) == {}
     saved = {44: (0, 1, 5), 6: (14,), 7: (40,)}
     now = {44: (1, 3, 5), 6: (14,), 30: (0, 0, 0, 0, 1, 0, 1)}
@@ -347,14 +347,14 @@ def test_the_stream_is_set_up_on_the_port_in_use(port, other_type, own_type):
 
 
 @pytest.mark.parametrize("port", [1, 2])
-def test_without_port_parameters_the_port_is_found_by_silence(port):
+def test_port_is_found_by_silence_without_port_parameters(port):
     device = Device(port)
     device.knows_ports = False
     assert run(device, configure_stream(100, 115200)).values[0] == port
     assert device.ram[75] == f"{port},8,06,0001,083F"
 
 
-def test_the_other_ports_outputs_are_left_to_it():
+def test_outputs_of_the_other_port_are_unchanged():
     device = Device(1)
     device.ram.update({75: "2,16,01,0008", 76: "3,8,01,0009", 77: "1,4,01,0101"})
     stream = run(device, configure_stream(100, 115200))
@@ -380,7 +380,7 @@ def test_firmware_without_saturation_flags_gets_the_shorter_packet():
 
 
 @pytest.mark.parametrize("problem", ["no room", "0C", "no stream"])
-def test_what_fails_leaves_the_settings_as_they_were(problem):
+def test_failed_set_up_restores_the_settings(problem):
     device = Device()
     if problem == "no room":
         device.ram.update({75: "2,16,01,0008", 76: "3,8,01,0009", 77: "2,4,01,0101"})
@@ -395,7 +395,7 @@ def test_what_fails_leaves_the_settings_as_they_were(problem):
     assert device.async_on
 
 
-def test_reads_alone_pass_a_gate_that_lets_only_reads_pass():
+def test_configuration_is_read_through_a_read_only_gate():
     device, sent = Device(), []
 
     def gate(command):

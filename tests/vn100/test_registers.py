@@ -134,14 +134,14 @@ def test_command_round_trips_float32_in_fixed_point(values):
 
 
 @given(value=F32)
-def test_the_devices_own_rounding_is_the_same(value):
+def test_values_rounded_by_the_device_are_equal(value):
     printed = f"{np.float32(value):G}"
     assert same(50, (value, 0.0, 0.0), parse(50, [printed, "0", "0"]))
     assert same(50, (value, 0.0, 0.0), (float(np.float32(value)), 0.0, 0.0))
 
 
 @given(value=st.floats(1e-30, 1e30), sign=st.sampled_from([-1.0, 1.0]))
-def test_a_change_in_the_sixth_digit_is_not_the_same(value, sign):
+def test_change_in_the_sixth_digit_is_a_difference(value, sign):
     changed = float(np.float32(sign * value * 1.00002))
     assert not same(50, (sign * value, 0.0, 0.0), (changed, 0.0, 0.0))
     assert not same(50, (sign * value, 0.0, 0.0), (-sign * value, 0.0, 0.0))
@@ -188,7 +188,7 @@ def test_same_compares_integers_text_and_lengths_exactly():
         (9999, [], 0x08, "no register 9999"),
     ],
 )
-def test_parse_names_register_field_and_token(register, tokens, code, says):
+def test_parse_error_names_register_field_and_token(register, tokens, code, says):
     with pytest.raises(RegisterValueError, match=str(register)) as caught:
         parse(register, tokens)
     assert caught.value.code == code
@@ -237,7 +237,7 @@ def test_command_refuses_what_the_device_would(register, values, code, says):
     assert says in str(caught.value)
 
 
-def test_dust_is_refused_with_advice_and_as_stored_removes_it():
+def test_tiny_values_are_refused_and_removed_by_as_stored():
     dust = (1.1234567e-20, 0.0, 0.0) * 4
     with pytest.raises(RegisterValueError, match="as_stored"):
         format_command(84, tuple(v or 3.3e-25 for v in dust))

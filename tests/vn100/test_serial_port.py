@@ -93,7 +93,7 @@ def another_program(path, code):
             process.kill()
 
 
-def test_bytes_both_ways(pty):
+def test_bytes_are_transferred_in_both_directions(pty):
     with SerialPort(pty.path, 115200) as port:
         assert port.read() == b""
         os.write(pty.master, YMR)
@@ -130,7 +130,7 @@ def test_a_file_is_no_serial_port(tmp_path):
         "pass",
     ],
 )
-def test_a_port_in_use_names_its_holder_and_is_left_alone(pty, lock):
+def test_port_in_use_is_refused_with_its_holder(pty, lock):
     settings = termios.tcgetattr(pty.master)
     with another_program(pty.path, lock) as pid:
         with pytest.raises(PortBusy) as caught:
@@ -142,7 +142,7 @@ def test_a_port_in_use_names_its_holder_and_is_left_alone(pty, lock):
     SerialPort(pty.path, 115200).close()
 
 
-def test_our_own_second_opening_is_refused_too(pty):
+def test_second_opening_by_the_same_process_is_refused(pty):
     with SerialPort(pty.path, 115200), pytest.raises(PortBusy, match="in use"):
         SerialPort(pty.path, 115200)
     SerialPort(pty.path, 115200).close()
@@ -164,7 +164,7 @@ def test_both_locks_are_held_and_released(pty):
         os.close(other)
 
 
-def test_whoever_serves_a_pty_is_no_holder():
+def test_server_of_a_pty_is_not_a_holder():
     serve = (
         "import os, time\nm, s = os.openpty()\nprint(os.ttyname(s), flush=True)\ntime.sleep(60)\n"
     )
@@ -191,7 +191,7 @@ def test_hang_up_is_link_lost_for_reading_and_writing(pty):
         port.read()
 
 
-def test_writing_waits_for_a_slow_reader_and_not_for_ever(pty):
+def test_write_waits_for_a_slow_reader_up_to_a_limit(pty):
     data = os.urandom(100_000)
     taken = bytearray()
 
@@ -271,7 +271,7 @@ def test_the_last_good_rate_is_tried_first(pty):
     assert talking.heard == b""
 
 
-def test_a_wrong_configured_rate_is_found_by_listening_alone(pty):
+def test_right_rate_is_found_by_listening(pty):
     with device(pty, 921600) as talking:
         found = detect_baud(pty.path, configured=57600, may_query=True)
     assert found.baud == 921600
@@ -281,7 +281,7 @@ def test_a_wrong_configured_rate_is_found_by_listening_alone(pty):
     assert talking.heard == b""
 
 
-def test_a_quiet_device_is_asked_only_where_that_is_allowed(pty):
+def test_silent_device_is_queried_only_if_permitted(pty):
     with device(pty, 57600, streams=False) as talking:
         with pytest.raises(BaudNotFound) as caught:
             detect_baud(pty.path, 57600, listen_s=0.03)
@@ -293,7 +293,7 @@ def test_a_quiet_device_is_asked_only_where_that_is_allowed(pty):
     assert found.why == "an answer came at 57600 baud, the configured rate"
 
 
-def test_garbage_at_every_rate_is_told_from_silence(pty):
+def test_garbage_is_distinguished_from_silence(pty):
     with device(pty, 0) as talking, pytest.raises(BaudNotFound) as caught:
         detect_baud(pty.path, listen_s=0.05)
     assert not caught.value.silent
@@ -302,7 +302,7 @@ def test_garbage_at_every_rate_is_told_from_silence(pty):
     assert talking.heard == b""
 
 
-def test_a_rate_that_the_adapter_cannot_do_is_passed_over(pty, monkeypatch):
+def test_rate_that_the_adapter_lacks_is_skipped(pty, monkeypatch):
     real = SerialPort.set_baud
 
     def cannot(port, baud):
@@ -316,7 +316,7 @@ def test_a_rate_that_the_adapter_cannot_do_is_passed_over(pty, monkeypatch):
     assert [heard.baud for heard in found.tried] == [921600]
 
 
-def test_the_latency_timer_is_read_where_there_is_one(tmp_path):
+def test_latency_timer_is_read_if_present(tmp_path):
     folder = tmp_path / "class" / "tty" / "ttyUSB7" / "device"
     folder.mkdir(parents=True)
     (folder / "latency_timer").write_text("16\n")

@@ -1,6 +1,7 @@
-"""The conversation: which reply answers, what late and foreign ones do, what always goes out.
+"""The conversation: which reply belongs to a command, late and foreign replies, and commands
+that are always sent.
 
-Lines are the manual's or recorded ones, except in the property test, which computes its own.
+Lines are from the manual or recorded, except in the property test, which computes its own.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def checksum(body):
     return f"${body}*{value:02X}\r\n".encode()
 
 
-def test_a_read_is_asked_in_ascii_and_answered():
+def test_read_is_sent_and_its_reply_returned():
     s = session()
     assert s.start(read(23), 0.0) == []
     assert s.take_output() == READ_23
@@ -103,7 +104,7 @@ def test_a_measurement_never_answers_a_read_and_keeps_its_place():
     assert events[1].result[:3] == (6.38, 0.023, -1.953)
 
 
-def test_a_reply_about_another_register_is_somebody_elses():
+def test_reply_about_another_register_is_stray():
     s = session()
     s.start(read(23), 0.0)
     (event,) = s.receive(REPLY_25, 0.1)
@@ -114,7 +115,7 @@ def test_a_reply_about_another_register_is_somebody_elses():
     assert s.receive(REPLY_23, 0.3) == [ProcedureFinished(IDENTITY)]
 
 
-def test_a_reply_with_nonsense_in_it_is_no_reply():
+def test_malformed_reply_is_stray():
     s = session()
     s.start(read(44), 0.0)
     (event,) = s.receive(checksum("VNRRG,44,0,nan,5"), 0.1)
@@ -132,7 +133,7 @@ def test_the_echo_of_a_write_must_be_what_was_sent():
     assert isinstance(event, ProcedureFinished)
 
 
-def test_silence_is_asked_three_times_then_no_reply():
+def test_silence_causes_three_attempts_and_no_reply():
     s = session()
     s.start(read(23), 0.0)
     assert s.take_output() == READ_23
@@ -182,7 +183,7 @@ def test_a_refusal_without_a_command_is_a_fault():
     assert session().receive(error(0x07), 0.0) == [DeviceFault(0x07)]
 
 
-def test_a_late_reply_answers_the_repeated_command_and_a_barrier_catches_the_second():
+def test_late_reply_answers_the_repeated_command_and_a_barrier_absorbs_the_second():
     def twice():
         first = yield from read(23)
         second = yield from read(23)
@@ -228,7 +229,7 @@ def test_a_late_reply_with_the_old_values_does_not_verify_a_write():
     assert not s.busy
 
 
-def test_errors_during_a_barrier_are_the_earlier_commands():
+def test_errors_during_a_barrier_belong_to_the_earlier_command():
     def sequence():
         with pytest.raises(NoReply):
             yield Read(85)
@@ -245,7 +246,7 @@ def test_errors_during_a_barrier_are_the_earlier_commands():
     assert s.receive(REPLY_23, 1.35) == [ProcedureFinished(IDENTITY)]
 
 
-def test_a_silent_barrier_is_tried_with_another_register_then_the_command_must_be_unmistakable():
+def test_silent_barrier_is_retried_and_ambiguous_commands_are_not_sent():
     def sequence():
         for command in (Read(23), Read(23), Read(25)):
             with pytest.raises(NoReply):
@@ -360,7 +361,7 @@ def test_nothing_is_sent_when_the_link_is_gone():
     assert s.take_output() == ASY_0
 
 
-def test_saving_waits_longer_asks_once_and_watches_for_errors():
+def test_save_has_a_longer_timeout_and_one_attempt():
     s = session()
     s.start(save_settings(), 0.0)
     assert s.take_output() == WNV
@@ -381,7 +382,7 @@ def test_saving_waits_longer_asks_once_and_watches_for_errors():
     assert s.take_output() == b""
 
 
-def test_a_pause_says_what_was_heard():
+def test_pause_returns_what_was_received():
     s = session()
     s.start(one(Pause(0.3)), 0.0)
     s.receive(YMR + YMR, 0.1)
@@ -390,7 +391,7 @@ def test_a_pause_says_what_was_heard():
     assert event.result.tokens == ("VNYMR",)
 
 
-def test_half_a_message_is_given_up_after_a_silence():
+def test_partial_message_is_dropped_after_silence():
     s = session()
     s.receive(YMR[:50], 0.0)
     assert s.deadline_s == pytest.approx(0.5)
@@ -400,7 +401,7 @@ def test_half_a_message_is_given_up_after_a_silence():
     assert isinstance(event, Measurement)
 
 
-def test_half_a_message_waits_for_a_retransmission_on_the_network():
+def test_partial_message_waits_longer_on_the_network():
     s = session()
     s.receive(YMR[:50], 0.0)
     assert s.tick(0.4) == []
@@ -410,7 +411,7 @@ def test_half_a_message_waits_for_a_retransmission_on_the_network():
 
 
 def asked_then(command):
-    """A read, and the command right behind it; how often that came too late."""
+    """A read, and a command directly after it; returns how often that was too late."""
     late = 0
     while True:
         yield Read(23)
@@ -430,7 +431,7 @@ def asked_then(command):
     ],
     ids=["write", "save"],
 )
-def test_what_must_be_right_behind_an_answer_is_held_back_where_that_is_old(command, sent):
+def test_command_that_needs_a_recent_answer_is_withheld_when_it_is_old(command, sent):
     talk = session()
     talk.start(asked_then(command), 0.0)
     assert talk.take_output() == READ_23
@@ -442,7 +443,7 @@ def test_what_must_be_right_behind_an_answer_is_held_back_where_that_is_old(comm
     assert events == [ProcedureFinished(1)]
 
 
-def test_an_answer_to_a_repeated_question_may_be_to_the_first_and_is_old():
+def test_answer_to_a_repeated_read_counts_as_old():
     talk = session()
     talk.start(asked_then(Word("VNWNV", behind=True)), 0.0)
     talk.take_output()
@@ -456,7 +457,7 @@ def test_an_answer_to_a_repeated_question_may_be_to_the_first_and_is_old():
     assert talk.take_output() == WNV
 
 
-def test_a_barrier_that_lasts_makes_the_answer_before_it_too_old():
+def test_answer_before_a_long_barrier_is_too_old():
     talk = session()
     talk.start(asked_then(Word("VNWNV", behind=True)), 0.0)
     talk.tick(0.4)

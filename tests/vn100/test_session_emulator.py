@@ -133,7 +133,7 @@ FAULTS = [
 
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_verified_is_true_under_every_fault_and_the_output_comes_back(fault, seed):
+def test_verified_write_is_in_the_device_under_every_fault(fault, seed):
     """What must change: the write may fail, with a typed error. What must not: a verified write is
     in the memory, and once the fault is over the device streams (a resume may be needed)."""
     bench = Bench(Setup(seed=seed, faults=(fault,), rate_hz=20))
@@ -149,7 +149,7 @@ def test_verified_is_true_under_every_fault_and_the_output_comes_back(fault, see
     assert len(bench.measurements(1.0)) == pytest.approx(20, abs=1)
 
 
-def test_a_device_that_never_loses_a_command_is_never_left_silent():
+def test_output_is_on_again_if_no_command_is_lost():
     """Replies may be lost, late or wrong: as long as commands arrive, the output is on again."""
     for fault in ("lost_reply=0.5", "late_reply=0.7", "wrong_reply=0.5", "duplicate=0.5"):
         for seed in range(5):
@@ -175,7 +175,7 @@ def test_on_a_pty_from_an_unknown_rate_to_a_verified_write(baud):
         assert served.emulator.memory.get(84) == tuple(float(v) for v in np.float32(NEW_23))
 
 
-def test_the_session_costs_nearly_nothing_beside_deframing_and_decoding():
+def test_session_costs_little_compared_with_parsing():
     bench = Bench(Setup(output="binary", rate_hz=800, baud=921600))
     chunks = []
     for _ in range(500):

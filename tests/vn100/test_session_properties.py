@@ -1,7 +1,7 @@
-"""Random conversations on a bad line: what was verified is there, what was read is fresh.
+"""Random conversations on a bad line: verified values are in the device, and reads are fresh.
 
-The line keeps its order, as a wire does; replies are lost or late, commands are lost, damaged or
-not kept, and another program talks in between.
+The line keeps its order, as a wire does. Replies are lost or late, commands are lost, damaged or
+not carried out, and another program sends in between.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def test_verified_means_that_the_device_holds_the_values(faults, foreign, writes
     faults=st.lists(FAULTS, max_size=20),
     foreign=st.lists(FOREIGN.filter(lambda kind: kind != "read"), max_size=20),
 )
-def test_a_read_never_returns_what_was_there_before_it_was_asked(faults, foreign):
+def test_read_never_returns_an_outdated_value(faults, foreign):
     wire, s, now_s = Wire(iter(faults)), Session(lambda command: True), 0.0
     strangers, answers = iter(foreign), 0
     for number in range(8):

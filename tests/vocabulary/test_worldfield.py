@@ -106,7 +106,7 @@ def test_the_two_models_agree_within_tens_of_nanotesla(place, year) -> None:
     assert np.linalg.norm(difference_nt) > 0.01  # they are two models
 
 
-def test_the_igrf_has_the_words_and_errors_of_the_wmm() -> None:
+def test_igrf_has_the_text_and_errors_of_the_wmm() -> None:
     field = world_field(*SEATTLE, 1960.0, "igrf")
     assert field.total_sigma_gauss == pytest.approx(138e-5)
     assert field.heading_usable
@@ -132,7 +132,7 @@ def test_the_igrf_has_the_words_and_errors_of_the_wmm() -> None:
         ((10.0, 10.0, 0.0), math.nan, "no world magnetic model for the year nan"),
     ],
 )
-def test_what_is_not_known_is_refused_in_one_line(place, year, words) -> None:
+def test_unknown_position_or_date_is_refused_in_one_line(place, year, words) -> None:
     with pytest.raises(WorldFieldError) as refused:
         world_field(*place, year)
     assert words in str(refused.value)

@@ -1,6 +1,6 @@
-"""Another unit takes over the cable: what was judged of one device never reaches another.
+"""Another unit takes over the cable: a decision about one unit never reaches another.
 
-Judged by the units' own records (`cabled_units`), which share nothing with the project.
+Judged by the units' own records (`cabled_units`), which share no code with the project.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from cabled_run import FIRST, SPARE, CabledRun, two_units
 from ahrsd.inputs import Operator
 
 STREAMS = pytest.mark.parametrize("binary", [False, True], ids=["VNIMU", "packets"])
-#: which command, and whether the stream is binary: both kinds by turns
+#: which command, and whether the stream is binary: both kinds alternately
 QUICK_WRITE = ((1, False), (17, True), (33, False), (49, True))
 QUICK_SAVE = ((1, False), (16, True), (31, False))
 
 
 def untouched(run: CabledRun) -> None:
-    """The spare unit is as it left the factory, and both numbers were told."""
+    """The spare unit is in factory state, and both serial numbers were reported."""
     spare = run.cable.units[SPARE]
     assert spare.writes == []
     assert spare.saves == []
@@ -26,7 +26,7 @@ def untouched(run: CabledRun) -> None:
 
 
 @STREAMS
-def test_the_whole_way_on_one_unit(binary):
+def test_whole_write_on_one_unit(binary):
     run = CabledRun(two_units(binary=binary))
     unit = run.cable.unit
     run.proven()
@@ -42,7 +42,7 @@ def test_the_whole_way_on_one_unit(binary):
 
 @STREAMS
 @pytest.mark.parametrize("bound", [None, FIRST])
-def test_before_the_approval(binary, bound):
+def test_exchange_before_the_approval_leaves_the_spare_unit_untouched(binary, bound):
     run = CabledRun(two_units(binary=binary), serial=bound)
     assert run.until("QUALIFIED")
     wanted = run.core.writeback.proposal.id
@@ -64,8 +64,8 @@ def test_before_the_approval(binary, bound):
         for how in ((False, 0.6), (True, 2.0))
     ],
 )
-def test_at_every_command_of_the_write(binary, at, silent_s):
-    """The cable goes at the n-th command after the approval."""
+def test_exchange_at_any_command_of_the_write_leaves_the_spare_unit_untouched(binary, at, silent_s):
+    """The cable is moved at the n-th command after the approval."""
     run = CabledRun(two_units(binary=binary))
     first, heard = run.cable.unit, []
     assert run.until("QUALIFIED")
@@ -94,7 +94,7 @@ def test_at_every_command_of_the_write(binary, at, silent_s):
         pytest.param("proven", False, marks=pytest.mark.slow),
     ],
 )
-def test_while_the_values_are_on_trial_or_proven(binary, when):
+def test_exchange_in_trial_or_proven_leaves_the_spare_unit_untouched(binary, when):
     run = CabledRun(two_units(binary=binary))
     if when == "trial":
         run.approve()
@@ -108,7 +108,7 @@ def test_while_the_values_are_on_trial_or_proven(binary, when):
     assert run.cable.units[FIRST].saves == []
     run.cable.swap(FIRST)
     run.run(15.0)
-    # it restarted and has its old values; a stream without the device's time does not prove that
+    # it restarted with its old values; a stream without device time does not prove that
     assert run.kinds()[-1] in ("LOST", "REVERTED", "ROLLED_BACK")
     assert len(run.cable.units[FIRST].writes) == 2
 
@@ -121,7 +121,7 @@ def test_while_the_values_are_on_trial_or_proven(binary, when):
         for at in range(1, 36, 5)
     ],
 )
-def test_at_every_command_of_the_save(binary, at):
+def test_exchange_at_any_command_of_the_save_leaves_the_spare_unit_untouched(binary, at):
     run = CabledRun(two_units(binary=binary))
     run.proven()
     first, heard = run.cable.unit, []
@@ -144,7 +144,7 @@ def test_at_every_command_of_the_save(binary, at):
     "at",
     [pytest.param(at, marks=[] if at % 8 == 1 else pytest.mark.slow) for at in range(1, 22, 4)],
 )
-def test_a_rollback_writes_nothing_into_another_unit(binary, at):
+def test_rollback_writes_nothing_to_another_unit(binary, at):
     run = CabledRun(two_units(binary=binary))
     run.approve()
     assert run.until("TRIAL")
@@ -170,10 +170,10 @@ def test_a_rollback_writes_nothing_into_another_unit(binary, at):
     "steps",
     [pytest.param(n, marks=[] if n in (16, 28) else pytest.mark.slow) for n in range(16, 30)],
 )
-def test_a_unit_that_has_the_cable_while_a_save_ends_confirms_nothing(steps):
-    """It starts up there, so a time falls; the first one did not restart and is back.
-
-    Up to the end of the window behind VNWNV, in which nobody asks who has the cable.
+def test_unit_connected_during_the_end_of_a_save_confirms_nothing(steps):
+    """The spare unit starts there, so the device time decreases, while the first unit did not
+    restart and returns. Up to the end of the window after VNWNV in which the identity is not
+    read.
     """
     run, saved = CabledRun(two_units(binary=True)), []
     first, spare = run.cable.units[FIRST], run.cable.units[SPARE]
@@ -189,7 +189,7 @@ def test_a_unit_that_has_the_cable_while_a_save_ends_confirms_nothing(steps):
     run.step()
     run.cable.unit = first
     run.run(40.0)
-    assert run.state in ("COMMITTED", "FAULT")  # FAULT: that one answered in the middle of it
+    assert run.state in ("COMMITTED", "FAULT")  # FAULT: the spare unit answered during the save
     assert spare.writes == spare.saves == []
-    first.restart()  # and now it did
+    first.restart()  # now the first unit did restart
     assert run.until("CONFIRMED", 40.0), run.notes

@@ -1,4 +1,4 @@
-"""`ahrsd run` itself on a pty: the cable goes to another unit before and behind an approval."""
+"""`ahrsd run` on a pty: the cable is moved to another unit before and after an approval."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ def until(log: Path, words: str, process: subprocess.Popen[bytes]) -> None:
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("bound", [FIRST])
-def test_the_program_notices_another_unit_and_writes_nothing_into_it(tmp_path, bound):
-    """A text stream without device time; the device is bound by its serial number."""
+def test_program_notices_another_unit_and_writes_nothing_to_it(tmp_path, bound):
+    """A text stream without device time; the configuration binds the serial number."""
     config, log = tmp_path / "ahrsd.toml", tmp_path / "log"
     config.write_text(CONFIG.format(folder=tmp_path, serial=bound))
     with Served() as served, log.open("wb") as out:

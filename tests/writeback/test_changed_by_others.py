@@ -1,4 +1,4 @@
-"""Registers that somebody else changed: what was un-mapped through the old ones proves nothing."""
+"""Registers changed by another program: data un-mapped through the old values prove nothing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def estimate() -> Estimate:
 
 @pytest.fixture
 def observing() -> VirtualRun:
-    """A run that would write what its calibrator says, as soon as a person approves it."""
+    """A run that would write the estimate of its calibrator as soon as a person approves it."""
     policy = WriteBackPolicy(mode=Mode.STAGE, armed_at_start=True, max_change_auto_deg=180.0)
     device = build(Setup("rov", seed=3, output="imu", rate_hz=50))
     run = VirtualRun(device, core_settings(Config(), policy=policy), step_s=0.1)
@@ -37,7 +37,7 @@ def observing() -> VirtualRun:
     return run
 
 
-def test_the_check_before_a_write_finds_it_and_the_calibration_begins_anew(observing):
+def test_check_before_a_write_finds_a_foreign_change_and_restarts_the_calibration(observing):
     run = observing
     planted = PlantedCalibrator(run.core.calibrator, estimate())
     run.core.calibrator = planted
@@ -50,11 +50,11 @@ def test_the_check_before_a_write_finds_it_and_the_calibration_begins_anew(obser
     assert ("warning", "somebody changed registers [23]: calibrated anew") in run.notes
     assert run.writes == 0
     assert run.core.registers[23] == pytest.approx(OTHER)
-    run.run(15.0)  # the device is asked again before its samples count
+    run.run(15.0)  # the registers are read again before the samples count
     assert run.core.calibrator.started
 
 
-def test_a_restart_of_the_device_explains_what_changed(observing):
+def test_change_explained_by_a_restart_does_not_restart_the_calibration(observing):
     run = observing
     before = run.core.calibrator
     run.emulator.memory.ram[23, 0] = OTHER
@@ -64,7 +64,7 @@ def test_a_restart_of_the_device_explains_what_changed(observing):
     assert not [text for _, text in run.notes if "somebody" in text]
 
 
-def test_what_differs_only_as_the_device_prints_it_is_the_same():
+def test_values_that_differ_only_by_printing_are_equal():
     record = DeviceRecord()
     written = (1.0569499731063843, *IDENTITY[1:])
     printed = (1.05695, *IDENTITY[1:])
@@ -73,4 +73,4 @@ def test_what_differs_only_as_the_device_prints_it_is_the_same():
     assert record.on_registers_read({23: OTHER}, {23: printed}, 1) == [23]
     assert (
         record.on_registers_read({23: IDENTITY}, {23: OTHER}, 2) == []
-    )  # the link was lost meanwhile
+    )  # the link was lost in between

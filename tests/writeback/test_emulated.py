@@ -1,4 +1,4 @@
-"""The write-back with the real session on the emulated device: bytes, retries, every fault."""
+"""The write-back with the real session on the emulated device: bytes, retries and every fault."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HOLDS_OLD = (State.OBSERVING, State.CANDIDATE, State.QUALIFIED, State.ROLLED_BAC
 
 
 class Bench:
-    """A core of a few lines, an emulated device, and one clock for both."""
+    """A minimal core, an emulated device, and one clock for both."""
 
     def __init__(self, setup, estimate):
         self.emulator = build(setup)
@@ -61,7 +61,7 @@ class Bench:
                 self.identify()
 
     def step(self):
-        """Bytes both ways, once."""
+        """Exchanges bytes in both directions once."""
         self.do(self.wb.on_interlock(True, self.now_s))
         self.do(self.wb.tick(self.now_s))
         if self.waiting and not self.session.busy:
@@ -125,7 +125,7 @@ def make_estimate():
 
 
 def begin(setup):
-    """A device that is known, and a candidate that an operator approves; the fault comes later."""
+    """A known device and a candidate that an operator approves; the fault comes later."""
     from ahrsd.events import GateResult
 
     bench = Bench(setup, make_estimate())
@@ -140,7 +140,7 @@ def begin(setup):
 
 
 @pytest.mark.parametrize("firmware", ["3.0", "3"])
-def test_the_registers_reach_the_device_exactly(firmware):
+def test_registers_reach_the_device_exactly_and_are_rolled_back(firmware):
     bench, old, new = begin(Setup(firmware=firmware, rate_hz=40))
     assert bench.until(lambda: bench.wb.state is State.TRIAL, 5.0)
     assert bench.held == new
@@ -153,7 +153,7 @@ def test_the_registers_reach_the_device_exactly(firmware):
     assert bench.emulator.counters != before  # it streams
 
 
-def test_firmware_2_with_its_estimator_applied_is_left_alone():
+def test_firmware_2_with_applied_onboard_estimator_is_not_written():
     bench, old, _ = begin(Setup(firmware="2", rate_hz=40))
     bench.until(lambda: False, 2.0)
     assert bench.wb.state is State.QUALIFIED
@@ -167,13 +167,13 @@ FAULTS = [
     "byte_drop=0.01", "bit_flip=0.01", "noise_insert=0.5", "garbage=0.3", "duplicate=0.7",
     "burst_latency=60", "false_header=0.5", "mute",
 ]  # fmt: skip
-CHECK_S, WRITE_S = 3.0, (3.28, 3.31, 3.33)  # when a transaction that begins at 3.0 does what
+CHECK_S, WRITE_S = 3.0, (3.28, 3.31, 3.33)  # steps of a transaction that begins at 3.0
 SCHEDULES = [
     *(f"{fault}@{at_s}+6" for fault in FAULTS for at_s in (CHECK_S, *WRITE_S)),
     *(f"{fault}@{at_s}" for fault in ("reset", "power_cut") for at_s in (3.1, *WRITE_S)),
     *(f"power_cut_wrg={n}@3.1" for n in (1, 2)),
 ]
-#: each fault from the check on, and from one moment of the write, another for the next fault
+#: each fault from the check on, and from one moment of the write that differs between faults
 QUICK = [
     *(f"{fault}@{at_s}+6" for k, fault in enumerate(FAULTS) for at_s in (CHECK_S, WRITE_S[k % 3])),
     *(one for one in SCHEDULES if one.startswith(("reset", "power_cut"))),
@@ -181,7 +181,7 @@ QUICK = [
 
 
 def come_to_rest(bench):
-    """Until nothing is under way; a person asks a FAULT to look again when the line is good."""
+    """Runs until nothing is in progress; after a FAULT a person requests a check on a good line."""
 
     def at_rest():
         return bench.wb.state is State.TRIAL or bench.settled()
@@ -198,8 +198,8 @@ def come_to_rest(bench):
     "fault",
     [pytest.param(one, marks=() if one in QUICK else pytest.mark.slow) for one in SCHEDULES],
 )
-def test_under_every_fault_the_machine_and_the_device_agree(fault):
-    """What may change: how far it comes. What must not: both say the same when it is over."""
+def test_machine_and_device_agree_after_every_fault(fault):
+    """How far the write comes may vary. Afterwards machine and device must agree."""
     bench, old, new = begin(Setup(seed=1, firmware="3", faults=(fault,), rate_hz=20))
     come_to_rest(bench)
     assert bench.wb.state in (State.TRIAL, *HOLDS_OLD)
@@ -207,7 +207,7 @@ def test_under_every_fault_the_machine_and_the_device_agree(fault):
 
 
 @pytest.mark.parametrize("at_s", [3.0, 3.1, 3.2])
-def test_what_somebody_else_writes_meanwhile_stays(at_s):
+def test_foreign_value_written_during_a_write_stays(at_s):
     bench, old, _ = begin(Setup(firmware="3", faults=(f"third_party_change@{at_s}",), rate_hz=20))
     come_to_rest(bench)
     assert bench.held[23] != old[23]

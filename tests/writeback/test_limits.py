@@ -1,4 +1,4 @@
-"""Budgets, locks, stops, and what the journal's history makes of its records."""
+"""Budgets, locks, stops, and the history that is derived from the journal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DAY_S = 86400.0
 
 
 def another(rig, shift_gauss=0.0):
-    """One more transaction, as far as it goes, with another hard iron."""
+    """One more transaction with another hard iron, as far as it goes."""
     rig.pass_time(0.1)
     rig.verdict(hard_iron_gauss=np.array([0.03 + shift_gauss, 0.04, -0.02]))
     if rig.wb.state is State.QUALIFIED:
@@ -37,7 +37,7 @@ def at(boot_s, boot_id="one", wall_s=None):
     return Stamp(1.8e9 + boot_s if wall_s is None else wall_s, boot_id, boot_s)
 
 
-def test_ram_writes_keep_their_distance_and_their_number():
+def test_ram_writes_are_limited_by_interval_and_number():
     policy = WriteBackPolicy()
     history = JournalHistory(ram_writes_at=(at(1000.0),))
     assert "599 s ago" in ram_budget(policy, history, Now(at(1599.0)))[0]
@@ -51,11 +51,11 @@ def test_ram_writes_keep_their_distance_and_their_number():
     ("now", "granted"),
     [
         (at(9.0 + DAY_S), True),
-        (at(9.0 + DAY_S, wall_s=1.8e9 + 9.0 + DAY_S - 3600.0), False),  # an hour behind
+        (at(9.0 + DAY_S, wall_s=1.8e9 + 9.0 + DAY_S - 3600.0), False),  # one hour behind
         (at(9.0 + DAY_S, wall_s=1.8e9 + 9.0 + 2 * DAY_S), True),
         (at(9.0 + 3600.0, wall_s=1.8e9 + 9.0 + 2 * DAY_S), False),  # set forward by a day
-        (at(9.0 + DAY_S, wall_s=1e6), True),  # of 1970, which says nothing; boottime does
-        (at(8.0, wall_s=2e9), False),  # boottime never falls: not understood
+        (at(9.0 + DAY_S, wall_s=1e6), True),  # in 1970, which says nothing; boottime does
+        (at(8.0, wall_s=2e9), False),  # boottime never decreases: not understood
         (at(50.0, "two", wall_s=1e6), False),
         (at(50.0, "two", wall_s=1.8e9 + 9.0 + DAY_S + 3600.0), False),  # may be an hour ahead
         (at(50.0, "two", wall_s=1.8e9 + 9.0 + DAY_S + 7500.0), True),
@@ -64,7 +64,7 @@ def test_ram_writes_keep_their_distance_and_their_number():
         (at(DAY_S, "", wall_s=1.9e9), True),
     ],
 )
-def test_no_clock_that_is_wrong_or_set_gives_a_budget(now, granted):
+def test_wrong_or_set_clock_grants_no_budget(now, granted):
     history = JournalHistory(ram_writes_at=(at(9.0),) * 6, flashes_at=(at(9.0),), flashes=1)
     assert (ram_budget(WriteBackPolicy(), history, Now(now)) == []) is granted
     assert (flash_budget(WriteBackPolicy(), history, Now(now)) == []) is granted
@@ -73,14 +73,14 @@ def test_no_clock_that_is_wrong_or_set_gives_a_budget(now, granted):
 
 
 @pytest.mark.parametrize("wall_s", [1e6, None, 1.8e9])
-def test_records_of_an_older_version_count_until_this_run_is_a_day_old(wall_s):
+def test_records_without_clocks_count_until_the_run_is_a_day_old(wall_s):
     history = JournalHistory(flashes_at=(Stamp(wall_s),), flashes=1)
     present = at(9 * DAY_S, wall_s=1.8e9 + 3600.0)
     assert flash_budget(WriteBackPolicy(), history, Now(present, DAY_S - 1.0)) != []
     assert flash_budget(WriteBackPolicy(), history, Now(present, DAY_S)) == []
 
 
-def test_a_record_of_1970_is_as_old_as_one_behind_it():
+def test_record_dated_1970_is_as_old_as_the_next_record():
     early = Stamp(4000.0, "one", 30.0)
     history = JournalHistory(flashes_at=(early,), flashes=1, newest_at=at(90.0))
     assert flash_budget(WriteBackPolicy(), history, Now(at(5.0, "two"))) != []
@@ -88,7 +88,7 @@ def test_a_record_of_1970_is_as_old_as_one_behind_it():
     assert flash_budget(WriteBackPolicy(), history, Now(later)) == []
 
 
-def test_flash_by_day_and_by_life():
+def test_flash_writes_are_limited_per_day_and_per_lifetime():
     policy = WriteBackPolicy()
     one = JournalHistory(flashes=1, flashes_at=(at(0.0),))
     assert flash_budget(policy, one, Now(at(DAY_S))) == []
@@ -98,7 +98,7 @@ def test_flash_by_day_and_by_life():
     assert worn == ["200 flash writes of this device, limit 200"]
 
 
-def test_thirty_days_of_changing_iron_stay_within_the_budget(make_rig):
+def test_flash_budget_holds_over_thirty_days_of_changing_iron(make_rig):
     rig = make_rig()
     rig.connect()
     for hour in range(30 * 24):
@@ -108,14 +108,14 @@ def test_thirty_days_of_changing_iron_stay_within_the_budget(make_rig):
             rig.live()
         if rig.wb.state is State.PROVEN:
             rig.stand_still()
-    # an iron of another hour is not saved, so not quite one a day
+    # an outdated iron is not saved, so slightly less than one per day
     assert 20 <= rig.device.flash_writes <= 30
     times = [stamp.boot_s for stamp in rig.wb.history.flashes_at]
     assert rig.wb.history.flashes == rig.device.flash_writes
     assert np.diff(times).min() >= DAY_S
 
 
-def test_after_a_rollback_a_day_of_rest_and_twice_the_margin(make_rig):
+def test_rollback_requires_a_day_of_rest_and_twice_the_margin(make_rig):
     rig = rolled_back(make_rig)
     assert rig.wb.margin == 2.0
     another(rig, 0.02)
@@ -131,7 +131,7 @@ def test_after_a_rollback_a_day_of_rest_and_twice_the_margin(make_rig):
     assert len(rig.sent) == sent + 2
 
 
-def test_two_rollbacks_lock_for_good(make_rig):
+def test_two_rollbacks_lock_permanently(make_rig):
     rig = rolled_back(make_rig, cooldown_s=0.0, min_interval_s=0.0)
     another(rig)
     rig.live(field_spread=0.5)
@@ -147,7 +147,7 @@ def test_two_rollbacks_lock_for_good(make_rig):
     assert rig.wb.state is State.TRIAL
 
 
-def test_a_proven_write_forgives_an_earlier_rollback(make_rig):
+def test_proven_write_clears_an_earlier_rollback(make_rig):
     rig = rolled_back(make_rig, cooldown_s=0.0, min_interval_s=0.0)
     another(rig)
     rig.live()
@@ -156,7 +156,7 @@ def test_a_proven_write_forgives_an_earlier_rollback(make_rig):
 
 
 @pytest.mark.parametrize("when", ["resting", "trial"])
-def test_a_lock_undoes_what_is_only_in_ram(make_rig, when):
+def test_lock_undoes_values_that_are_only_in_ram(make_rig, when):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     if when == "trial":
@@ -168,7 +168,7 @@ def test_a_lock_undoes_what_is_only_in_ram(make_rig, when):
     assert any("locked: race day" in text for text in rig.wb.obstacles())
 
 
-def test_a_lock_while_saving_does_not_interrupt_it(make_rig):
+def test_lock_does_not_interrupt_a_save(make_rig):
     rig = make_rig()
 
     def lock(command):
@@ -181,7 +181,7 @@ def test_a_lock_while_saving_does_not_interrupt_it(make_rig):
     assert rig.wb.state is State.LOCKED
 
 
-def test_an_unknown_command_is_answered(make_rig):
+def test_unknown_command_is_answered_with_the_possible_ones(make_rig):
     rig = make_rig()
     rig.do(rig.wb.on_operator("explode", "", rig.now_s))
     assert "possible: arm, disarm, approve, lock, unlock, rollback" in rig.notes("warning")[-1]
@@ -195,7 +195,7 @@ def test_an_unknown_command_is_answered(make_rig):
 @pytest.mark.parametrize(
     ("keep", "prove", "kept"), [(False, True, False), (True, False, False), (True, True, True)]
 )
-def test_a_stop_undoes_ram_unless_it_is_proven_and_to_be_kept(make_rig, keep, prove, kept):
+def test_stop_undoes_ram_unless_proven_and_configured_to_keep(make_rig, keep, prove, kept):
     rig = make_rig(Mode.STAGE, keep_on_stop=keep)
     rig.connect()
     another(rig)
@@ -204,13 +204,13 @@ def test_a_stop_undoes_ram_unless_it_is_proven_and_to_be_kept(make_rig, keep, pr
     rig.do(rig.wb.on_stop(rig.now_s))
     assert rig.wb.idle
     assert (rig.device.held() != rig.device.held("flash")) is kept
-    assert rig.wb.history.rollbacks == 0  # a stop says nothing about the values
+    assert rig.wb.history.rollbacks == 0  # a stop is no verdict on the values
     if kept:
         rig.back("program")
         assert rig.wb.state is State.PROVEN
 
 
-def test_a_stop_before_the_write_sends_nothing_more(make_rig):
+def test_stop_before_the_write_sends_nothing(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     rig.verdict()
@@ -226,7 +226,7 @@ def test_a_stop_before_the_write_sends_nothing_more(make_rig):
 
 @pytest.mark.parametrize("code", [2, 3, 4, 5, 6, 7, 8, 9, 0x0C])
 @pytest.mark.parametrize("number", [23, 84])
-def test_a_refused_write_leaves_the_device_as_it_was(make_rig, code, number):
+def test_refused_write_leaves_the_device_unchanged(make_rig, code, number):
     rig = make_rig(Mode.STAGE)
     before = rig.device.held()
     refusals = iter([code])
@@ -244,7 +244,7 @@ def test_a_refused_write_leaves_the_device_as_it_was(make_rig, code, number):
     assert rig.device.asynchronous
 
 
-def test_a_device_that_cannot_be_put_back_is_a_fault_with_the_lines_to_type(make_rig):
+def test_failed_rollback_is_a_fault_with_the_commands_to_type(make_rig):
     rig = make_rig(Mode.STAGE)
     writes = []
 
@@ -264,7 +264,7 @@ def test_a_device_that_cannot_be_put_back_is_a_fault_with_the_lines_to_type(make
     assert rig.device.held() == rig.device.held("flash")
 
 
-def test_a_third_party_that_writes_before_us_wins(make_rig):
+def test_foreign_write_before_ours_aborts_the_transaction(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     rig.pass_time(0.1)
@@ -278,7 +278,7 @@ def test_a_third_party_that_writes_before_us_wins(make_rig):
     assert rig.asked_again == 1
 
 
-def test_a_third_party_that_writes_between_check_and_write_is_a_fault(make_rig):
+def test_foreign_write_between_check_and_write_is_a_fault(make_rig):
     rig = make_rig(Mode.STAGE)
 
     def writes(command):
@@ -289,12 +289,12 @@ def test_a_third_party_that_writes_between_check_and_write_is_a_fault(make_rig):
     rig.whole_way()
     assert rig.sent == []
     assert rig.wb.state is State.FAULT
-    rig.do(rig.wb.on_stop(rig.now_s))  # a stop does not overwrite what somebody else wrote
+    rig.do(rig.wb.on_stop(rig.now_s))  # a stop does not overwrite foreign values
     assert rig.sent == []
     assert rig.wb.idle
 
 
-def test_a_journal_that_cannot_be_read_in_the_trial_is_an_alarm_not_forgetting(make_rig):
+def test_unreadable_journal_in_a_trial_is_a_fault_with_the_commands_to_type(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     another(rig)
@@ -307,15 +307,15 @@ def test_a_journal_that_cannot_be_read_in_the_trial_is_an_alarm_not_forgetting(m
     assert rig.device.held() == rig.device.held("flash")
 
 
-def test_the_gate_itself_asks_everything_again(make_rig):
+def test_command_gate_checks_all_conditions_itself(make_rig):
     rig = make_rig()
     rig.connect()
     rig.pass_time(0.1)
-    rig.verdict()  # says the gyro's bias, without which it would not be still
+    rig.verdict()  # with the gyro bias, without which it would not count as still
     rig.stand_still()
     safe, now_s = rig.wb._safe, rig.now_s
     write, save = Write(23, rig.device.ram[23]), Word("VNWNV")
-    assert not safe.allow(write, Purpose.STAGE, now_s)  # nobody has spoken in this run
+    assert not safe.allow(write, Purpose.STAGE, now_s)  # no approval in this run
     assert not safe.allow(save, Purpose.SAVE, now_s)
     rig.do(rig.wb.on_operator("arm", "", now_s))
     assert safe.allow(write, Purpose.STAGE, now_s)
@@ -336,7 +336,7 @@ def test_the_gate_itself_asks_everything_again(make_rig):
     )
 
 
-def test_samples_are_marked_unusable_while_registers_are_in_doubt(make_rig):
+def test_samples_are_unusable_while_registers_are_in_doubt(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     another(rig)
@@ -347,7 +347,7 @@ def test_samples_are_marked_unusable_while_registers_are_in_doubt(make_rig):
 # -- history ---------------------------------------------------------------------------------------
 
 
-def test_the_history_of_the_file_is_the_history_that_was_lived(make_rig):
+def test_history_from_the_journal_equals_that_of_the_run(make_rig):
     rig = rolled_back(make_rig, cooldown_s=0.0, min_interval_s=0.0)
     another(rig)
     rig.live()
@@ -355,7 +355,7 @@ def test_the_history_of_the_file_is_the_history_that_was_lived(make_rig):
 
 
 def row(value: float) -> list[float]:
-    """Of register 23 or 84, the last value."""
+    """The value of register 23 or 84 with this last element."""
     return [1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, value]
 
 
@@ -376,8 +376,10 @@ def writes(value: float) -> dict[str, object]:
         ([("ROLLED_BACK", {}), ("CLIENT_WRITES", {"new": {"23": ["x"]}})], True),
     ],
 )
-def test_which_values_were_only_tried(more, tried):
-    """Those that nobody saved, wrote by hand or had for right; a value that stays is none."""
+def test_trial_values_are_recognised(more, tried):
+    """Values that were neither saved, nor written by hand, nor accepted as correct; an unchanged
+    value is none of them.
+    """
     facts = {
         "txn": "x", "serial": 1, "firmware": "3.1.0.0", "old": {"23": row(1), "84": row(5)},
         "new": {"23": row(2), "84": row(5)}, "snapshot": {}, "heading_change_deg": 1.0,
@@ -391,7 +393,7 @@ def test_which_values_were_only_tried(more, tried):
 
 
 @pytest.mark.parametrize("old", [{"23": [1]}, {}])
-def test_a_transaction_whose_values_are_no_registers_forbids_writing(old):
+def test_journal_record_with_invalid_registers_forbids_writing(old):
     facts = {
         "txn": "x", "serial": 1, "firmware": "3.1.0.0", "old": old, "new": {"23": [2]},
         "snapshot": {}, "heading_change_deg": 1.0, "approver": "auto",
@@ -399,7 +401,7 @@ def test_a_transaction_whose_values_are_no_registers_forbids_writing(old):
     assert JournalHistory.of([SimpleNamespace(kind="PREPARED", facts=facts)]).broken == "PREPARED"
 
 
-def test_a_record_that_cannot_be_understood_forbids_writing(make_rig):
+def test_incomprehensible_journal_record_forbids_writing(make_rig):
     record = SimpleNamespace(kind="PREPARED", facts={"txn": "x"})
     history = JournalHistory.of([record])
     assert history.broken == "PREPARED"
@@ -430,7 +432,7 @@ def block(time_s, rate=0.0, shake=0.0, accel=True, gap=False):
         ({"accel": False}, "still for 0.0 s"),
     ],
 )
-def test_still(changes, reason):
+def test_motion_is_detected_in_field_and_rates(changes, reason):
     still = Stillness(StillPolicy())
     for k in range(10):
         still.update(block(k * 0.4 + 0.01 * np.arange(40), **changes), np.full(3, 0.01))
@@ -438,7 +440,7 @@ def test_still(changes, reason):
     assert why is None if reason is None else reason in (why or "")
 
 
-def test_not_still_without_samples_after_a_gap_or_when_they_are_old():
+def test_stillness_needs_recent_samples_without_a_gap():
     still = Stillness(StillPolicy())
     assert still.find_motion(0.0) is not None
     still.update(block(0.01 * np.arange(400)), np.full(3, 0.01))
@@ -448,7 +450,7 @@ def test_not_still_without_samples_after_a_gap_or_when_they_are_old():
     assert "still for 1.0 s" in (still.find_motion(11.0) or "")
 
 
-def test_a_movement_ends_the_rest_and_old_shaking_is_forgotten():
+def test_motion_ends_stillness_until_it_is_long_enough_ago():
     still = Stillness(StillPolicy())
     still.update(block(0.01 * np.arange(400), shake=0.5), np.full(3, 0.01))
     assert "varies" in (still.find_motion(4.0) or "")
@@ -458,7 +460,7 @@ def test_a_movement_ends_the_rest_and_old_shaking_is_forgotten():
     assert still.find_motion(8.1) is not None
 
 
-def test_without_a_verdict_for_flash_nothing_is_saved(make_rig):
+def test_nothing_is_saved_without_a_verdict_of_the_flash_gates(make_rig):
     rig = make_rig()
     rig.connect()
     rig.pass_time(0.1)
@@ -471,7 +473,7 @@ def test_without_a_verdict_for_flash_nothing_is_saved(make_rig):
     assert any("no gate has judged" in text for text in rig.wb.obstacles())
 
 
-def test_a_new_process_saves_nothing_before_its_own_gates_have_judged(make_rig):
+def test_new_process_saves_nothing_before_its_own_gates_and_proof(make_rig):
     rig = make_rig()
     rig.connect()
     rig.pass_time(0.1)
@@ -484,14 +486,14 @@ def test_a_new_process_saves_nothing_before_its_own_gates_have_judged(make_rig):
     assert rig.device.flash_writes == 0
     rig.verdict()
     rig.stand_still()
-    assert rig.device.flash_writes == 0  # nor before it has proven them itself
+    assert rig.device.flash_writes == 0  # nor before it has proven the values itself
     assert any("on trial again" in text for text in rig.wb.obstacles())
     rig.live()
     rig.stand_still()
     assert rig.device.flash_writes == 1
 
 
-def test_a_device_that_was_read_anew_is_not_saved_by_the_gates_of_before(make_rig):
+def test_gate_verdicts_from_before_a_reconciliation_do_not_allow_a_save(make_rig):
     rig = make_rig()
     rig.connect()
     rig.pass_time(0.1)

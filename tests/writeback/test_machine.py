@@ -1,4 +1,4 @@
-"""The way from a verdict to a confirmed flash, and everything that must stop it."""
+"""The path from a verdict to a confirmed flash, and all that must stop it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STAGED = ["PREPARED", "RAM_VERIFIED"]
 COMMITTED = [*STAGED, "PROVEN", "FLASH_SENT", "FLASH_ACKED"]
 
 
-def test_the_whole_way_to_confirmed(make_rig):
+def test_whole_path_to_confirmed(make_rig):
     rig = make_rig()
     rig.whole_way()
     assert rig.wb.state is State.COMMITTED
@@ -35,7 +35,7 @@ def test_the_whole_way_to_confirmed(make_rig):
     assert rig.notes("error") == []
 
 
-def test_nothing_is_sent_before_the_record_is_on_the_disk(make_rig):
+def test_nothing_is_sent_before_the_record_is_journaled(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     rig.verdict()
@@ -55,7 +55,7 @@ def test_nothing_is_sent_before_the_record_is_on_the_disk(make_rig):
     assert rig.wb.state is State.TRIAL
 
 
-def test_observe_says_to_the_byte_what_it_would_write_and_sends_nothing(make_rig):
+def test_observe_prints_the_exact_commands_and_sends_nothing(make_rig):
     rig = make_rig(Mode.OBSERVE, approval="auto", armed_at_start=True, max_change_auto_deg=90.0)
     rig.whole_way()
     assert rig.wb.state is State.QUALIFIED
@@ -70,7 +70,7 @@ def test_observe_says_to_the_byte_what_it_would_write_and_sends_nothing(make_rig
     assert any("mode is observe" in reason for reason in rig.wb.obstacles())
 
 
-def test_stage_proves_in_ram_and_never_saves(make_rig):
+def test_stage_proves_values_in_ram_and_never_saves(make_rig):
     rig = make_rig(Mode.STAGE)
     flash = rig.device.held("flash")
     rig.whole_way()
@@ -89,7 +89,7 @@ def test_stage_proves_in_ram_and_never_saves(make_rig):
         ({"registers": 84}, "could not be read"),
     ],
 )
-def test_a_doubtful_device_is_observed_only(make_rig, limit, reason):
+def test_doubtful_device_is_only_observed(make_rig, limit, reason):
     from drivers.vn100.commands import Identity
     from drivers.vn100.registers import profile_of
 
@@ -111,7 +111,7 @@ def test_a_doubtful_device_is_observed_only(make_rig, limit, reason):
     assert any(reason in text for text in rig.wb.obstacles())
 
 
-def test_another_device_on_the_port_is_not_written(make_rig):
+def test_device_with_another_serial_number_is_not_written(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     rig.do(rig.wb.on_link_lost(rig.now_s))
@@ -124,7 +124,7 @@ def test_another_device_on_the_port_is_not_written(make_rig):
     assert any("this is the device 42" in text for text in rig.wb.obstacles())
 
 
-def test_an_applied_onboard_estimator_holds_the_write(make_rig):
+def test_applied_onboard_estimator_prevents_the_write(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.device.ram[44] = (1, 3, 5)
     rig.whole_way()
@@ -134,7 +134,7 @@ def test_an_applied_onboard_estimator_holds_the_write(make_rig):
 
 
 @pytest.mark.parametrize("gates", ["RED", "none"])
-def test_no_write_with_a_red_gate_or_without_gates(make_rig, gates):
+def test_no_write_with_a_closed_gate_or_without_gates(make_rig, gates):
     rig = make_rig(Mode.STAGE, approval="auto", armed_at_start=True, max_change_auto_deg=90.0)
     rig.connect()
     rig.pass_time(0.1)
@@ -144,7 +144,7 @@ def test_no_write_with_a_red_gate_or_without_gates(make_rig, gates):
     assert rig.wb.state is State.TRIAL
 
 
-def test_an_unconverged_or_small_change_is_no_candidate(make_rig):
+def test_unconverged_or_small_change_is_no_candidate(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     rig.verdict(converged=False)
@@ -162,7 +162,7 @@ def test_an_unconverged_or_small_change_is_no_candidate(make_rig):
 # -- approval --------------------------------------------------------------------------------------
 
 
-def test_only_the_right_id_approves(make_rig):
+def test_approval_needs_the_id_of_the_proposal(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     rig.pass_time(0.1)
@@ -174,7 +174,7 @@ def test_only_the_right_id_approves(make_rig):
     assert rig.wb.state is State.TRIAL
 
 
-def test_what_is_approved_is_what_is_written_although_the_estimate_drifts(make_rig):
+def test_approved_values_are_written_although_the_estimate_drifts(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     rig.pass_time(0.1)
@@ -185,12 +185,12 @@ def test_what_is_approved_is_what_is_written_although_the_estimate_drifts(make_r
     assert rig.device.held()[23] == pytest.approx(seen.new[23], abs=1e-6)
 
 
-def test_a_candidate_that_moved_needs_a_new_yes(make_rig):
+def test_changed_candidate_needs_a_new_approval(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     rig.verdict()
     first = rig.wb.proposal.id
-    rig.do(rig.wb.on_operator("approve", first, rig.now_s))  # the vehicle has not said yes yet
+    rig.do(rig.wb.on_operator("approve", first, rig.now_s))  # the vehicle has not permitted it yet
     rig.verdict(hard_iron_gauss=np.array([0.06, 0.04, -0.02]))
     rig.pass_time(0.1)
     assert rig.wb.state is State.QUALIFIED
@@ -198,7 +198,7 @@ def test_a_candidate_that_moved_needs_a_new_yes(make_rig):
     assert rig.device.log == []
 
 
-def test_an_approval_expires(make_rig):
+def test_approval_expires(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.safe = False
     rig.connect()
@@ -213,7 +213,7 @@ def test_an_approval_expires(make_rig):
     assert rig.device.log == []
 
 
-def test_auto_approves_small_changes_only(make_rig):
+def test_auto_approves_only_small_changes(make_rig):
     large = make_rig(Mode.STAGE, approval="auto", armed_at_start=True)
     large.connect()
     large.pass_time(0.1)
@@ -228,7 +228,7 @@ def test_auto_approves_small_changes_only(make_rig):
     assert small.journal[0].facts["approver"] == "auto"
 
 
-def test_a_run_writes_by_itself_only_when_a_person_armed_it(make_rig):
+def test_automatic_write_needs_arming_by_a_person(make_rig):
     rig = make_rig(Mode.COMMIT, approval="auto", max_change_auto_deg=90.0, commit_unattended=True)
     rig.connect()
     rig.pass_time(0.1)
@@ -238,7 +238,7 @@ def test_a_run_writes_by_itself_only_when_a_person_armed_it(make_rig):
     assert not any(isinstance(command, Write) for command in rig.device.log)
     rig.do(rig.wb.on_operator("arm", "", rig.now_s))
     assert rig.wb.state is State.TRIAL
-    rig.do(rig.wb.on_operator("disarm", "", rig.now_s))  # on trial still, but nothing is saved
+    rig.do(rig.wb.on_operator("disarm", "", rig.now_s))  # still on trial, but nothing is saved
     rig.live(turns=2.5)
     rig.stand_still()
     assert rig.wb.state is State.PROVEN
@@ -250,7 +250,7 @@ def test_a_run_writes_by_itself_only_when_a_person_armed_it(make_rig):
     assert rig.device.flash_writes == 1
 
 
-def test_nobody_is_armed_after_a_restart_but_an_approved_write_goes_its_way(make_rig):
+def test_restart_disarms_and_an_approved_write_continues(make_rig):
     for approve in (False, True):
         auto = {} if approve else {"approval": "auto", "max_change_auto_deg": 90.0}
         rig = make_rig(Mode.COMMIT, commit_unattended=True, **auto)
@@ -266,7 +266,7 @@ def test_nobody_is_armed_after_a_restart_but_an_approved_write_goes_its_way(make
         assert rig.wb.state is (State.COMMITTED if approve else State.PROVEN)
 
 
-def test_flash_needs_an_operator_or_the_explicit_setting(make_rig):
+def test_save_needs_an_operator_or_the_explicit_setting(make_rig):
     for allowed in (False, True):
         rig = make_rig(
             approval="auto",
@@ -283,7 +283,7 @@ def test_flash_needs_an_operator_or_the_explicit_setting(make_rig):
 
 
 @pytest.mark.parametrize("word", ["none", "unsafe", "old", "future"])
-def test_no_byte_without_the_vehicles_fresh_word(make_rig, word):
+def test_nothing_is_sent_without_a_recent_permission_of_the_vehicle(make_rig, word):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     if word == "unsafe":
@@ -297,7 +297,7 @@ def test_no_byte_without_the_vehicles_fresh_word(make_rig, word):
     assert rig.device.log == []
 
 
-def test_a_word_withdrawn_between_two_writes_undoes_the_first(make_rig):
+def test_permission_withdrawn_between_two_registers_undoes_the_first(make_rig):
     rig = make_rig(Mode.STAGE)
     before = rig.device.held()
 
@@ -315,7 +315,7 @@ def test_a_word_withdrawn_between_two_writes_undoes_the_first(make_rig):
 
 
 @pytest.mark.parametrize("how", ["unsafe", "silent"])
-def test_a_word_withdrawn_in_the_trial_rolls_back(make_rig, how):
+def test_permission_withdrawn_in_a_trial_rolls_back(make_rig, how):
     rig = make_rig(Mode.STAGE)
     before = rig.device.held()
     rig.connect()
@@ -333,7 +333,7 @@ def test_a_word_withdrawn_in_the_trial_rolls_back(make_rig, how):
     assert rig.device.held() == before
 
 
-def test_a_trial_may_be_allowed_to_live_through_driving(make_rig):
+def test_trial_may_be_configured_to_continue_while_driving(make_rig):
     rig = make_rig(Mode.STAGE, trial=TrialPolicy(interlock=False))
     rig.connect()
     rig.pass_time(0.1)
@@ -367,7 +367,7 @@ def in_trial(make_rig, **policy):
         {"heading_jump_deg": float("nan")},
     ],
 )
-def test_a_bad_calibration_is_rolled_back_at_once(make_rig, bad):
+def test_bad_calibration_is_rolled_back_at_once(make_rig, bad):
     rig = in_trial(make_rig)
     rig.live(duration_s=10.0, **bad)
     assert rig.wb.state is State.ROLLED_BACK
@@ -378,7 +378,7 @@ def test_a_bad_calibration_is_rolled_back_at_once(make_rig, bad):
     assert [e.register for e in undone] == [23, 84]
 
 
-def test_worse_for_a_minute_is_rolled_back_a_moment_is_not(make_rig):
+def test_trial_fails_if_worse_for_a_minute_and_not_for_a_moment(make_rig):
     rig = in_trial(make_rig)
     worse = {"new_figure": 1.2, "old_figure": 1.0}
     rig.live(duration_s=100.0, **worse)
@@ -390,7 +390,7 @@ def test_worse_for_a_minute_is_rolled_back_a_moment_is_not(make_rig):
     assert rig.wb.state is State.ROLLED_BACK
 
 
-def test_it_ends_after_its_time_or_its_turns_and_never_while_worse(make_rig):
+def test_trial_ends_by_time_or_turns_and_never_while_worse(make_rig):
     rig = in_trial(make_rig)
     rig.live(duration_s=599.0, turns=1.9)
     rig.live(duration_s=650.0, turns=2.5, new_figure=1.2, old_figure=1.0)
@@ -402,7 +402,7 @@ def test_it_ends_after_its_time_or_its_turns_and_never_while_worse(make_rig):
     assert turned.wb.state is State.PROVEN
 
 
-def test_unjudged_is_not_proven(make_rig):
+def test_trial_without_a_verdict_is_rolled_back(make_rig):
     rig = in_trial(make_rig, trial=TrialPolicy(interlock=False))
     for _ in range(7):
         rig.now_s += 10.0
@@ -425,7 +425,7 @@ def proven(make_rig, **policy):
     return rig
 
 
-def test_flash_waits_for_stillness(make_rig):
+def test_save_waits_for_stillness(make_rig):
     rig = proven(make_rig)
     rig.stand_still(rate_rad_s=0.02)
     rig.stand_still(seconds=2.5)
@@ -435,8 +435,8 @@ def test_flash_waits_for_stillness(make_rig):
     assert rig.wb.state is State.COMMITTED
 
 
-def test_a_move_at_the_last_moment_holds_vnwnv(make_rig):
-    """The gate right before VNWNV: the newest proof of stillness is too old by then."""
+def test_motion_at_the_last_moment_prevents_vnwnv(make_rig):
+    """The check immediately before VNWNV: the latest proof of stillness is too old by then."""
     rig = proven(make_rig)
 
     def slow(command):
@@ -452,7 +452,7 @@ def test_a_move_at_the_last_moment_holds_vnwnv(make_rig):
     assert rig.wb.history.flashes == 0
 
 
-def test_a_red_flash_gate_holds_the_save(make_rig):
+def test_closed_flash_gate_prevents_the_save(make_rig):
     rig = proven(make_rig)
     rig.verdict(flash_gates=rig.RED)
     rig.stand_still()
@@ -461,7 +461,7 @@ def test_a_red_flash_gate_holds_the_save(make_rig):
     assert rig.wb.state is State.COMMITTED
 
 
-def test_somebody_elses_setting_in_ram_is_never_saved(make_rig):
+def test_foreign_setting_in_ram_is_never_saved(make_rig):
     rig = proven(make_rig)
     rig.device.ram[35] = (1, 0, 1, 1)
     rig.stand_still()
@@ -470,7 +470,7 @@ def test_somebody_elses_setting_in_ram_is_never_saved(make_rig):
     assert "registers 35 differ" in " ".join(rig.notes("warning"))
 
 
-def test_session_settings_are_put_back_before_the_save_and_set_up_after(make_rig):
+def test_session_settings_are_restored_before_the_save_and_set_again_after(make_rig):
     keys = frozenset({6, 75})
     rig = make_rig(configure_stream=True)
     user = dict(rig.device.ram)
@@ -488,7 +488,7 @@ def test_session_settings_are_put_back_before_the_save_and_set_up_after(make_rig
     assert rig.stream_set_up == 1
 
 
-def test_a_save_without_answer_is_a_fault_until_a_restart_tells(make_rig):
+def test_unanswered_save_is_a_fault_until_a_restart_shows_the_result(make_rig):
     rig = proven(make_rig)
     rig.device.mute = lambda command: isinstance(command, Word) and command.word == "VNWNV"
     rig.stand_still()
@@ -502,7 +502,7 @@ def test_a_save_without_answer_is_a_fault_until_a_restart_tells(make_rig):
     assert rig.wb.state is State.CONFIRMED
 
 
-def test_a_full_disk_forbids_the_flash_and_not_the_rollback(make_rig):
+def test_full_disk_prevents_the_save_and_not_the_rollback(make_rig):
     rig = proven(make_rig)
     rig.disk_full = True
     rig.stand_still()
@@ -513,7 +513,7 @@ def test_a_full_disk_forbids_the_flash_and_not_the_rollback(make_rig):
     assert rig.device.held() == rig.device.held("flash")
 
 
-def test_the_same_values_are_not_proposed_again(make_rig):
+def test_committed_values_are_not_proposed_again(make_rig):
     rig = make_rig()
     rig.whole_way()
     rig.verdict()

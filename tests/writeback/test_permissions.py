@@ -1,4 +1,4 @@
-"""The gate over every command there is: what a mode may send, and nothing else."""
+"""The gate over all commands: what a mode may send, and nothing else."""
 
 import pytest
 from hypothesis import given
@@ -26,13 +26,13 @@ commands = st.sampled_from(COMMANDS)
 
 
 def allowed(mode: Mode, configure_stream: bool, purpose: Purpose) -> set[str]:
-    """Bodies' first words of what passes, reads left out."""
+    """First words of the commands that pass, without reads."""
     passed = [c for c in COMMANDS if permitted(c, mode, configure_stream, purpose)]
     written = {str(c.register) for c in passed if isinstance(c, Write)}
     return written | {c.word for c in passed if isinstance(c, Word)}
 
 
-def test_the_lists_of_this_test_are_complete() -> None:
+def test_lists_of_commands_are_complete() -> None:
     assert {c.register for c in WRITES} >= {23, 84, 44, 26, 5, 6, 7, 75, 76, 77, 0, 21}
     assert {c.word for c in SPOKEN} >= {"VNWNV", "VNRST", "VNRFS", "VNASY", "VNSGB", "VNTAR"}
 
@@ -57,8 +57,10 @@ TABLE = {
 @pytest.mark.parametrize("mode", Mode)
 @pytest.mark.parametrize("configure_stream", [False, True])
 @pytest.mark.parametrize("purpose", OURS)
-def test_every_mode_and_purpose(mode: Mode, configure_stream: bool, purpose: Purpose) -> None:
-    """Where the table above has no row for it, or its row without the stream, nothing passes."""
+def test_commands_allowed_per_mode_and_purpose(
+    mode: Mode, configure_stream: bool, purpose: Purpose
+) -> None:
+    """If the table above has no row, or only one without the stream, nothing passes."""
     row = TABLE.get((mode, configure_stream, purpose), TABLE.get((mode, False, purpose), set()))
     assert allowed(mode, configure_stream, purpose) == row
     reads = [permitted(c, mode, configure_stream, purpose) for c in READS]
@@ -67,10 +69,10 @@ def test_every_mode_and_purpose(mode: Mode, configure_stream: bool, purpose: Pur
 
 @pytest.mark.parametrize("mode", Mode)
 @pytest.mark.parametrize("configure_stream", [False, True])
-def test_what_clients_ask_for_passes_in_every_mode_but_nothing_that_calibrates(
+def test_client_commands_pass_in_every_mode_except_calibration_writes(
     mode: Mode, configure_stream: bool
 ) -> None:
-    """Who may ask what is decided before (`sharing.arbiter`)."""
+    """`sharing.arbiter` decides before which client may send what."""
     passed = allowed(mode, configure_stream, Purpose.CLIENT)
     registers = {str(c.register) for c in WRITES} - {
         str(n) for n in (5, 23, 25, 26, 43, 44, 74, 84)
@@ -80,7 +82,7 @@ def test_what_clients_ask_for_passes_in_every_mode_but_nothing_that_calibrates(
 
 
 @given(st.sampled_from(WRITES), modes, st.booleans(), st.sets(st.sampled_from(sorted(REGISTERS))))
-def test_a_save_puts_settings_of_clients_back_and_nothing_that_calibrates(
+def test_save_may_restore_client_settings_but_no_calibration(
     command: Write, mode: Mode, stream: bool, clients: set[int]
 ) -> None:
     may = permitted(command, mode, stream, Purpose.SAVE, clients)
@@ -111,7 +113,7 @@ def test_no_mode_writes_any_other_register(
 
 
 @given(commands, st.booleans(), purposes)
-def test_flash_only_in_commit_and_only_to_save(
+def test_vnwnv_only_in_commit_and_only_for_a_save(
     command: Command, stream: bool, purpose: Purpose
 ) -> None:
     save = Word("VNWNV")
@@ -120,7 +122,7 @@ def test_flash_only_in_commit_and_only_to_save(
 
 
 @given(commands, modes, modes, st.booleans(), purposes)
-def test_a_higher_mode_never_permits_less(
+def test_higher_mode_never_permits_less(
     command: Command, one: Mode, other: Mode, stream: bool, purpose: Purpose
 ) -> None:
     low, high = sorted((one, other))
@@ -128,5 +130,5 @@ def test_a_higher_mode_never_permits_less(
 
 
 @pytest.mark.parametrize("mode", Mode)
-def test_a_pause_is_no_command_to_the_device(mode: Mode) -> None:
+def test_pause_is_always_permitted(mode: Mode) -> None:
     assert permitted(Pause(1.0), mode, False, Purpose.READ)

@@ -1,7 +1,8 @@
-"""Bad calibrations that got past the gates: each is on the device, live, and must not stay there.
+"""Bad calibrations that passed the gates: each is on the device, on trial, and must not stay
+there.
 
-The table is that of the failures which users of other programs report. Emulator and core run in
-virtual time; the calibrator is one that always says the planted values, with every gate green.
+The table has the failures that users of other programs report. Emulator and core run in virtual
+time. The calibrator always returns the planted values, with every gate open.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def right(truth: EmulatedTruth) -> Planted:
 
 
 def squeezed(truth: EmulatedTruth, by: list[float], offset: list[float]) -> Planted:
-    """A fit whose ellipsoid is squeezed along the axes and whose centre is off."""
+    """A fit whose ellipsoid is compressed along the axes and whose centre is wrong."""
     good, D = right(truth), np.diag(by)
     return Planted(
         np.linalg.inv(D @ truth.soft_iron @ D), good.offset + np.array(offset), good.gyro
@@ -52,28 +53,28 @@ def squeezed(truth: EmulatedTruth, by: list[float], offset: list[float]) -> Plan
 
 
 def planar_cap(truth: EmulatedTruth) -> Planted:
-    """A level circle fitted in three dimensions: up and down are anybody's guess."""
+    """A level circle fitted in three dimensions: the vertical is arbitrary."""
     return squeezed(truth, [1.0, 1.0, 0.8], [0.0, 0.0, 0.15])
 
 
 def partial_motion(truth: EmulatedTruth) -> Planted:
-    """A quarter of a turn: the ellipse is drawn out along the chord and its centre is off."""
+    """A quarter of a turn: the ellipse is stretched along the chord and its centre is wrong."""
     return squeezed(truth, [0.9, 1.08, 1.0], [0.06, -0.05, 0.0])
 
 
 def other_compass(truth: EmulatedTruth) -> Planted:
-    """The heading came from a compass that is 15 deg off; the hard iron took it up."""
+    """The heading came from a compass with an error of 15 deg; the hard iron absorbed it."""
     return squeezed(truth, [1.0, 1.0, 1.0], [0.0, 0.245 * np.sin(np.radians(15.0)), 0.0])
 
 
 def other_compass_turned(truth: EmulatedTruth) -> Planted:
-    """The same, and the matrix took it up: it is turned by 15 deg about the vertical."""
+    """The same error absorbed by the matrix, which is rotated by 15 deg about the vertical."""
     good = right(truth)
     return Planted(turn(0.0, 0.0, 15.0) @ good.matrix, good.offset, good.gyro)
 
 
 def mounting_turned(truth: EmulatedTruth) -> Planted:
-    """The mounting frame was turned by 10 deg about the nose."""
+    """The mounting frame was rotated by 10 deg about the longitudinal axis."""
     good = right(truth)
     return Planted(turn(10.0, 0.0, 0.0) @ good.matrix, good.offset, good.gyro)
 
@@ -106,13 +107,13 @@ def wrong_sign(truth: EmulatedTruth) -> Planted:
 
 
 def magnet_nearby(truth: EmulatedTruth) -> Planted:
-    """A magnet lay beside the sensor while it was calibrated, and was taken away again."""
+    """A magnet was next to the sensor during the calibration, and was then removed."""
     good = right(truth)
     return Planted(good.matrix, good.offset + np.array([0.1, -0.06, 0.05]), good.gyro)
 
 
 def double_correction(truth: EmulatedTruth) -> Planted:
-    """The values in the register were taken off once more."""
+    """The values in the register were subtracted a second time."""
     good = right(truth)
     return Planted(good.matrix @ good.matrix, 2.0 * good.offset, 2.0 * good.gyro)
 
@@ -123,7 +124,9 @@ def another_device(truth: EmulatedTruth) -> Planted:
 
 
 def hsi_active(truth: EmulatedTruth) -> Planted:
-    """The on-board estimator had already corrected what was fitted: nothing seems to be wrong."""
+    """The on-board estimator had already corrected the fitted data, so that nothing seemed
+    wrong.
+    """
     return Planted(np.eye(3), np.zeros(3), truth.gyro_bias_rad_s)
 
 
@@ -137,9 +140,9 @@ ROLLED_BACK: tuple[Bad, ...] = (
     planar_cap, partial_motion, other_compass, soft_iron_twice, soft_iron_inverted, wrong_sign,
     magnet_nearby, double_correction, another_device, hsi_active, gyro_sign,
 )  # fmt: skip
-# too much or too little iron, as others of these have it
+# too much or too little iron, as in other cases of this table
 LIKE_OTHERS: tuple[Bad, ...] = (partial_motion, other_compass, soft_iron_twice, another_device)
-# A matrix that is not symmetric is none that the estimator can find: refused before the first byte.
+# The estimator cannot return an asymmetric matrix: it is refused before the first byte.
 REFUSED: tuple[Bad, ...] = (other_compass_turned, mounting_turned, soft_iron_in_place)
 
 
@@ -166,7 +169,7 @@ def estimate(planted: Planted) -> Estimate:
 def planted_run(
     scenario: str, planted: Planted, output: str = "imu", gyro: Array | None = None
 ) -> VirtualRun:
-    """A run in mode commit, without an operator, whose calibrator says these values.
+    """A run in mode commit, without an operator, whose calibrator returns these values.
 
     gyro: what register 84 holds at the start
     """
@@ -189,7 +192,7 @@ def planted_run(
 
 
 def on_trial(*arguments: Any, **more: Any) -> VirtualRun:
-    """A run in which the planted values have just been written to the device."""
+    """A run in which the planted values were just written to the device."""
     run = planted_run(*arguments, **more)
     assert run.until(lambda: state(run) == "TRIAL", 20.0), (run.states, run.notes[-5:])
     return run
@@ -215,9 +218,9 @@ def holds_what_it_held(run: VirtualRun, scenario: str) -> bool:
     ],
     ids=lambda bad: bad.__name__,
 )
-def test_what_got_past_the_gates_is_rolled_back_within_the_trial(bad, scenario):
+def test_bad_calibration_that_passed_the_gates_is_rolled_back_in_the_trial(bad, scenario):
     if bad is hsi_active:
-        scenario = "calibrated"  # on a device in factory state it is no change at all
+        scenario = "calibrated"  # it changes nothing on a device in factory state
     run = on_trial(scenario, bad(draw_truth(SEED)))
     assert run.until(lambda: state(run) != "TRIAL", TRIAL_S)
     assert run.until(lambda: state(run) == "ROLLED_BACK", 10.0), run.states
@@ -226,7 +229,7 @@ def test_what_got_past_the_gates_is_rolled_back_within_the_trial(bad, scenario):
 
 
 @pytest.mark.parametrize("bad", REFUSED, ids=lambda bad: bad.__name__)
-def test_what_no_estimate_can_be_is_never_sent(bad):
+def test_impossible_estimate_is_never_sent(bad):
     run = planted_run("rov", bad(draw_truth(SEED)))
     run.run(20.0)
     assert state(run) == "OBSERVING"
@@ -237,16 +240,16 @@ def test_what_no_estimate_can_be_is_never_sent(bad):
 @pytest.mark.parametrize(
     "output", ["imu", *(pytest.param(one, marks=pytest.mark.slow) for one in ("ascii", "binary"))]
 )
-def test_the_right_values_are_proven_and_stay(output):
-    """Also on streams without the device's time, which stands still while the output is paused."""
+def test_correct_values_are_proven_and_stay(output):
+    """On streams without device time as well, whose time stops while the output is paused."""
     run = on_trial("rov", right(draw_truth(SEED)), output=output)
     assert run.until(lambda: state(run) != "TRIAL", TRIAL_S)
-    # where the vehicle stands still at that moment the save follows at once
+    # if the vehicle stands still at that moment the save follows at once
     assert run.states[run.states.index("TRIAL") + 1] == "PROVEN", run.states
     assert state(run) in ("PROVEN", "SAVE_PREPARING", "SAVING"), run.states
 
 
-def test_a_better_gyro_bias_alone_is_proven_on_a_calibrated_device():
+def test_better_gyro_bias_alone_is_proven_on_a_calibrated_device():
     good = right(draw_truth(SEED))
     run = on_trial("calibrated", good, gyro=good.gyro + 0.02)
     assert run.sent["VNWRG 23"] == 0
@@ -267,10 +270,10 @@ GATED = {
     "the on-board estimator": Setup("hsi-active", SEED, output="binary", rate_hz=20),
 }
 
-#: in the quick form a motion that leaves something open, and an estimator on board
+#: in the short form a motion with undetermined directions, and an on-board estimator
 SLOW_GATED = ("partial motion", "a magnet nearby")
 
-GUARDS = {  # one of these is red in the end
+GUARDS = {  # one of these gates is closed in the end
     "planar motion": {"motion.planar_circle", "observability.held", "heldout_heading.windows"},
     "partial motion": {"motion.heading", "observability.converged"},
     "a magnet nearby": {"stationarity.field", "field.spread_flash", "field.spread_ram"},
@@ -282,8 +285,10 @@ GUARDS = {  # one of these is red in the end
     "name",
     [pytest.param(name, marks=pytest.mark.slow if name in SLOW_GATED else ()) for name in GATED],
 )
-def test_through_the_real_gates_nothing_of_it_reaches_the_flash(name):
-    """Whatever qualifies is approved at once; three minutes, with the world model's field."""
+def test_bad_calibration_never_passes_the_real_gates_to_the_flash(name):
+    """All that qualifies is approved at once, for three minutes, with the field of the world
+    model.
+    """
     policy = WriteBackPolicy(mode=Mode.COMMIT)
     place = LocationSection(latitude_deg=48.0, longitude_deg=8.0, date=datetime.date(2026, 1, 1))
     settings = core_settings(Config(location=place), policy=policy)

@@ -1,4 +1,6 @@
-"""A restart is proven or it is not; what follows from the journal's newest record either way."""
+"""Proof of a restart, and what follows from the newest record of the journal with and without
+it.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ RECORD = Stamp(1.8e9, "one", 1000.0, 500.0)
 
 
 def later(seconds, boot_id="one"):
-    """The present, so many seconds after the record; another boot began at 0."""
+    """The present, this many seconds after the record; another boot began at 0."""
     boot_s = 1000.0 + seconds if boot_id == "one" else seconds
     return Stamp(1.8e9 + seconds, boot_id, boot_s)
 
@@ -27,13 +29,18 @@ def later(seconds, boot_id="one"):
     [
         (RECORD, later(60.0), 560.0, False),
         (RECORD, later(60.0), 5.0, True),
-        (RECORD, later(60.0), 59.8, True),  # its time fell, and no further than the record is old
-        (RECORD, later(60.0), 61.0, False),  # it fell further: a clock that jumped
+        (
+            RECORD,
+            later(60.0),
+            59.8,
+            True,
+        ),  # its time decreased, by no more than the age of the record
+        (RECORD, later(60.0), 61.0, False),  # it decreased by more: a clock that jumped
         (RECORD, later(60.0), 499.9, False),
-        (Stamp(1.8e9, "one", 1000.0), later(60.0), 59.8, False),  # within the time of a message
+        (Stamp(1.8e9, "one", 1000.0), later(60.0), 59.8, False),  # within the duration of a message
         (Stamp(1.8e9, "one", 1000.0), later(60.0), 59.0, True),
-        (RECORD, later(-1.0), 0.0, False),  # boottime does not fall
-        (RECORD, later(1e6), 1e6 + 500.0 - 900.0, False),  # a clock that is a thousandth slow
+        (RECORD, later(-1.0), 0.0, False),  # boottime does not decrease
+        (RECORD, later(1e6), 1e6 + 500.0 - 900.0, False),  # a clock that is slow by a thousandth
         (RECORD, later(60.0, "two"), 499.0, True),
         (RECORD, later(60.0, "two"), 499.9, False),
         (RECORD, later(60.0, "two"), 560.0, False),
@@ -46,12 +53,12 @@ def later(seconds, boot_id="one"):
         (RECORD, later(60.0), -1.0, False),
     ],
 )
-def test_what_proves_a_restart(record, now, uptime_s, proven):
+def test_device_time_proves_a_restart(record, now, uptime_s, proven):
     assert restarted_since(record, now, uptime_s) is proven
 
 
 @pytest.mark.parametrize("wall_s", [0.0, 1.0, 1.8e9 - 3600.0, 4e9, None])
-def test_the_wall_clock_proves_nothing(wall_s):
+def test_wall_clock_proves_no_restart(wall_s):
     timeless = Stamp(1.8e9, "one", 1000.0)
     pairs = [(Stamp(wall_s), later(9.0)), (timeless, Stamp(wall_s)), (Stamp(wall_s), Stamp(wall_s))]
     for record, now in pairs:
@@ -62,7 +69,7 @@ def test_the_wall_clock_proves_nothing(wall_s):
     "facts",
     [{}, {"wall_s": "x", "boot_id": 7, "boot_s": [], "device_s": True}, {"boot_s": float("nan")}],
 )
-def test_a_stamp_that_is_none_says_nothing(facts):
+def test_invalid_stamp_is_empty(facts):
     assert Stamp.of(facts) == Stamp()
 
 
@@ -79,12 +86,12 @@ def hear(rig, uptime_s, seconds=0.0):
     rig.do(rig.wb.on_uptime(uptime_s, rig.now_s))
 
 
-def test_a_restart_that_is_seen_counts_for_this_device_only(make_rig):
+def test_observed_restart_counts_only_for_its_device(make_rig):
     rig = saved(make_rig, tells_time=False)
     rig.device.restart()
     rig.do(rig.wb.on_reset(rig.now_s))
     ours, rig.device.serial = rig.device.serial, 42
-    rig.connect(journal=[])  # another unit took over the cable meanwhile
+    rig.connect(journal=[])  # another unit took over the cable in between
     rig.device.serial = ours
     rig.connect()
     assert rig.wb.state is State.COMMITTED
@@ -93,7 +100,7 @@ def test_a_restart_that_is_seen_counts_for_this_device_only(make_rig):
     assert rig.wb.state is State.CONFIRMED
 
 
-def test_a_device_that_reports_a_restart_and_tells_a_time_that_runs_on_did_not(make_rig):
+def test_reported_restart_does_not_count_if_the_device_time_continues(make_rig):
     rig = saved(make_rig)
     rig.do(rig.wb.on_reset(rig.now_s))
     rig.connect()
@@ -104,8 +111,8 @@ def test_a_device_that_reports_a_restart_and_tells_a_time_that_runs_on_did_not(m
 
 
 @pytest.mark.parametrize("late_s", [3.0, 90.0])
-def test_messages_out_of_a_buffer_prove_nothing(make_rig, late_s):
-    """The program was stopped: the first message is as old as that, the next ones are not."""
+def test_buffered_messages_prove_no_restart(make_rig, late_s):
+    """The program was stopped: the first message is as old as the stop, the next ones are not."""
     rig = saved(make_rig)
     rig.start()
     rig.now_s += late_s
@@ -120,17 +127,17 @@ def test_messages_out_of_a_buffer_prove_nothing(make_rig, late_s):
     assert rig.asked_again == 0
 
 
-def test_a_time_that_jumps_back_has_the_device_read_again_and_proves_nothing(make_rig):
+def test_backward_jump_of_device_time_causes_a_check_and_proves_no_restart(make_rig):
     rig = saved(make_rig)
     rig.pass_time(0.5)
-    hear(rig, rig.now_s - rig.started_s - 300.0, 1.0)  # no restart: it runs for 700 s
+    hear(rig, rig.now_s - rig.started_s - 300.0, 1.0)  # no restart: it has been running for 700 s
     assert rig.wb.state is State.RECONCILING
     assert rig.asked_again == 1
     rig.connect()
     assert rig.wb.state is State.COMMITTED
 
 
-def test_an_old_journal_confirms_nothing_until_a_restart_is_seen(make_rig):
+def test_journal_without_clocks_confirms_only_after_an_observed_restart(make_rig):
     rig = saved(make_rig)
     for record in rig.journal:
         for key in ("boot_id", "boot_s", "device_s"):
@@ -141,7 +148,7 @@ def test_an_old_journal_confirms_nothing_until_a_restart_is_seen(make_rig):
     rig.now_s += 20.0
     rig.device.restart()
     rig.started_s = rig.now_s - 1.0
-    rig.hear_time()  # its time fell in this run, and the record is of before
+    rig.hear_time()  # its time decreased in this run, and the record is older
     rig.connect()
     assert rig.wb.state is State.CONFIRMED
 
@@ -150,7 +157,7 @@ def test_an_old_journal_confirms_nothing_until_a_restart_is_seen(make_rig):
 
 
 def failed(make_rig):
-    """A write of which register 84 was refused, and nothing could be put back."""
+    """A write of which register 84 was refused, and nothing could be restored."""
     rig = make_rig(Mode.STAGE)
     new = []
 
@@ -173,7 +180,7 @@ def failed(make_rig):
 
 @pytest.mark.parametrize("number", [23, 84])
 @pytest.mark.parametrize("lost", ["all", "program"])
-def test_a_failed_write_of_weeks_ago_is_not_undone_over_somebodys_values(make_rig, lost, number):
+def test_old_failed_write_is_not_undone_over_foreign_values(make_rig, lost, number):
     rig = failed(make_rig)
     rig.now_s += 21 * 86400.0
     rig.device.restart()
@@ -186,7 +193,7 @@ def test_a_failed_write_of_weeks_ago_is_not_undone_over_somebodys_values(make_ri
     assert rig.device.ram[number] == rig.device.flash[number] == OTHER
 
 
-def test_what_somebody_saved_is_not_written_over_after_a_restart(make_rig):
+def test_foreign_saved_values_are_not_overwritten_after_a_restart(make_rig):
     for kind in (
         RecordKind.PREPARED,
         RecordKind.RAM_FAILED,
@@ -201,7 +208,7 @@ def test_what_somebody_saved_is_not_written_over_after_a_restart(make_rig):
             assert TABLE[kind][held].record is RecordKind.FOREIGN
 
 
-def test_a_failed_write_that_is_still_in_ram_is_undone(make_rig):
+def test_failed_write_still_in_ram_is_undone(make_rig):
     rig = failed(make_rig)
     assert rig.device.held()[23] != rig.device.held("flash")[23]
     rig.back("program")
@@ -209,7 +216,7 @@ def test_a_failed_write_that_is_still_in_ram_is_undone(make_rig):
     assert rig.device.held() == rig.device.held("flash")
 
 
-# -- a rollback that the disk did not take ---------------------------------------------------------
+# -- a rollback that was not journaled -------------------------------------------------------------
 
 
 def on_trial(make_rig):
@@ -222,14 +229,14 @@ def on_trial(make_rig):
     return rig
 
 
-def test_a_rollback_that_could_not_be_journaled_is_not_called_lost(make_rig):
+def test_unjournaled_rollback_is_not_recorded_as_lost(make_rig):
     rig = on_trial(make_rig)
     rig.disk_full = True
     rig.live(field_spread=0.5)
     assert rig.wb.state is State.ROLLED_BACK
     assert rig.kinds == ["PREPARED", "RAM_VERIFIED"]
     rig.disk_full = False
-    rig.back("program")  # killed before it could try again
+    rig.back("program")  # killed before it could retry
     assert rig.wb.state is State.OBSERVING
     assert rig.kinds[-1] == "REVERTED"
     assert "a rollback that could not be journaled" in rig.notes("warning")[-1]
@@ -238,7 +245,7 @@ def test_a_rollback_that_could_not_be_journaled_is_not_called_lost(make_rig):
 
 
 @pytest.mark.parametrize("when", ["time", "stop", "reread", "person"])
-def test_a_rollback_that_could_not_be_journaled_is_journaled_later(make_rig, when):
+def test_unjournaled_rollback_is_journaled_later(make_rig, when):
     rig = on_trial(make_rig)
     rig.disk_full = True
     rig.live(field_spread=0.5)
@@ -255,7 +262,9 @@ def test_a_rollback_that_could_not_be_journaled_is_journaled_later(make_rig, whe
     else:
         rig.do(rig.wb.on_link_lost(rig.now_s))
         rig.connect()
-        assert rig.wb.state is State.OBSERVING  # not LOST, though the file does not say it yet
+        assert (
+            rig.wb.state is State.OBSERVING
+        )  # not LOST, although the file does not contain it yet
         rig.pass_time(31.0)
     wanted = ["PREPARED", "RAM_VERIFIED", "ROLLBACK", "ROLLED_BACK"]
     assert rig.kinds == wanted + (["LOCKED"] if when == "person" else [])
@@ -266,7 +275,7 @@ def test_a_rollback_that_could_not_be_journaled_is_journaled_later(make_rig, whe
     assert not any("journal" in text for text in rig.wb.obstacles())
 
 
-def test_a_write_that_could_not_be_announced_leaves_the_save_before_it_open(make_rig):
+def test_unjournaled_write_leaves_the_previous_save_open(make_rig):
     rig = saved(make_rig)
     rig.now_s += 2 * 86400.0
     rig.disk_full = True
@@ -282,7 +291,7 @@ def test_a_write_that_could_not_be_announced_leaves_the_save_before_it_open(make
     assert rig.wb.history.holds[23] == pytest.approx(rig.device.held("flash")[23])
 
 
-def test_records_of_another_unit_are_not_journaled_for_this_one(make_rig):
+def test_pending_records_of_another_unit_are_dropped_with_an_error(make_rig):
     rig = on_trial(make_rig)
     rig.disk_full = True
     rig.live(field_spread=0.5)
@@ -300,7 +309,7 @@ def test_records_of_another_unit_are_not_journaled_for_this_one(make_rig):
 
 @pytest.mark.parametrize("how", ["refused", "silent"])
 @pytest.mark.parametrize("what", [23, 84, "VNASY"])
-def test_one_refusal_does_not_end_the_rollback_of_the_others(make_rig, what, how):
+def test_refused_register_does_not_stop_the_rollback_of_the_others(make_rig, what, how):
     rig = on_trial(make_rig)
     before, held = rig.device.held("flash"), rig.device.held()
 
@@ -325,10 +334,8 @@ def test_one_refusal_does_not_end_the_rollback_of_the_others(make_rig, what, how
 
 @pytest.mark.parametrize("number", [23, 84])
 @pytest.mark.parametrize("how", ["silent", "no end"])
-def test_a_write_that_never_came_to_the_device_leaves_what_somebody_else_wrote(
-    make_rig, number, how
-):
-    """Theirs came between the check and the first write; then the device said nothing."""
+def test_write_that_never_arrived_leaves_foreign_values(make_rig, number, how):
+    """They were written between the check and the first write; then the device did not answer."""
     rig = make_rig(Mode.STAGE)
 
     def silent(command):
@@ -352,8 +359,10 @@ def test_a_write_that_never_came_to_the_device_leaves_what_somebody_else_wrote(
 
 
 @pytest.mark.parametrize("number", [23, 84])
-def test_what_the_device_made_of_a_value_of_ours_is_put_back(make_rig, number):
-    """It stores something else than it was told, and says so: neither the old nor the new value."""
+def test_value_altered_by_the_device_is_rolled_back(make_rig, number):
+    """The device stores another value than it received, and reports it: neither the old nor the
+    new one.
+    """
     rig = make_rig(Mode.STAGE)
     before, made = rig.device.held(), []
 
@@ -366,16 +375,14 @@ def test_what_the_device_made_of_a_value_of_ours_is_put_back(make_rig, number):
 
     rig.device.mute = alters
     rig.whole_way()
-    assert len(made) == 1  # once more would bring the same
+    assert len(made) == 1  # a retry would give the same
     assert rig.device.held() == before
     assert rig.kinds == ["PREPARED", "RAM_FAILED", "ROLLBACK", "ROLLED_BACK"]
 
 
 @pytest.mark.parametrize("echo", [True, False])
-def test_a_restart_right_behind_a_write_brings_back_what_somebody_saved_and_it_stays(
-    make_rig, echo
-):
-    """Their values are in flash, others in RAM; the write is not repeated over them."""
+def test_foreign_saved_value_restored_by_a_restart_after_a_write_stays(make_rig, echo):
+    """Foreign values are in flash, others in RAM. The write is not repeated over them."""
     rig = make_rig(Mode.STAGE)
     rig.device.flash[84] = OTHER
     restarted = []
@@ -405,11 +412,11 @@ def writes(rig):
     return [command for command in rig.device.log if isinstance(command, Write)]
 
 
-# -- values of nobody ------------------------------------------------------------------------------
+# -- unknown values --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("number", [23, 84])
-def test_values_that_nobody_journaled_deserve_a_line(make_rig, number):
+def test_values_without_a_journal_record_are_reported(make_rig, number):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     assert rig.notes("warning") == []
@@ -423,7 +430,7 @@ def test_values_that_nobody_journaled_deserve_a_line(make_rig, number):
     assert rig.notes("warning") == []
 
 
-def test_the_values_of_an_own_save_are_journaled(make_rig):
+def test_values_of_an_own_save_are_not_reported(make_rig):
     rig = saved(make_rig)
     rig.back("device")
     assert rig.wb.state is State.CONFIRMED

@@ -1,4 +1,4 @@
-"""A calibration that holds no more never gets to flash, whenever that is found out.
+"""A calibration that is no longer valid never reaches the flash, whenever that is found.
 
 Judged by the unit's own record of what it was sent (`cabled_units`).
 """
@@ -21,7 +21,7 @@ OLD = ("1,0,0,0,1,0,0,0,1,0,0,0",) * 2
 
 
 def undone(run: CabledRun) -> None:
-    """Nothing was saved and the old values are back in RAM."""
+    """Nothing was saved and the old values are in RAM again."""
     unit = run.cable.units[FIRST]
     assert unit.saves == []
     assert unit.held("flash") == OLD
@@ -29,12 +29,12 @@ def undone(run: CabledRun) -> None:
 
 
 def voided(run: CabledRun, words: str = "the hard iron changed: the calibration in force is void"):
-    """What the calibrator says when it sees a step."""
+    """What the calibrator returns when it has seen a step."""
     run.core.calibrator._void = words
 
 
 @pytest.mark.parametrize("when", ["trial", "proven"])
-def test_a_step_of_the_iron_ends_what_is_not_saved_yet(when):
+def test_step_of_the_iron_rolls_back_unsaved_values(when):
     run = CabledRun(two_units())
     if when == "trial":
         run.approve()
@@ -46,14 +46,16 @@ def test_a_step_of_the_iron_ends_what_is_not_saved_yet(when):
     run.park()
     undone(run)
     assert run.journal[FIRST][-2]["facts"]["cause"] == "void"
-    assert run.core.writeback.history.rollbacks == 0  # the values were right when they were written
+    assert (
+        run.core.writeback.history.rollbacks == 0
+    )  # the values were correct when they were written
 
 
 @pytest.mark.parametrize(
     "at",
     [pytest.param(at, marks=[] if at % 3 == 1 else pytest.mark.slow) for at in range(1, 36, 5)],
 )
-def test_at_every_command_of_the_save(at):
+def test_step_of_the_iron_at_any_command_of_the_save(at):
     run, heard = CabledRun(two_units()), []
     run.proven()
 
@@ -70,8 +72,8 @@ def test_at_every_command_of_the_save(at):
 
 
 @pytest.mark.parametrize("at", [1, 12, pytest.param(30, marks=pytest.mark.slow)])
-def test_a_save_whose_checks_take_long_is_decided_anew(at, monkeypatch):
-    """No sample comes during the checks, so nobody sees whether the vehicle changed."""
+def test_save_is_decided_again_when_its_checks_take_too_long(at, monkeypatch):
+    """No sample arrives during the checks, so a change of the vehicle would not be seen."""
     monkeypatch.setattr("ahrsd.writeback.flow.RETRY_SAVE_S", 12.0)  # not ten minutes
     run, heard, held_s = CabledRun(two_units(rate_hz=50.0)), [], []
     run.proven()
@@ -95,8 +97,8 @@ def test_a_save_whose_checks_take_long_is_decided_anew(at, monkeypatch):
     assert run.kinds().count("FLASH_SENT") == 2
 
 
-def test_a_line_that_is_slow_by_itself_is_no_reason_not_to_save():
-    """One answer in 50 ms: the checks of a save last two seconds and more."""
+def test_slow_line_does_not_prevent_a_save():
+    """One answer per 50 ms: the checks of a save last two seconds and more."""
     run, begun_s = CabledRun(two_units()), []
     run.proven()
 
@@ -110,7 +112,7 @@ def test_a_line_that_is_slow_by_itself_is_no_reason_not_to_save():
     assert run.now_s - begun_s[0] > 1.0
 
 
-def test_an_estimate_that_clearly_asks_for_something_else_ends_it():
+def test_clearly_different_estimate_ends_the_proof():
     run = CabledRun(two_units())
     run.proven()
     run.core.calibrator = PlantedCalibrator(
@@ -122,7 +124,7 @@ def test_an_estimate_that_clearly_asks_for_something_else_ends_it():
     undone(run)
 
 
-def test_one_that_differs_a_little_only_holds_the_save():
+def test_slightly_different_estimate_only_delays_the_save():
     run = CabledRun(two_units())
     run.proven()
     slightly = PlantedCalibrator(
@@ -137,8 +139,8 @@ def test_one_that_differs_a_little_only_holds_the_save():
     assert run.state == "COMMITTED"
 
 
-class Red(PlantedCalibrator):
-    """One gate is red."""
+class OneClosedGate(PlantedCalibrator):
+    """One gate is closed."""
 
     def judge_estimate(self, at_s: float, *_: object) -> tuple[GateResult, ...]:
         super().judge_estimate(at_s)
@@ -147,10 +149,10 @@ class Red(PlantedCalibrator):
         return self.gates
 
 
-def test_a_gate_that_went_red_holds_the_save_and_ends_the_proof_when_it_stays_red():
+def test_closed_gate_delays_the_save_and_ends_the_proof_if_it_stays_closed():
     run = CabledRun(two_units())
     run.proven()
-    green, red = run.core.calibrator, Red(run.core.calibrator, estimate())
+    green, red = run.core.calibrator, OneClosedGate(run.core.calibrator, estimate())
     run.core.calibrator = red
     run.park(30.0)
     assert run.state == "PROVEN"
@@ -163,8 +165,8 @@ def test_a_gate_that_went_red_holds_the_save_and_ends_the_proof_when_it_stays_re
     undone(run)
 
 
-def test_a_jump_of_the_readings_at_rest_is_proven_again_before_it_is_saved():
-    """A magnet that is mounted while the vehicle stands: no motion tells the estimator."""
+def test_jump_of_the_readings_at_rest_requires_a_new_proof():
+    """A magnet is mounted while the vehicle stands, so that no motion shows it to the estimator."""
     run = CabledRun(two_units())
     run.proven()
     run.cable.moving = False
@@ -174,10 +176,10 @@ def test_a_jump_of_the_readings_at_rest_is_proven_again_before_it_is_saved():
     assert run.cable.unit.saves == []
     assert run.told("jumped")
     again = any("on trial again" in text for text in run.core.writeback.obstacles())
-    assert again or "ROLLED_BACK" in run.states  # or the trial has found it worse already
+    assert again or "ROLLED_BACK" in run.states  # or the trial has already found it worse
 
 
-def test_a_proof_that_nothing_was_heard_of_for_long_is_undone():
+def test_proof_without_recent_samples_is_undone():
     run = CabledRun(two_units())
     run.proven()
     run.cable.unit.ram[6] = "0"
@@ -190,8 +192,10 @@ def test_a_proof_that_nothing_was_heard_of_for_long_is_undone():
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_the_estimator_itself_sees_the_step_and_the_old_values_are_not_saved():
-    """The real estimator from the first sample; the vehicle says safe after it is sure again."""
+def test_step_seen_by_the_real_estimator_prevents_the_save():
+    """The real estimator from the first sample; the vehicle permits the save after it has
+    converged again.
+    """
     config = check_config({"gates": lenient_gates()}, "test")
     run = CabledRun(two_units(binary=True), planted=False)
     run.core.calibrator = Calibrator(
@@ -217,9 +221,7 @@ def test_the_estimator_itself_sees_the_step_and_the_old_values_are_not_saved():
     ("reply_timeout_s", "max_age_s", "most_s"),
     [(0.4, 1.0, 0.5), (0.4, 60.0, 0.5), (2.0, 60.0, 2.0), (2.0, 1.0, 1.0), (60.0, 1.0, 1.0)],
 )
-def test_the_checks_of_a_save_last_no_longer_than_a_reply_and_the_vehicles_word(
-    reply_timeout_s, max_age_s, most_s
-):
+def test_checks_of_a_save_have_a_time_limit(reply_timeout_s, max_age_s, most_s):
     policy = WriteBackPolicy(reply_timeout_s=reply_timeout_s, interlock_max_age_s=max_age_s)
     safe = Safeguards(policy)
     safe.save_from_s = 100.0

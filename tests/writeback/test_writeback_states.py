@@ -1,4 +1,6 @@
-"""Properties of the table: nothing hangs, nothing skips the rollback, the docs show it."""
+"""Properties of the state table: no dead end, no way around the rollback, and agreement with the
+docs.
+"""
 
 from pathlib import Path
 
@@ -19,7 +21,7 @@ from ahrsd.writeback.states import (
 AWAY = {Signal.LINK_LOST, Signal.DEVICE_RESET, Signal.CLIENT_RESET, Signal.IN_DOUBT}
 DOCUMENT = Path(__file__).parents[2] / "docs" / "design" / "write-back.md"
 
-# States that end by themselves only by a person, the device or a verdict, and may last for ever.
+# States that only a person, the device or a verdict ends, and that may last for ever.
 RESTING = {
     State.OBSERVING,
     State.CANDIDATE,
@@ -42,20 +44,20 @@ def reachable(start: State, without: frozenset[State] = frozenset()) -> set[Stat
     return seen
 
 
-def test_total_over_states_and_signals() -> None:
+def test_table_is_total_over_states_and_signals() -> None:
     assert set(TABLE) == set(State)
     assert {target for row in TABLE.values() for target in row.values()} <= set(State)
     used = {signal for row in TABLE.values() for signal in row}
     assert used == set(Signal)
 
 
-def test_every_state_is_reachable_and_none_is_a_trap() -> None:
+def test_every_state_is_reachable_and_can_be_left() -> None:
     assert reachable(State.RECONCILING) == set(State)
     for state in State:
         assert State.OBSERVING in reachable(state)
 
 
-def test_every_waiting_state_handles_silence() -> None:
+def test_every_waiting_state_has_a_timeout() -> None:
     assert set(ON_TIMEOUT) == set(State) - RESTING
     for state, (seconds, target) in ON_TIMEOUT.items():
         assert TABLE[state][Signal.TIMEOUT] is target
@@ -63,7 +65,7 @@ def test_every_waiting_state_handles_silence() -> None:
 
 
 @pytest.mark.parametrize("state", State)
-def test_link_loss_reset_and_doubt_lead_to_reconciling_everywhere(state: State) -> None:
+def test_link_loss_reset_and_doubt_always_lead_to_reconciling(state: State) -> None:
     assert TABLE[state][Signal.LINK_LOST] is State.RECONCILING
     assert TABLE[state][Signal.DEVICE_RESET] is State.RECONCILING
     assert TABLE[state][Signal.CLIENT_RESET] is State.RECONCILING
@@ -71,19 +73,19 @@ def test_link_loss_reset_and_doubt_lead_to_reconciling_everywhere(state: State) 
 
 
 @pytest.mark.parametrize("state", [State.STAGING, State.STAGED, State.TRIAL, State.PROVEN])
-def test_nothing_leads_from_changed_ram_to_rest_without_undoing_or_saving(state: State) -> None:
-    """RECONCILING and FAULT end in a comparison with the device; ROLLING_BACK undoes."""
+def test_changed_ram_is_always_undone_or_saved(state: State) -> None:
+    """RECONCILING and FAULT end with a comparison with the device; ROLLING_BACK undoes."""
     ways_out = frozenset({State.RECONCILING, State.FAULT, State.ROLLING_BACK, State.SAVING})
     assert not reachable(state, without=ways_out) & (WITHOUT_TRANSACTION | {State.LOCKED})
 
 
-def test_a_reconciling_device_never_goes_straight_into_a_write() -> None:
+def test_reconciling_never_leads_directly_to_a_write() -> None:
     assert not {State.PREPARING, State.CHECKING, State.STAGING, State.SAVING} & set(
         TABLE[State.RECONCILING].values()
     )
 
 
-def test_only_an_approval_leads_into_a_transaction() -> None:
+def test_only_an_approval_starts_a_transaction() -> None:
     into = {
         (state, signal)
         for state, row in TABLE.items()
@@ -91,30 +93,30 @@ def test_only_an_approval_leads_into_a_transaction() -> None:
         if target is State.PREPARING
     }
     assert into == {(State.QUALIFIED, Signal.APPROVED), (State.SET_ASIDE, Signal.GO_ON)}
-    # and what is set aside had one, for values that the device held and that were undone
+    # a transaction that was set aside had one, for values that the device held and that were undone
     aside = {s for s, row in TABLE.items() if State.SET_ASIDE in row.values()}
-    assert aside == {State.ROLLING_BACK, State.RECONCILING}  # the second: behind a client's reset
+    assert aside == {State.ROLLING_BACK, State.RECONCILING}  # the second: after a client's reset
 
 
 @pytest.mark.parametrize("state", [State.FAULT, State.FLASH_TORN, State.LOCKED])
-def test_only_a_person_or_the_device_ends_an_alarm(state: State) -> None:
+def test_only_a_person_or_the_device_ends_an_alarm_state(state: State) -> None:
     assert set(TABLE[state]) - AWAY <= {Signal.ROLL_BACK, Signal.UNLOCK}
 
 
-def test_flash_is_reached_only_from_proven_through_the_journal() -> None:
+def test_saving_is_reached_only_from_proven_through_the_journal() -> None:
     into = {state for state, row in TABLE.items() if State.SAVING in row.values()}
     assert into == {State.SAVE_PREPARING}
     assert {s for s, row in TABLE.items() if State.SAVE_PREPARING in row.values()} == {State.PROVEN}
     assert TABLE[State.SAVE_PREPARING][Signal.JOURNALLED] is State.SAVING
 
 
-def test_states_with_changed_ram_can_all_be_undone_or_are_undoing() -> None:
+def test_every_state_with_changed_ram_can_roll_back_or_is_rolling_back() -> None:
     for state in CHANGED_IN_RAM - {State.ROLLING_BACK, State.SAVING}:
         assert TABLE[state][Signal.ROLL_BACK] is State.ROLLING_BACK
 
 
 def mermaid() -> str:
-    """The table as a Mermaid state diagram, signals of one pair of states on one edge."""
+    """The table as a Mermaid state diagram; signals between one pair of states share an edge."""
     lines = ["stateDiagram-v2", "    [*] --> RECONCILING"]
     for state, row in TABLE.items():
         edges: dict[State, list[str]] = {}
@@ -126,18 +128,18 @@ def mermaid() -> str:
     return "\n".join(lines)
 
 
-def test_the_document_shows_this_table() -> None:
+def test_document_shows_this_table() -> None:
     assert f"```mermaid\n{mermaid()}\n```" in DOCUMENT.read_text()
 
 
 @pytest.mark.parametrize("state", ON_TIMEOUT)
-def test_the_document_shows_every_timeout(state: State) -> None:
+def test_document_shows_every_timeout(state: State) -> None:
     seconds, target = ON_TIMEOUT[state]
     assert f"| {state.value} | {seconds:.0f} s | {target.value} |\n" in DOCUMENT.read_text()
 
 
 @pytest.mark.parametrize("last", RECONCILE)
-def test_the_document_shows_what_follows_an_interruption(last: RecordKind) -> None:
+def test_document_shows_the_reconciliation_table(last: RecordKind) -> None:
     cells = [
         f"`{row.record.value}`, {row.signal.value}" if row.record else row.signal.value
         for row in (RECONCILE[last][held] for held in DeviceContents)
@@ -146,6 +148,6 @@ def test_the_document_shows_what_follows_an_interruption(last: RecordKind) -> No
 
 
 @pytest.mark.parametrize("kind", RecordKind)
-def test_the_document_says_what_each_record_means(kind: RecordKind) -> None:
+def test_document_explains_every_journal_record(kind: RecordKind) -> None:
     rows = [line for line in DOCUMENT.read_text().splitlines() if line.startswith("| `")]
     assert any(f"`{kind.value}`" in row.split("|")[1] for row in rows)

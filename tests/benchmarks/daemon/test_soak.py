@@ -77,7 +77,7 @@ def short_histories(monkeypatch):
 
 
 @pytest.mark.parametrize("minutes", [6, pytest.param(9, marks=pytest.mark.slow)])
-def test_nothing_grows_and_nothing_gets_slower(soak, tmp_path, short_histories, minutes):
+def test_memory_and_update_time_do_not_grow(soak, tmp_path, short_histories, minutes):
     found = run(soak, tmp_path, float(minutes))
     print(found)
     growth = Growth.of(found)
@@ -95,7 +95,7 @@ def test_nothing_grows_and_nothing_gets_slower(soak, tmp_path, short_histories, 
 
 
 @pytest.mark.slow
-def test_a_log_that_keeps_everything_is_seen(soak, tmp_path, short_histories, monkeypatch):
+def test_growing_log_is_detected(soak, tmp_path, short_histories, monkeypatch):
     """The proof that the test above can fail: four kilobytes per update."""
     monkeypatch.setattr(soak, "DAEMON_KEEPS", None)
     growth = Growth.of(run(soak, tmp_path, 8.0))
@@ -121,7 +121,7 @@ def test_the_played_stream_is_the_emulated_one_with_time_going_on(soak, monkeypa
     assert np.array_equal(first[:, 1:], second[:, 1:])
 
 
-def test_a_question_is_answered_once_by_the_device_and_then_from_memory(soak):
+def test_query_is_answered_once_by_the_device_and_then_from_memory(soak):
     device = soak.Device(Setup("rov", seed=1, output="binary", rate_hz=40, baud=921600), 5.0)
     asked = encode("VNRRG,03")
     answer = device.answer(asked)

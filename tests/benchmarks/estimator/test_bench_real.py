@@ -37,8 +37,10 @@ def test_circles_calibrate_and_the_drive_judges(bench, recordings):
 
 @pytest.mark.slow
 @pytest.mark.benchmark
-def test_optical_attitude_judges_and_nobody_beats_who_knows_it(bench, recordings):
-    """This sensor is nearly calibrated: what is left is the room's field, and ours adds nothing."""
+def test_no_method_beats_one_that_uses_the_optical_attitude(bench, recordings):
+    """This sensor is nearly calibrated: the remaining error is the field of the room, and ours
+    adds none.
+    """
     names = (bench.BROAD[1],)
     lines = {line.method: line for line in bench.against_optics(recordings, ("ellipsoid",), names)}
     assert lines["oracle"].after_deg < lines["oracle"].before_deg

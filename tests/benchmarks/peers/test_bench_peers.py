@@ -100,7 +100,7 @@ def test_the_comparison_from_end_to_end(peers, tmp_path, capsys):
     assert "peers: seed 1" in capsys.readouterr().err
 
 
-def test_answers_that_are_there_are_not_asked_for_again(peers, tmp_path, monkeypatch):
+def test_existing_answers_are_not_computed_again(peers, tmp_path, monkeypatch):
     arguments = ["--cache", str(tmp_path), "--runs", "1", "--sets", "wam", "--motions", "rov"]
     peers.main([*arguments, "--only-peers"])
     kept = tmp_path / "peers" / "wam-rov" / "0.jsonl"
@@ -123,7 +123,7 @@ def test_without_the_tool_it_says_so_in_one_line(peers, tmp_path, monkeypatch):
         peers.main(["--cache", str(tmp_path)])
 
 
-def test_a_peers_process_that_dies_is_said(peers, tmp_path):
+def test_dead_process_of_a_peer_is_reported(peers, tmp_path):
     peers.TOOL.write_text("raise SystemExit('no numpy here')")
     with pytest.raises(SystemExit, match=r"ended before MAGYC-NLS \+sg: no numpy here"):
         peers.main(["--cache", str(tmp_path), "--runs", "1", "--sets", "wam", "--motions", "rov"])

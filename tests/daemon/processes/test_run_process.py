@@ -1,6 +1,7 @@
-"""`ahrsd run` as a program beside an emulated device: what it sends, a second one, being frozen.
+"""`ahrsd run` as a program with an emulated device: bytes sent, a second instance, and
+suspension.
 
-Bytes are counted on the pty, where the device hears them.
+Bytes are counted on the pty, as the device receives them.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ from ahrsd.events import SamplesSeen
 from ahrsd.offline.replay import replay
 from drivers.vn100.messages import encode
 
-#: VectorNav's own SDK for Python (0.99, MIT licence), built from its sources: what a program does
-#: with it, one word a line; it is in no package registry
+#: VectorNav's own SDK for Python (0.99, MIT licence), built from its sources: a program that
+#: uses it and prints one word per line; it is in no package registry
 WITH_THE_SDK = """
 import sys, time
 from vectornav import Registers, Sensor
@@ -59,7 +60,7 @@ READ = rb"\$VNRRG,\d+(,\d)?\*[0-9A-F]{2}"
 
 
 class Running:
-    """The program, its log, and what the device heard."""
+    """The program, its log, and the bytes that the device received."""
 
     def __init__(self, process: subprocess.Popen[bytes], log: Path, heard: bytearray) -> None:
         self.process, self.log, self.heard = process, log, heard
@@ -119,7 +120,8 @@ def captured(folder: Path) -> Path:
 
 
 def grown(path: Path, by: int):
-    """A condition: the file has its head, and so many bytes more than when that was seen first.
+    """A condition: the file has its head, and this many more bytes than when that was first
+    seen.
 
     The head of a capture is larger than what a device sends in seconds.
     """
@@ -134,7 +136,7 @@ def grown(path: Path, by: int):
     return condition
 
 
-def test_passive_sends_not_one_byte(program, tmp_path):
+def test_passive_sends_no_byte(program, tmp_path):
     with program("--mode", "passive", output="imu") as (running, _):
         running.until(lambda: list((tmp_path / "captures").glob("*.mcap")))
         running.until(grown(captured(tmp_path), 10_000))
@@ -143,7 +145,7 @@ def test_passive_sends_not_one_byte(program, tmp_path):
     assert re.search(r"messages: \d{2,} valid", running.said)
 
 
-def test_observe_sends_register_reads_and_nothing_else(program, tmp_path):
+def test_observe_sends_only_register_reads(program, tmp_path):
     with program(output="imu") as (running, _):
         running.until(lambda: "OBSERVING" in running.said)
         running.until(grown(captured(tmp_path), 10_000))
@@ -154,7 +156,7 @@ def test_observe_sends_register_reads_and_nothing_else(program, tmp_path):
     assert [line for line in lines if not re.fullmatch(READ, line)] == []
 
 
-def test_a_second_one_is_told_who_holds_the_port_and_the_device_hears_nothing(program, tmp_path):
+def test_second_instance_is_refused_with_the_holder_and_sends_nothing(program, tmp_path):
     with program("--mode", "passive", output="imu") as (running, port):
         running.until(lambda: list((tmp_path / "captures").glob("*.mcap")))
         running.until(grown(captured(tmp_path), 1_000))
@@ -176,7 +178,7 @@ def test_a_second_one_is_told_who_holds_the_port_and_the_device_hears_nothing(pr
 
 
 @pytest.mark.timeout(120)
-def test_frozen_for_seconds_it_goes_on_and_bridges_nothing(program, tmp_path):
+def test_suspended_program_continues_and_bridges_no_gap(program, tmp_path):
     rate_hz, frozen_s = 100, 4.0
     with program(output="binary", rate_hz=rate_hz) as (running, _):
         running.until(lambda: "OBSERVING" in running.said)
@@ -198,7 +200,7 @@ def test_frozen_for_seconds_it_goes_on_and_bridges_nothing(program, tmp_path):
     assert float(np.nanmax(steps_s)) < 1.5 / rate_hz
     missing_s = np.diff(times_s)[np.diff(times_s) > 1.5 / rate_hz]
     gaps = [gap.length_s for gap in done.core.stream.gaps]
-    for length_s in gaps:  # samples that came before their registers are missing too
+    for length_s in gaps:  # samples from before the registers were read are missing too
         assert np.min(np.abs(missing_s - length_s)) < 1e-6
     assert max(missing_s, default=0.0) == pytest.approx(max(gaps, default=0.0), abs=1e-6)
 
@@ -207,7 +209,7 @@ def test_frozen_for_seconds_it_goes_on_and_bridges_nothing(program, tmp_path):
 
 
 def driver_start(path: Path, lines: tuple[str, ...], *, crc: bool = False) -> list[str]:
-    """What a driver is answered that asks each again after 50 ms, as real ones do."""
+    """Answers to a driver that repeats each request after 50 ms, as real drivers do."""
     port = os.open(path, os.O_RDWR | os.O_NOCTTY)
     tty.setraw(port)
     answers = []
@@ -223,13 +225,13 @@ def driver_start(path: Path, lines: tuple[str, ...], *, crc: bool = False) -> li
             if select.select([port], [], [], 0.005)[0]:
                 heard += os.read(port, 65536)
             found = [a for a in ANSWER.findall(heard) if a.startswith(line[:8].encode())]
-        time.sleep(0.1)  # what was asked twice is answered by then
+        time.sleep(0.1)  # repeated requests are answered by then
         answers.append(found[0].decode())
     os.close(port)
     return answers
 
 
-def test_drivers_on_shared_ports_beside_the_working_daemon(program, tmp_path):
+def test_drivers_on_shared_ports_of_a_working_daemon(program, tmp_path):
     owner, logger = tmp_path / "vn100", tmp_path / "logger"
     shares = f'[[share]]\npty = "{owner}"\nowner = true\n[[share]]\npty = "{logger}"\n'
     with program(output="binary", config=shares) as (running, _):
@@ -259,7 +261,7 @@ def test_drivers_on_shared_ports_beside_the_working_daemon(program, tmp_path):
     assert [one["refused"] for one in counts] == [0, 0]
 
 
-def test_the_vendors_own_library_works_on_a_shared_port(program, tmp_path):
+def test_vendor_library_works_on_a_shared_port(program, tmp_path):
     pytest.importorskip("vectornav", reason="VectorNav's SDK for Python is not installed")
     owner = tmp_path / "vn100"
     with program(output="binary", config=f'[[share]]\npty = "{owner}"\nowner = true\n') as (one, _):

@@ -1,7 +1,7 @@
 """`ahrsd run` as a program on a scripted device: exchange, second master, clocks, changed iron.
 
-The promises of tests/writeback/histories/test_write_moments.py, each once with real processes,
-files and time: half a minute to two minutes each (`pytest -m slow`).
+Each promise of tests/writeback/histories/test_write_moments.py once with real processes, files and
+time, half a minute to two minutes each (`pytest -m slow`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def program(tmp_path):
     return make
 
 
-def test_the_whole_way_to_flash_and_through_a_restart(program):
+def test_whole_write_to_flash_and_confirmation_after_a_restart(program):
     with program() as running:
         running.start()
         running.until_record("FLASH_ACKED")
@@ -37,7 +37,7 @@ def test_the_whole_way_to_flash_and_through_a_restart(program):
 
 
 @pytest.mark.parametrize("stream", ["binary", "imu"])
-def test_an_approval_for_one_unit_writes_nothing_to_another(program, stream):
+def test_approval_for_one_unit_writes_nothing_to_another(program, stream):
     with program(stream=stream, approval="operator") as running:
         running.start()
         running.until(lambda: "candidate" in running.said)
@@ -51,7 +51,7 @@ def test_an_approval_for_one_unit_writes_nothing_to_another(program, stream):
         assert running.observer.violations == []
 
 
-def test_another_unit_in_the_trial_is_left_as_it_is(program):
+def test_unit_exchanged_in_a_trial_is_not_changed(program):
     with program(stream="imu", trial_s=6.0) as running:
         running.start()
         running.until_record("RAM_VERIFIED")
@@ -64,7 +64,7 @@ def test_another_unit_in_the_trial_is_left_as_it_is(program):
         assert other.memory.flash == before
 
 
-def test_a_calibration_that_became_void_before_the_vehicle_was_safe_is_not_saved(program):
+def test_calibration_void_before_the_vehicle_is_safe_is_not_saved(program):
     with program(trial_s=3.0, trial_interlock=False) as running:
         running.start()
         running.until_record("RAM_VERIFIED")
@@ -74,7 +74,7 @@ def test_a_calibration_that_became_void_before_the_vehicle_was_safe_is_not_saved
         by = np.array([0.04, -0.03, 0.035])
         running.served.act(lambda cable, now_s: running.vehicle.move_iron(by, now_s))
         running.until(lambda: "is void" in running.said)
-        running.for_s(8.0)  # calibrated anew meanwhile
+        running.for_s(8.0)  # recalibrated in between
         running.word = "safe"
         running.for_s(12.0)
         running.stop()
@@ -83,8 +83,10 @@ def test_a_calibration_that_became_void_before_the_vehicle_was_safe_is_not_saved
 
 
 @pytest.mark.parametrize("behind_s", [-1.7e9, -3600.0])
-def test_a_wall_clock_that_is_set_confirms_nothing(program, behind_s):
-    """The save is only acknowledged; the program starts again on the same boot, the clock right."""
+def test_setting_the_wall_clock_confirms_nothing(program, behind_s):
+    """The save is only acknowledged. The program starts again in the same boot with the clock
+    corrected.
+    """
     with program() as running:
         running.set_wall(behind_s)
         running.unit.lies.not_saved = True
@@ -103,7 +105,7 @@ def test_a_wall_clock_that_is_set_confirms_nothing(program, behind_s):
         assert running.observer.violations == []
 
 
-def test_a_second_master_in_proven_is_noticed_before_any_save(program):
+def test_foreign_write_in_proven_is_noticed_before_a_save(program):
     with program(trial_s=3.0, trial_interlock=False) as running:
         running.start()
         running.until_record("RAM_VERIFIED")
@@ -122,7 +124,7 @@ def test_a_second_master_in_proven_is_noticed_before_any_save(program):
         assert running.observer.violations == []
 
 
-def test_a_restart_between_the_two_registers_is_not_proven(program):
+def test_restart_between_two_registers_is_not_proven(program):
     with program(stream="imu", trial_s=2.0) as running:
         done = []
 
@@ -140,7 +142,7 @@ def test_a_restart_between_the_two_registers_is_not_proven(program):
         assert running.observer.violations == []
 
 
-def test_killed_at_random_and_started_again_journal_and_device_agree(program):
+def test_journal_and_device_agree_after_random_kills(program):
     draw = np.random.default_rng(3)
     with program() as running:
         for _ in range(5):

@@ -1,4 +1,4 @@
-"""`ahrsd run` killed after a drive and started again: its candidate comes in much less time.
+"""`ahrsd run` killed after a drive and started again: its candidate comes much sooner.
 
 The device's time runs faster than the host's, so times are those of the device.
 """
@@ -22,8 +22,8 @@ from drivers.vn100.emulator.pty import EmulatorProcess
 from drivers.vn100.emulator.scenarios import Setup
 
 SPEED = 8.0
-AGAIN_S = 7.0  # within it the device is read once more, which every used sample needs
-#: it stands while a slow machine starts the program: the bias is known to what standing tells
+AGAIN_S = 7.0  # within it the device is read once more, which every used sample requires
+#: it stands still while a slow machine starts the program, which determines the bias
 MOTION = (("static", 60.0), ("tumble", 5000.0))
 SCENE = Setup("rov", seed=2, output="binary", rate_hz=50, baud=115200, motion=MOTION)
 
@@ -70,14 +70,16 @@ class Started:
         self.process.wait(PATIENCE_S)
 
     def facts(self):
-        """Facts of the capture with the device's time."""
+        """Facts of the capture with the device time."""
         return [fact for _, fact in self._events() if "at_s" in fact]
 
     def _events(self):
         return CaptureReader(self.capture).facts("event")
 
     def read_s(self):
-        """Of the device's time at most, from the port's opening to the verdict by the host's."""
+        """Upper limit of the device time from the opening of the port to the verdict, by the
+        host clock.
+        """
         events = [*self._events()]
         qualified = next(ns for ns, fact in events if fact.get("state") == "QUALIFIED")
         return SPEED * 1e-9 * (qualified - events[0][0])
@@ -90,7 +92,7 @@ class Started:
 
 
 @pytest.mark.slow
-def test_a_kill_does_not_lose_the_drive(tmp_path):
+def test_drive_before_a_kill_is_used(tmp_path):
     port = tmp_path / "vn100"
     with EmulatorProcess(SCENE, link=port, speed=SPEED, lossless=True):
         cold = Started(tmp_path, port)
@@ -102,12 +104,12 @@ def test_a_kill_does_not_lose_the_drive(tmp_path):
         warm = Started(tmp_path, port)
         try:
             warm.until(lambda: "-> QUALIFIED" in warm.said)
-            time.sleep(1.0)  # what is said is on its way to the capture
+            time.sleep(1.0)  # messages are still on their way to the capture
         finally:
             warm.kill()
     assert "no warm start: there is no earlier capture" in cold.said
     assert f"from {cold.capture.name}" in warm.said
-    # a verdict is stamped by its samples, which on a busy machine are older than those that agreed
+    # a verdict is stamped by its samples, on a busy machine older than those that agreed
     assert warm.read_s() >= CONFIRM_S
     assert warm.qualified_s() - warm.warm_s() < 0.8 * cold.qualified_s()
     done = replay(warm.capture, warm.config)  # the samples are inputs: nothing else is needed

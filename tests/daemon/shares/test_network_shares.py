@@ -1,4 +1,6 @@
-"""Network shares as readers meet them: many, slow, gone, talking, turned away; names in the way."""
+"""Network shares as seen by readers: many, slow, disconnected, sending, or refused, and occupied
+names.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ TEXT = sentence("VNYMR,+006.271,+000.031,-002.000,+0.2,-0.1,+0.4,+0.1,-0.2,-9.8,
 
 
 def free(kind: socket.SocketKind = socket.SOCK_STREAM) -> str:
-    """An address that nobody uses now."""
+    """An unused address."""
     return f"127.0.0.1:{free_port(kind)}"
 
 
@@ -83,7 +85,7 @@ def served() -> Iterator[Served]:
     served.shares.close()
 
 
-def test_every_reader_gets_the_messages_byte_for_byte_and_no_answer_of_others(served):
+def test_every_reader_gets_all_messages_and_no_answers_to_others(served):
     one, two = served.connected(), served.connected()
     served.shares.heard(TEXT[:20])
     served.shares.heard(TEXT[20:] + sentence("VNRRG,23,1") + bytes(range(40)) + TEXT)
@@ -94,7 +96,7 @@ def test_every_reader_gets_the_messages_byte_for_byte_and_no_answer_of_others(se
     two.close()
 
 
-def test_a_message_goes_out_at_once(served):
+def test_message_is_forwarded_at_once(served):
     one = served.connected()
     for _ in range(20):
         begun_s = time.monotonic()
@@ -104,7 +106,7 @@ def test_a_message_goes_out_at_once(served):
     one.close()
 
 
-def test_a_reader_that_never_reads_loses_its_own_and_it_is_counted(served):
+def test_blocked_reader_loses_only_its_own_messages_and_they_are_counted(served):
     idle, reader = served.connected(4096), served.connected()
     got = b""
     for _ in range(4000):
@@ -116,15 +118,15 @@ def test_a_reader_that_never_reads_loses_its_own_and_it_is_counted(served):
     kept = read(idle, len(got) - lost)
     assert kept == TEXT * (4000 - lost // len(TEXT))  # whole messages
     served.shares.heard(TEXT)
-    assert read(idle, len(TEXT)) == TEXT  # and it goes on
+    assert read(idle, len(TEXT)) == TEXT  # and it continues
     assert served.facts.lost_bytes == lost
     idle.close()
     until(lambda: served.facts.readers == 1)
-    assert served.facts.lost_bytes == lost  # also when it is gone
+    assert served.facts.lost_bytes == lost  # also after it disconnected
     reader.close()
 
 
-def test_a_reader_of_numbered_records_is_told_which_it_lost():
+def test_reader_of_numbered_records_learns_which_were_lost():
     share = ShareSection(tcp=free(), send="corrected")
     shares = NetworkShares([share])
     (outlet,) = shares.places
@@ -142,7 +144,7 @@ def test_a_reader_of_numbered_records_is_told_which_it_lost():
         assert 0 < shares.facts()[0].lost_bytes < 8000 * 230
     shares.close()
     records = [json.loads(line) for line in got.splitlines()]
-    assert records[0] == {"seq": 0}  # what was newest when it came
+    assert records[0] == {"seq": 0}  # the newest record when it connected
     gaps = [record for record in records if record.get("record") == "gap"]
     seen = {record["seq"] for record in records if "record" not in record}
     lost = {seq for gap in gaps for seq in range(gap["first_seq"], gap["last_seq"] + 1)}
@@ -152,7 +154,7 @@ def test_a_reader_of_numbered_records_is_told_which_it_lost():
     assert sum(gap["lost"] for gap in gaps) == len(lost)
 
 
-def test_what_a_reader_says_is_thrown_away_and_told_once(served, caplog):
+def test_bytes_from_a_reader_are_discarded_and_logged_once(served, caplog):
     one = served.connected()
     with caplog.at_level(logging.WARNING, "ahrsd"):
         for _ in range(3):
@@ -164,7 +166,7 @@ def test_what_a_reader_says_is_thrown_away_and_told_once(served, caplog):
     one.close()
 
 
-def test_a_flood_is_read_slowly_and_the_others_go_on(served):
+def test_flood_from_a_reader_is_throttled_and_others_continue(served):
     loud, reader = served.connected(), served.connected()
     loud.setblocking(False)
     begun_s, got, count = time.monotonic(), b"", 0
@@ -181,7 +183,7 @@ def test_a_flood_is_read_slowly_and_the_others_go_on(served):
     reader.close()
 
 
-def test_more_readers_than_the_limit_are_turned_away_and_told_once(served, caplog):
+def test_readers_beyond_the_limit_are_refused_and_logged_once(served, caplog):
     readers = [served.connected() for _ in range(MOST_READERS)]
     with caplog.at_level(logging.WARNING, "ahrsd"):
         for number in range(3):
@@ -199,7 +201,7 @@ def test_more_readers_than_the_limit_are_turned_away_and_told_once(served, caplo
         reader.close()
 
 
-def test_readers_that_come_and_go_leave_nothing(served):
+def test_disconnected_readers_leave_no_descriptor(served):
     before = len([*Path("/proc/self/fd").iterdir()])
     for _ in range(100):
         one = served.connected()
@@ -209,7 +211,7 @@ def test_readers_that_come_and_go_leave_nothing(served):
     assert len([*Path("/proc/self/fd").iterdir()]) == before
 
 
-def test_without_descriptors_the_readers_that_are_there_go_on(served, caplog):
+def test_connected_readers_continue_when_descriptors_are_exhausted(served, caplog):
     one = served.connected()
     late = socket.socket()
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -233,7 +235,7 @@ def test_without_descriptors_the_readers_that_are_there_go_on(served, caplog):
     one.close()
 
 
-def test_a_reader_that_resets_its_connection_is_gone(served):
+def test_reader_that_resets_its_connection_is_removed(served):
     one, two = served.connected(), served.connected()
     one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
     one.close()
@@ -244,7 +246,7 @@ def test_a_reader_that_resets_its_connection_is_gone(served):
     two.close()
 
 
-def test_the_address_is_free_again_behind_a_run_with_readers(served):
+def test_address_is_free_after_a_run_with_readers(served):
     one = served.connected()
     served.shares.close()
     assert one.recv(1) == b""
@@ -253,7 +255,7 @@ def test_the_address_is_free_again_behind_a_run_with_readers(served):
     one.close()
 
 
-def test_a_datagram_for_each_message():
+def test_udp_share_sends_one_datagram_per_message():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
         heard.bind(("127.0.0.1", 0))
         heard.settimeout(PATIENCE_S)
@@ -266,7 +268,7 @@ def test_a_datagram_for_each_message():
         shares.close()
 
 
-def test_a_datagram_that_nobody_takes_or_that_cannot_leave_stops_nothing(caplog):
+def test_undeliverable_datagrams_are_counted_and_stop_nothing(caplog):
     nobody, nowhere = free(socket.SOCK_DGRAM), "[2001:db8::1]:5005"
     shares = NetworkShares([ShareSection(udp=nobody), ShareSection(udp=nowhere, other_hosts=True)])
     with caplog.at_level(logging.WARNING, "ahrsd"):
@@ -274,14 +276,14 @@ def test_a_datagram_that_nobody_takes_or_that_cannot_leave_stops_nothing(caplog)
             shares.raw([TEXT])
     there, not_there = shares.facts()
     assert (there.lost_bytes, there.fault) == (0, "")
-    if not_there.fault:  # a machine with a route to everywhere sends it
+    if not_there.fault:  # sent if the machine has a default route
         assert not_there.lost_bytes == 5 * len(TEXT)
         assert caplog.text.count(not_there.fault) == 1
     shares.close()
 
 
 @pytest.mark.parametrize("kind", ["tcp", "udp"])
-def test_over_ipv6(kind):
+def test_share_works_over_ipv6(kind):
     try:
         shares = NetworkShares([ShareSection(**{kind: "[::1]:21019"})])
     except ConfigError:
@@ -296,7 +298,7 @@ def test_over_ipv6(kind):
         ("192.0.2.77:2101", "no interface of this machine has that address"),
     ],
 )
-def test_where_nobody_can_listen_it_is_one_line_and_nothing_is_left(tmp_path, address, words):
+def test_unusable_address_is_a_one_line_error_without_remains(tmp_path, address, words):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -309,7 +311,7 @@ def test_where_nobody_can_listen_it_is_one_line_and_nothing_is_left(tmp_path, ad
     assert not os.path.lexists(tmp_path / "good")
 
 
-def test_an_address_that_others_reach_is_told_at_the_start():
+def test_address_reachable_by_others_is_logged_at_the_start():
     address = free().replace("127.0.0.1", "0.0.0.0")
     shares = Shares(
         [ShareSection(tcp=address, other_hosts=True), ShareSection(udp="127.0.0.1:9")],

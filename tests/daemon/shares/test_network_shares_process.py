@@ -1,6 +1,7 @@
 """`ahrsd run` with a port and three network shares, as its readers see it.
 
-Readers are plain sockets; one is killed, one talks, the device is unplugged, the run is restarted.
+Readers are plain sockets. One is killed, one sends bytes, the device is unplugged, the run is
+restarted.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class Reader:
                 self.data += piece
 
     def records(self, kind: str) -> list[dict]:
-        """Asked again and again: each line is read once."""
+        """New lines since the last call: each line is returned once."""
         whole = self.data.rfind(b"\n") + 1
         self._records += map(json.loads, self.data[self._read : whole].splitlines())
         self._read = max(whole, self._read)
@@ -142,7 +143,7 @@ def vehicle(tmp_path) -> Iterator:
         yield make
 
 
-def test_readers_in_passive_get_every_byte_and_the_device_hears_none_of_theirs(vehicle, tmp_path):
+def test_readers_get_every_byte_and_none_of_theirs_reaches_the_device(vehicle, tmp_path):
     run = vehicle("passive")
     first, doomed = run.reader(run.raw), run.reader(run.raw)
     corrected = run.reader(run.corrected)
@@ -179,14 +180,14 @@ def test_readers_in_passive_get_every_byte_and_the_device_hears_none_of_theirs(v
         body, _, check = line[1:].partition(b"*")
         assert check.decode() == f"{reduce(xor, body):02X}"
         assert body[:5] in (b"HCHDM", b"YXXDR")
-        assert body[:5] != b"HCHDM" or body == b"HCHDM,,M"  # nothing is known of this device yet
+        assert body[:5] != b"HCHDM" or body == b"HCHDM,,M"  # this device is not known yet
     assert first.ended
     assert corrected.ended
     for one in (first, doomed, corrected):
         one.close()
 
 
-def test_a_device_that_is_unplugged_leaves_the_readers_and_comes_back_to_them(vehicle):
+def test_readers_stay_connected_while_the_device_is_unplugged(vehicle):
     run = vehicle("observe", faults=("unplug@10",))
     raw, corrected = run.reader(run.raw), run.reader(run.corrected)
     run.until(lambda: any(not r["device_present"] for r in corrected.records("state")))
@@ -203,7 +204,7 @@ def test_a_device_that_is_unplugged_leaves_the_readers_and_comes_back_to_them(ve
     corrected.close()
 
 
-def test_restarted_with_readers_it_listens_again_at_once(vehicle):
+def test_restarted_run_with_readers_listens_again_at_once(vehicle):
     run = vehicle("observe")
     before = run.reader(run.raw)
     run.until(lambda: len(before.data) > 1000)
@@ -221,7 +222,7 @@ def test_restarted_with_readers_it_listens_again_at_once(vehicle):
         one.close()
 
 
-def test_an_address_in_use_ends_the_start_in_one_line_and_leaves_nothing(vehicle, tmp_path):
+def test_address_in_use_is_a_one_line_error_without_remains(vehicle, tmp_path):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()

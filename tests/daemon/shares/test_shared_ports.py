@@ -1,4 +1,6 @@
-"""Shared ports as programs meet them: opened, closed, killed, not read, flooded, in the way."""
+"""Shared ports as seen by programs: opened, closed, killed, blocked, flooding, or with an
+occupied name.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,7 @@ class Program:
 
 
 class Shared:
-    """Two ports, and what was heard from the programs on them."""
+    """Two ports, and the bytes received from the programs on them."""
 
     def __init__(self, folder: Path) -> None:
         self.paths = [folder / "vn100", folder / "log"]
@@ -79,7 +81,7 @@ def shared(tmp_path: Path) -> Iterator[Shared]:
     assert not any(os.path.lexists(path) for path in shared.paths)
 
 
-def test_measurements_to_all_and_an_answer_to_one(shared):
+def test_measurements_go_to_all_programs_and_an_answer_to_one(shared):
     one, two = shared.opened(0), shared.opened(1)
     shared.ports.heard(TEXT[:20])
     shared.ports.heard(TEXT[20:] + sentence("VNRRG,23,1") + TEXT)
@@ -95,8 +97,8 @@ def test_measurements_to_all_and_an_answer_to_one(shared):
     two.close()
 
 
-def test_the_port_is_raw_before_anybody_opens_it(shared):
-    """Echo would send the stream back as commands; a new line would become two characters."""
+def test_port_is_in_raw_mode_before_it_is_opened(shared):
+    """Echo would send the stream back as commands, and a newline would become two characters."""
     one = shared.opened()
     shared.ports.heard(b"".join(bytes([k]) for k in range(256)) + TEXT)
     assert one.read(256 + len(TEXT)) == bytes(range(256)) + TEXT
@@ -105,7 +107,7 @@ def test_the_port_is_raw_before_anybody_opens_it(shared):
     one.close()
 
 
-def test_a_program_that_paused_its_output_hears_answers_only(shared):
+def test_program_that_paused_its_output_gets_only_answers(shared):
     one, name = shared.opened(), str(shared.paths[0])
     shared.ports.send(SendToClient(name, b"$VNASY,0*4F\r\n", stream=False))
     shared.ports.heard(TEXT)
@@ -115,8 +117,8 @@ def test_a_program_that_paused_its_output_hears_answers_only(shared):
     one.close()
 
 
-def test_closed_and_opened_at_once_it_is_the_same_port(shared):
-    """As a driver does that changes its baud rate."""
+def test_port_reopened_at_once_is_the_same(shared):
+    """As by a driver that changes its baud rate."""
     one = shared.opened()
     target = shared.paths[0].readlink()
     one.close()
@@ -130,8 +132,8 @@ def test_closed_and_opened_at_once_it_is_the_same_port(shared):
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root to be another user")
-def test_a_program_that_is_killed_leaves_the_name_usable(shared):
-    """TIOCEXCL of the dead program stays with its pty; there is a fresh one after a while."""
+def test_name_stays_usable_after_a_program_is_killed(shared):
+    """TIOCEXCL of the dead program stays with its pty, so a new one is made after a while."""
     target = shared.paths[0].readlink()
     target.chmod(0o666)
     code = (
@@ -152,7 +154,7 @@ def test_a_program_that_is_killed_leaves_the_name_usable(shared):
     again.close()
 
 
-def test_a_program_that_never_reads_costs_only_itself(shared):
+def test_blocked_program_loses_only_its_own_messages(shared):
     idle, reader = shared.opened(0), shared.opened(1)
     got = b""
     for _ in range(2000):
@@ -166,7 +168,7 @@ def test_a_program_that_never_reads_costs_only_itself(shared):
     reader.close()
 
 
-def test_what_a_slow_reader_gets_is_whole_messages(shared):
+def test_slow_reader_gets_whole_messages(shared):
     slow = shared.opened()
     for _ in range(4000):
         shared.ports.heard(TEXT)
@@ -175,7 +177,7 @@ def test_what_a_slow_reader_gets_is_whole_messages(shared):
     slow.close()
 
 
-def test_a_flood_comes_at_the_rate_of_a_real_line(shared):
+def test_flood_is_throttled_to_the_rate_of_a_real_line(shared):
     one = shared.opened()
     os.set_blocking(one.fd, False)
     begun_s, sent = time.monotonic(), 0
@@ -190,7 +192,7 @@ def test_a_flood_comes_at_the_rate_of_a_real_line(shared):
 
 
 @pytest.mark.parametrize("what", ["file", "folder", "link to a file"])
-def test_a_name_that_is_somebodys_is_refused_and_kept(tmp_path, what):
+def test_occupied_name_is_refused_and_kept(tmp_path, what):
     path = tmp_path / "vn100"
     if what == "file":
         path.write_text("mine")
@@ -205,8 +207,10 @@ def test_a_name_that_is_somebodys_is_refused_and_kept(tmp_path, what):
 
 
 @pytest.mark.parametrize("raw", [True, False])
-def test_a_link_to_a_pty_that_lives_is_somebodys_port_or_only_has_its_number(tmp_path, raw):
-    """Such as a device on a pty; a person's terminal may have the number of what was killed."""
+def test_link_to_a_live_pty_is_kept_only_if_it_is_a_raw_port(tmp_path, raw):
+    """It may be a device on a pty, or a terminal that reuses the number of a killed program's
+    pty.
+    """
     master, slave = os.openpty()
     if raw:
         tty.setraw(slave)
@@ -222,7 +226,7 @@ def test_a_link_to_a_pty_that_lives_is_somebodys_port_or_only_has_its_number(tmp
     os.close(master)
 
 
-def test_a_name_that_is_taken_while_it_runs_is_told_and_the_other_ports_go_on(shared, caplog):
+def test_name_taken_during_the_run_is_reported_and_other_ports_continue(shared, caplog):
     one = shared.opened(0)
     shared.paths[0].unlink()
     shared.paths[0].write_text("theirs")
@@ -242,7 +246,7 @@ def test_a_name_that_is_taken_while_it_runs_is_told_and_the_other_ports_go_on(sh
 
 
 @pytest.mark.parametrize("taker", ["another run", "a file", "nobody"])
-def test_a_name_that_somebody_took_meanwhile_is_left_to_them(tmp_path, taker):
+def test_name_taken_by_another_program_is_not_removed(tmp_path, taker):
     path = tmp_path / "vn100"
     ports = SharedPorts([ShareSection(pty=path)], print, time.monotonic_ns)
     path.unlink()
@@ -254,7 +258,7 @@ def test_a_name_that_somebody_took_meanwhile_is_left_to_them(tmp_path, taker):
     assert os.path.lexists(path) == (taker != "nobody")
 
 
-def test_after_a_program_left_the_fresh_port_is_taken_away_too(shared):
+def test_port_renewed_after_a_program_left_is_removed_at_the_end(shared):
     target = shared.paths[0].readlink()
     shared.opened().close()
     until(lambda: shared.paths[0].readlink() != target)
@@ -262,7 +266,7 @@ def test_after_a_program_left_the_fresh_port_is_taken_away_too(shared):
     assert not os.path.lexists(shared.paths[0])
 
 
-def test_what_a_killed_run_left_is_replaced(tmp_path):
+def test_remains_of_a_killed_run_are_replaced(tmp_path):
     (tmp_path / "vn100").symlink_to("/dev/pts/99999")
     shared = Shared(tmp_path)
     one = shared.opened()
@@ -280,7 +284,7 @@ def test_what_a_killed_run_left_is_replaced(tmp_path):
         ({"group": "no such group"}, "there is no group no such group"),
     ],
 )
-def test_where_no_port_can_be_it_is_one_line(tmp_path, share, words):
+def test_impossible_port_is_a_one_line_error(tmp_path, share, words):
     good = ShareSection(pty=tmp_path / "good")
     with pytest.raises(ConfigError) as error:
         SharedPorts(
@@ -288,4 +292,4 @@ def test_where_no_port_can_be_it_is_one_line(tmp_path, share, words):
         )
     assert words in str(error.value)
     assert "\n" not in str(error.value)
-    assert not os.path.lexists(tmp_path / "good")  # nothing is left behind
+    assert not os.path.lexists(tmp_path / "good")  # nothing remains

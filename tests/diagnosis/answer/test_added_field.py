@@ -1,4 +1,4 @@
-"""What a field that is added does beside a calibration, and to the heading."""
+"""Effect of an added field on the calibration and on the heading."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def context() -> Context:
     return fit_null(track, walk=False).context()
 
 
-def test_iron_is_calibration_and_no_remainder(context: Context) -> None:
+def test_iron_field_is_absorbed_by_the_calibration(context: Context) -> None:
     take = calibration_basis(context)
     iron = context.field_b @ np.array([[0.1, 0.02, 0], [0.02, -0.1, 0.03], [0, 0.03, 0]]) + 0.05
     assert rms_about_mean(iron) > 0.01
     assert rms_about_mean(project_out_calibration(iron, take)) < 1e-12
 
 
-def test_a_heading_is_off_by_the_field_across(context: Context) -> None:
+def test_heading_error_follows_the_field_across_the_horizontal_field(context: Context) -> None:
     field = context.field_b @ context.model.soft_iron.T
     read = np.einsum("nij,nj->ni", context.R_nb, field).mean(axis=0)
     level = float(np.hypot(*read[:2]))

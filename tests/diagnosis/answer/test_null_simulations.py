@@ -1,4 +1,4 @@
-"""What is told beside a gyro that is louder than the magnetometer is beyond chance."""
+"""With a gyro noisier than the magnetometer, only findings beyond chance are reported."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ STEP_GAUSS = np.array([1.6e-3, -1.2e-3, 0.0])
 
 @pytest.fixture
 def few_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is tested here needs no sixteen of them."""
+    """Five simulations instead of sixteen: enough for these tests."""
     monkeypatch.setattr(priors, "CHANCE_FITS", 5)
 
 
@@ -50,7 +50,7 @@ def _made(
 
 
 def _stepped() -> tuple[Track, Callable[[float], FittedDiagnosis]]:
-    """A track with a step, and an answer that tells something unknown in it of so many nats."""
+    """A track with a step, and an answer with an unknown cause of the given evidence in nats."""
     track = track_of(_made(1e-4, 5e-2, samples=1000))
     since = (np.arange(len(track)) >= 500)[:, None]
     track = replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS)
@@ -68,8 +68,8 @@ def _stepped() -> tuple[Track, Callable[[float], FittedDiagnosis]]:
 
 
 @pytest.mark.usefixtures("few_fits")
-def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> None:
-    """How much of such chance makes is then not known either."""
+def test_no_verdict_when_a_simulation_of_the_null_model_cannot_be_diagnosed() -> None:
+    """It is then unknown how much evidence chance alone produces."""
     track, answered = _stepped()
 
     def ask(asked: Track) -> FittedDiagnosis:
@@ -88,7 +88,7 @@ def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> 
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_fits")
 @pytest.mark.parametrize(
-    ("nats", "is_told", "chance", "asked"),
+    ("nats", "is_reported", "chance", "asked"),
     [
         (30.0, False, 48, 1),
         (100.0, True, 48, 5),
@@ -96,10 +96,12 @@ def test_where_a_simulation_cannot_be_diagnosed_neither_yes_nor_no_is_said() -> 
         (2000.0, True, 519, 2),
     ],
 )
-def test_what_simulations_show_is_said_beside_what_is_told(
-    nats: float, is_told: bool, chance: int, asked: int
+def test_note_reports_evidence_that_simulations_of_the_null_model_produce(
+    nats: float, is_reported: bool, chance: int, asked: int
 ) -> None:
-    """Four times what five of them show may be chance, 16 times what three do, 43 times two."""
+    """Chance may produce 4 times the largest evidence of five simulations, 16 times that of three,
+    43 times that of two.
+    """
     track, answered = _stepped()
     copies = list[Track]()
 
@@ -110,23 +112,27 @@ def test_what_simulations_show_is_said_beside_what_is_told(
         return answered(12.0)
 
     found = diagnose_beyond_chance(track, ask)
-    assert found.unexplained.detected == is_told
+    assert found.unexplained.detected == is_reported
     assert len(copies) == asked
     (note,) = found.notes[:1]
-    beside = "" if is_told else ", so nothing is reported"
+    beside = "" if is_reported else ", so nothing is reported"
     assert note.endswith(f" an effect of up to 12 nats; up to {chance} nats may be chance{beside}")
 
 
 @pytest.mark.parametrize(
     ("copies", "chance", "times"), [(1, 1e-3, 999.0), (2, 1e-3, 43.2), (5, 1 / 126, 4.0)]
 )
-def test_times_beyond_the_largest_of_several(copies: int, chance: float, times: float) -> None:
-    """Of exponential draws: n! / ((1 + t) ... (n + t))."""
+def test_required_ratio_to_the_largest_of_several_simulations(
+    copies: int, chance: float, times: float
+) -> None:
+    """For exponential draws the probability is n! / ((1 + t) ... (n + t))."""
     assert required_ratio(copies, chance) == pytest.approx(times, rel=1e-3)
 
 
-def test_with_every_early_look_one_in_94_of_what_chance_makes_is_told() -> None:
-    """Of exponential draws beside five others: 1 in 126 at the last, 1 in 1000 at each before."""
+def test_false_alarm_rate_of_sequential_test_is_one_in_94() -> None:
+    """Exponential draws compared with five others: 1 in 126 at the last look, 1 in 1000 at each
+    earlier look.
+    """
     told, *others = np.random.default_rng(5).exponential(size=(6, 500_000))
     largest = np.maximum.accumulate(others)
     early = [required_ratio(count, priors.CHANCE_EARLY_P) for count in (1, 2, 3, 4)]
@@ -138,23 +144,27 @@ def test_with_every_early_look_one_in_94_of_what_chance_makes_is_told() -> None:
 @pytest.mark.parametrize(
     ("sigma_mag", "sigma_gyro", "ratio"), [(1e-3, 5e-3, 0.1), (1e-4, 5e-2, 10.0)]
 )
-def test_how_loud_a_gyro_is(sigma_mag: float, sigma_gyro: float, ratio: float) -> None:
-    """Of half a gauss, 25 times a second: 50 mrad/s turn it by 1 mG."""
+def test_gyro_noise_as_ratio_of_magnetometer_noise(
+    sigma_mag: float, sigma_gyro: float, ratio: float
+) -> None:
+    """At half a gauss and 25 Hz, 50 mrad/s turn the field by 1 mG in one step."""
     made = _made(sigma_mag, sigma_gyro)
     assert gyro_to_mag_noise(track_of(made), true_model(made)) == pytest.approx(ratio, rel=0.1)
 
 
-@pytest.mark.parametrize(("scenario", "is_bent"), [("lam", True), ("wam", False), ("mam", False)])
-def test_the_noise_bends_a_calibration_that_the_motion_hardly_shows(
-    scenario: str, is_bent: bool
+@pytest.mark.parametrize(("scenario", "is_biased"), [("lam", True), ("wam", False), ("mam", False)])
+def test_gyro_noise_biases_the_calibration_when_the_motion_is_small(
+    scenario: str, is_biased: bool
 ) -> None:
-    """Slow turns with a tilt of a few degrees; the same noise beside larger ones moves nothing."""
+    """With slow turns and a tilt of a few degrees the calibration is biased. With larger turns the
+    same noise changes nothing.
+    """
     problem, cold = build_problem(track_of(_made(1e-3, 5e-3, scenario, 2)), Spec())
     moved = calibration_bend(fit_null(problem.track, problem.spec, cold, walk=False))
-    assert moved == pytest.approx(0.62, abs=0.1) if is_bent else moved < 0.1
+    assert moved == pytest.approx(0.62, abs=0.1) if is_biased else moved < 0.1
 
 
-def test_a_copy_has_the_motion_the_noise_and_the_stamps() -> None:
+def test_simulated_copy_has_same_motion_noise_and_time_stamps() -> None:
     made = _made(1e-4, 5e-2)
     track, model = track_of(made), true_model(made)
     truth = noise_free_motion(track, model)

@@ -1,4 +1,4 @@
-"""The omnibus tests: uniform on nulls, and each fires on what it is for."""
+"""The omnibus tests: p values are uniform on nulls, and each test detects its kind of misfit."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _named(tests: tuple[Test, ...]) -> dict[str, Test]:
     return {test.name: test for test in tests}
 
 
-def test_probabilities_are_uniform_on_nulls() -> None:
+def test_p_values_are_uniform_on_nulls() -> None:
     found: dict[str, list[float]] = {}
     for seed in range(40):
         done = _filtered(seed)
@@ -55,7 +55,7 @@ def test_probabilities_are_uniform_on_nulls() -> None:
             assert stats.kstest(values, "uniform").pvalue > 1e-3, name
 
 
-def test_noise_that_is_larger_than_said() -> None:
+def test_normalised_innovation_detects_noise_above_the_model() -> None:
     rng = np.random.default_rng(0)
     tests = _named(omnibus_tests(_filtered(1, 6e-4 * rng.standard_normal((1500, 3)))))
     assert tests["normalised_innovation"].p_value < 1e-6
@@ -63,7 +63,7 @@ def test_noise_that_is_larger_than_said() -> None:
     assert tests["ljung_box"].p_value > 1e-3
 
 
-def test_a_slow_field_and_a_fast_line_are_not_white() -> None:
+def test_whiteness_tests_detect_a_slow_field_and_a_fast_line() -> None:
     t = np.arange(1500) * 0.04
     slow = 3e-3 * np.sin(2 * np.pi * 0.3 * t)[:, None] * np.array([1.0, 0.0, 1.0])
     tests = _named(omnibus_tests(_filtered(1, slow)))
@@ -73,13 +73,13 @@ def test_a_slow_field_and_a_fast_line_are_not_white() -> None:
     assert _named(omnibus_tests(_filtered(1, fast)))["cumulative_periodogram"].p_value < 1e-4
 
 
-def test_tails_are_not_normal() -> None:
+def test_normality_test_detects_outliers() -> None:
     rng = np.random.default_rng(3)
     hit = 8e-3 * rng.standard_normal((1500, 3)) * (rng.random((1500, 1)) < 0.01)
     assert _named(omnibus_tests(_filtered(1, hit)))["normality"].p_value < 1e-9
 
 
-def test_scatter_that_follows_a_column_names_it() -> None:
+def test_variance_test_names_the_column_that_the_variance_follows() -> None:
     rng = np.random.default_rng(2)
     current = np.where(np.arange(1500) % 400 < 150, 8.0, 1.0)
     done = _filtered(1, 2e-4 * current[:, None] * rng.standard_normal((1500, 3)))
@@ -91,13 +91,13 @@ def test_scatter_that_follows_a_column_names_it() -> None:
     assert variance_test(done, {"constant": np.ones(1500)}).p_value == 1.0
 
 
-def test_too_few_samples_give_no_tests() -> None:
+def test_no_omnibus_tests_when_samples_are_too_few() -> None:
     made = experiment(samples=60)
     assert omnibus_tests(run_filter(track_of(made), true_model(made))) == ()
 
 
-def test_noise_that_is_only_assumed_is_not_tested() -> None:
-    """A simulation without noise of the magnetometer: along the field nothing scatters."""
+def test_no_omnibus_tests_when_the_noise_level_is_only_assumed() -> None:
+    """A simulation without magnetometer noise: the readings have no scatter along the field."""
     made = experiment("mam", seed=0, samples=1500, sigma_mag=0.0, sigma_gyro=5e-3)
     model = replace(true_model(made), sigma_mag_gauss=priors.FLOOR_MAG_GAUSS)
     done = run_filter(track_of(made), model)

@@ -1,4 +1,6 @@
-"""Posterior predictive checks: the truth is inside, what was left out is outside."""
+"""Posterior predictive checks: statistics of the null are within their bands, omitted effects are
+not.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from ahrsd.diagnosis.repaired_model import forward
 
 
 def recorded(name=None, strength=1.0, seed=0, rows=3000):
-    """The null that is fitted to a recording, with an effect or without."""
+    """The null model fitted to a simulated recording, with or without one effect."""
     context, _ = moving(11, rows=rows)
     truth = forward.noise_free_readings(context)
     terms = ()
@@ -31,7 +33,7 @@ def recorded(name=None, strength=1.0, seed=0, rows=3000):
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_recording_of_the_null_is_inside_all_itsbands(seed):
+def test_all_statistics_of_a_null_recording_are_within_their_bands(seed):
     null = recorded(seed=seed)
     found = predictive_checks.check_null(null)
     assert set(found) == {
@@ -43,8 +45,8 @@ def test_a_recording_of_the_null_is_inside_all_itsbands(seed):
     assert all(c.band[0] < c.band[1] and c.inside_after == c.inside_before for c in found.values())
 
 
-def test_a_line_that_was_left_out_is_outside():
-    """What is slower is held as noise."""
+def test_line_statistic_is_outside_its_band_when_a_line_is_omitted():
+    """A slower disturbance would be taken for noise."""
     found = predictive_checks.check_null(recorded("ac_interference", seed=5))
     assert not found["line"].inside_before
 
@@ -52,7 +54,7 @@ def test_a_line_that_was_left_out_is_outside():
 @pytest.mark.parametrize(
     ("colour", "freedom", "read"), [((0.8,), np.inf, 1), ((), 3.5, 1), ((), np.inf, 3)]
 )
-def test_noise_of_any_colour_and_tail_is_inside_and_so_is_a_reading_now_and_then(
+def test_coloured_or_heavy_tailed_noise_and_sparse_readings_are_within_the_bands(
     colour, freedom, read
 ):
     context, _ = moving(11, rows=3000)
@@ -68,7 +70,7 @@ def test_noise_of_any_colour_and_tail_is_inside_and_so_is_a_reading_now_and_then
     assert [name for name, check in found.items() if not check.inside_after] == []
 
 
-def test_the_noise_is_as_loud_as_it_is_where_it_is_loud():
+def test_noise_law_has_the_higher_level_within_its_interval():
     context, _ = moving(11, rows=3000)
     model = replace(context.model, gyro_walk_rad_s_sqrt_s=0.0)
     time_s = context.track.time_s
@@ -81,7 +83,7 @@ def test_the_noise_is_as_loud_as_it_is_where_it_is_loud():
     law = predictive_checks.fit_noise_law(fit, [(30.0, 60.0)])
     loud = law.level[(time_s > 31) & (time_s < 59)]
     assert loud.min() / law.level[time_s < 29].max() == pytest.approx(3.0, rel=0.1)
-    assert law.freedom > 30  # one level taken for all, the tails would be heavy
+    assert law.freedom > 30  # with one level for all rows the tails would look heavy
 
 
 @pytest.mark.parametrize(
@@ -92,7 +94,7 @@ def test_the_noise_is_as_loud_as_it_is_where_it_is_loud():
         1.5e-2,
     ],
 )
-def test_readings_in_coarse_steps_are_simulated_so_and_their_noise_is_what_was_there_before(
+def test_noise_level_is_recovered_from_quantised_readings(
     step_gauss,
 ):
     context, _ = moving(11, rows=3000)
@@ -107,7 +109,7 @@ def test_readings_in_coarse_steps_are_simulated_so_and_their_noise_is_what_was_t
     assert law.mag_gauss == pytest.approx(model.sigma_mag_gauss, rel=0.1)
 
 
-def test_the_largest_of_many_differences_may_be_as_small_as_it_likes():
+def test_bands_of_largest_differences_have_no_lower_limit():
     null = recorded(rows=600)
     bands = {name: check.band[0] for name, check in predictive_checks.check_null(null).items()}
     assert {name for name, low in bands.items() if low > 0} == {
@@ -115,12 +117,12 @@ def test_the_largest_of_many_differences_may_be_as_small_as_it_likes():
     }  # fmt: skip
 
 
-def test_the_same_question_has_the_same_answer():
+def test_predictive_checks_are_deterministic():
     null = recorded(rows=600)
     assert predictive_checks.check_null(null) == predictive_checks.check_null(null)
 
 
-def test_statistics_of_white_noise_are_what_they_say():
+def test_statistics_of_white_noise_have_their_expected_values():
     context, _ = moving(12, rows=4000)
     e = np.random.default_rng(0).standard_normal((4000, 3))
     found = predictive_checks.residual_statistics(e, predictive_checks.build_scene(context))
@@ -137,7 +139,7 @@ def test_statistics_of_white_noise_are_what_they_say():
     )
 
 
-def test_without_columns_nothing_is_said_of_them():
+def test_no_covariate_statistic_when_no_column_varies():
     context, _ = moving(12, rows=400)
     still = {"throttle": np.full(400, 0.3), "x": np.full(400, np.nan)}
     bare = replace(context, track=replace(context.track, covariates=still))
@@ -147,7 +149,7 @@ def test_without_columns_nothing_is_said_of_them():
     )
 
 
-def test_simulations_lose_the_turns_that_nobody_saw():
+def test_simulated_copies_lose_the_expected_number_of_turns():
     context, _ = moving(11, rows=4000)
     expected = np.where(np.arange(4000) < 3000, 0.05, 0.0)
     track = replace(context.track, lost_turns=expected, step_share=0.5)
@@ -164,8 +166,10 @@ def test_simulations_lose_the_turns_that_nobody_saw():
     )
 
 
-def test_a_recording_that_lost_turns_looks_like_its_simulations():
-    """What is lost unseen jumps by a few deviations of a reading: here by 2, at 3 rows in 100."""
+def test_recording_with_lost_turns_is_within_its_bands():
+    """A turn that is lost undetected jumps by a few standard deviations of a reading: here by 2, in
+    3 rows of 100.
+    """
     context, _ = moving(11, rows=4000)
     model = replace(context.model, gyro_walk_rad_s_sqrt_s=0.0)
     truth = forward.noise_free_readings(context)
@@ -179,15 +183,17 @@ def test_a_recording_that_lost_turns_looks_like_its_simulations():
     assert [name for name, check in found.items() if not check.inside_after] == []
 
 
-def test_the_largest_of_many_is_below_its_band_as_often_as_is_said():
-    """One more largest value beyond 16: at most once in 1,000 by Gumbel's law, in 10 statistics."""
+def test_band_of_the_largest_value_has_the_stated_coverage():
+    """A 17th largest value is outside at most once in 1,000 by Gumbel's law, in 10 statistics."""
     drawn = np.random.default_rng(5).gumbel(size=(200_000, predictive_checks.COPIES + 1))
     known, other = drawn[:, :-1], drawn[:, -1]
     beyond = other > known.mean(axis=1) + priors.CHECKS_LARGEST_REACH * known.std(axis=1, ddof=1)
     assert np.mean(beyond) == pytest.approx(1e-3, rel=0.1)
     for size in (60, 5000):  # segments in three axes; lines of a periodogram
         share = np.random.default_rng(size).random((8_000, predictive_checks.COPIES + 1))
-        drawn = -np.log1p(-(share ** (1 / size)))  # of so many powers, by their distribution
+        drawn = -np.log1p(
+            -(share ** (1 / size))
+        )  # the largest of this many powers, by their distribution
         bands = [
             predictive_checks.predictive_bands([{"line": float(x)} for x in row[:-1]])
             for row in drawn

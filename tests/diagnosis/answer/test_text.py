@@ -1,4 +1,4 @@
-"""Words: what is left, ordinary or beyond that, and how an effect was read."""
+"""Text of the answer: the remaining residual, ordinary or beyond it, and how an effect was read."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from ahrsd.report.diagnosis_page import write_diagnosis_report
 WHY = "beyond the ordinary: a field by attitude, 80 mG where up to 19 mG is ordinary"
 
 
-def part(name: str, words: str, size: float, there: bool = True) -> Component:
+def component(name: str, words: str, size: float, there: bool = True) -> Component:
     nats = 100.0 if there else 0.0
     return Component(name, words, "sensor", size, 19e-3, "gauss", 100.0 * size, nats, there)
 
 
-def left(attitude: float, *, within: bool = True, there: bool = True) -> Ordinary:
-    """A field by attitude, and one of 10 mG by place."""
+def remaining(attitude: float, *, within: bool = True, there: bool = True) -> Ordinary:
+    """A field that varies with attitude, and one of 10 mG that varies with place."""
     field = float(np.hypot(attitude, 10e-3))
     return Ordinary(
         within=within,
@@ -51,14 +51,14 @@ def left(attitude: float, *, within: bool = True, there: bool = True) -> Ordinar
         gyro_up_to_rad_s=0.01,
         recordings=20,
         components=(
-            part("by_direction", "a field by attitude", attitude, there),
-            part("world_course", "a field by place", 10e-3, there),
+            component("by_direction", "a field by attitude", attitude, there),
+            component("world_course", "a field by place", 10e-3, there),
         ),
     )
 
 
-def found(one: Ordinary, *findings: Finding) -> Diagnosis:
-    """A diagnosis that leaves this in the world."""
+def diagnosis_of(one: Ordinary, *findings: Finding) -> Diagnosis:
+    """A diagnosis with this remaining residual in the world frame."""
     unknown = Unexplained(
         detected=not one.within,
         where=Where(((0.0, 100.0),), ("x", "y"), "world"),
@@ -71,8 +71,8 @@ def found(one: Ordinary, *findings: Finding) -> Diagnosis:
     return Diagnosis("walk.csv", None, something, 1e-20, findings, unknown, {})
 
 
-def test_what_is_ordinary_is_no_mismatch_and_is_not_silent():
-    one = found(left(8e-3))
+def test_ordinary_residual_is_reported_and_is_no_mismatch():
+    one = diagnosis_of(remaining(8e-3))
     told = one.to_json()["unexplained"]
     assert told["where"]["frame"] == "world"
     assert told["evidence_nats"] == 120.0
@@ -88,12 +88,12 @@ def test_what_is_ordinary_is_no_mismatch_and_is_not_silent():
     assert not any(line.startswith("unknown, here") for line in answer_lines(one))
 
 
-def test_what_is_unknown_is_told_with_direction_frequencies_and_size():
+def test_unknown_cause_is_reported_with_direction_frequencies_and_size():
     where = Where(
         ((0.0, 110.0),), ("x", "y"), "sensor", band_hz=(0.26, 2.08), direction=(0.6, -0.8, 0.0)
     )
-    left = Unexplained(True, where, None, 4.19e-4, "gauss", evidence_nats=40.0)
-    said = answer_lines(Diagnosis("walk.csv", None, True, 1e-17, (), left, {}))
+    remaining = Unexplained(True, where, None, 4.19e-4, "gauss", evidence_nats=40.0)
+    said = answer_lines(Diagnosis("walk.csv", None, True, 1e-17, (), remaining, {}))
     at = said.index("unknown, here (no effect of the library explains it):")
     assert said[at + 1 : at + 4] == [
         "   where      0.0-110.0 s; axes x y; turns with the vehicle; 0.26-2.08 Hz",
@@ -102,19 +102,19 @@ def test_what_is_unknown_is_told_with_direction_frequencies_and_size():
     ]
 
 
-def test_a_name_beside_what_is_ordinary_is_a_mismatch():
+def test_finding_next_to_an_ordinary_residual_is_a_mismatch():
     lag = Finding(
         "mag_time_lag", 0.99, (), Where((), (), "link"), (), None, None, None, words="it is late"
     )
-    one = found(left(8e-3), lag)
+    one = diagnosis_of(remaining(8e-3), lag)
     assert verdict(one).startswith(
         "MISMATCH: 1 effect left out (p = 1e-20); the remaining residual is"
     )
     assert ordinary_residual(one) is one.unexplained.ordinary
 
 
-def test_what_is_beyond_is_unknown_and_says_by_how_much():
-    one = found(left(80e-3, within=False))
+def test_residual_beyond_the_ordinary_is_unknown_and_reported_with_its_excess():
+    one = diagnosis_of(remaining(80e-3, within=False))
     assert ordinary_residual(one) is None
     said = "\n".join(answer_lines(one))
     assert said.startswith("walk.csv: MISMATCH: an unknown cause (p = 1e-20)")
@@ -122,29 +122,31 @@ def test_what_is_beyond_is_unknown_and_says_by_how_much():
     assert "why        beyond the ordinary: a field by attitude, 80 mG where up to" in said
 
 
-def test_the_page_says_which_of_both_it_is(tmp_path):
+def test_report_page_distinguishes_ordinary_residual_from_unknown(tmp_path):
     page = tmp_path / "report.html"
-    write_diagnosis_report(page, found(left(8e-3)), "ahrsd diagnose walk.csv")
+    write_diagnosis_report(page, diagnosis_of(remaining(8e-3)), "ahrsd diagnose walk.csv")
     said = page.read_text(encoding="utf-8")
     assert "Remaining residual, ordinary" in said
     assert "13 mG, 1.3 deg of heading" in said
     assert "a field by attitude: 8 mG, 0.8 deg of heading, 100 nats (ordinary: up to " in said
     assert "Unknown, here" not in said
-    write_diagnosis_report(page, found(left(80e-3, within=False)), "ahrsd diagnose walk.csv")
+    write_diagnosis_report(
+        page, diagnosis_of(remaining(80e-3, within=False)), "ahrsd diagnose walk.csv"
+    )
     said = page.read_text(encoding="utf-8")
     assert "Unknown, here" in said
     assert WHY in said
     assert "Remaining residual, ordinary" not in said
 
 
-def test_what_no_component_holds_is_told_as_a_whole():
-    one = replace(left(0.0, there=False), field_gauss=3e-3, heading_deg=0.4)
+def test_residual_without_a_single_component_is_reported_as_a_whole():
+    one = replace(remaining(0.0, there=False), field_gauss=3e-3, heading_deg=0.4)
     assert component_lines(one) == ["3 mG, 0.4 deg of heading, in no single component"]
     assert "3 mG, 0.4 deg of heading" in ordinary_text(one)
 
 
 @pytest.mark.parametrize("name", list(EFFECTS))
-def test_each_part_of_a_setting_is_told_or_left_out_for_a_reason(name):
+def test_every_setting_key_is_either_reported_or_listed_as_unreported(name):
     context, readings = moving(5)
     settings = [*EFFECTS[name].settings(context), EFFECTS[name].example(readings, 1.0)[1]]
     keys = {key for setting in settings for key in setting}
@@ -184,5 +186,5 @@ def test_each_part_of_a_setting_is_told_or_left_out_for_a_reason(name):
         ({"covariate": "an\nodd name"}, "by the column an\\nodd name"),
     ],
 )  # fmt: skip
-def test_the_words(setting, text):
+def test_text_of_a_setting(setting, text):
     assert setting_text(setting) == text

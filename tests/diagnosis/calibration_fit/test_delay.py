@@ -1,4 +1,4 @@
-"""A late sensor is put in time: the gyro exactly, and what was logged beside the magnetometer."""
+"""Correction of a delayed sensor: the gyro exactly, and the columns logged with a magnetometer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ahrsd.diagnosis.track import Track
 
 
 def attitude(t: np.ndarray) -> np.ndarray:
-    """A smooth attitude: two rotations, one after the other."""
+    """A smooth attitude, the product of two rotations."""
     first = so3.exp(np.outer(np.sin(1.3 * t), [0.3, -0.8, 0.4]))
     return first @ so3.exp(np.outer(np.cos(0.9 * t), [0.5, 0.2, 0.6]))
 
@@ -34,7 +34,7 @@ def rates(t: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("tau", [0.013, 0.04, -0.027])
-def test_rates_are_those_of_the_earlier_instants(tau):
+def test_delayed_gyro_has_the_rates_of_the_earlier_instants(tau):
     t = np.arange(0.0, 20.0, 0.02)
     dt = np.concatenate([[np.nan], np.diff(t)])
     track = Track(t, dt, np.zeros((len(t), 3)), rates(t), None, {}, (slice(0, len(t)),))
@@ -46,14 +46,14 @@ def test_rates_are_those_of_the_earlier_instants(tau):
     assert after < 0.002 * before
 
 
-def test_no_delay_is_the_same_track():
+def test_zero_delay_returns_the_same_track():
     t = np.arange(10.0)
     track = Track(t, t, np.zeros((10, 3)), np.ones((10, 3)), None, {}, (slice(0, 10),))
     assert delayed_gyro(track, 0.0) is track
 
 
-def test_steps_that_are_not_alike_have_no_half():
-    """With one sample in seven missing half a step is no convention that a delay could be."""
+def test_irregular_steps_have_no_regular_step():
+    """With one sample of seven missing, a delay of half a step is no sampling convention."""
     t = 0.025 * np.arange(4000)
     dt = np.diff(t, prepend=np.nan)
     assert regular_step(dt) == pytest.approx(0.025)
@@ -65,8 +65,8 @@ def test_steps_that_are_not_alike_have_no_half():
     ("lag_s", "late"),
     [(0.07, True), (0.016, True), (0.0125, False), (0.0122, False), (-0.02, False), (0.0, False)],
 )
-def test_half_a_step_is_the_gyros_and_what_is_logged_stays_where_it_is(lag_s, late):
-    """25 ms a step: a gyro that tells the rate at the instant is half of that early."""
+def test_half_a_step_is_a_gyro_convention_and_does_not_move_the_columns(lag_s, late):
+    """Steps are 25 ms. A gyro that reports the rate at the instant is early by half a step."""
     time_s = np.arange(200) * 0.025
     zeros = np.zeros((200, 3))
     track = Track(
@@ -83,8 +83,10 @@ def test_half_a_step_is_the_gyros_and_what_is_logged_stays_where_it_is(lag_s, la
     np.testing.assert_allclose(moved[10:], wanted[10:], atol=2e-3 if late else 0.0)
 
 
-def test_a_low_pass_does_half_beyond_a_delay_of_what_it_does_to_the_delayed_field():
-    """LP(h) - h(t - tau) of a field that turns steadily: i w tau becomes 1 / (1 + i w tau)."""
+def test_low_pass_beyond_delay_matches_the_closed_form_for_a_steady_turn():
+    """LP(h) - h(t - tau) of a field that turns steadily: the low-pass response is 1 / (1 + i w
+    tau).
+    """
     tau, rate = 0.05, 1.5
     t = 0.02 * np.arange(2000)
     dt = np.diff(t, prepend=np.nan)
@@ -107,7 +109,7 @@ def test_a_low_pass_does_half_beyond_a_delay_of_what_it_does_to_the_delayed_fiel
 
 
 def logged(t: np.ndarray) -> Track:
-    """A current, a lamp and a specific force beside a gyro, in two runs with a pause in between."""
+    """A current, a lamp and a specific force logged with a gyro, in two runs with a pause."""
     dt = np.diff(t, prepend=np.nan)
     dt[500] = np.nan
     t = np.concatenate([t[:500], t[500:] + 7.0])
@@ -117,7 +119,7 @@ def logged(t: np.ndarray) -> Track:
     return Track(t, dt, np.zeros((len(t), 3)), rates(t), force, columns, runs)
 
 
-def test_all_that_is_logged_beside_a_late_magnetometer_is_as_late() -> None:
+def test_columns_and_force_are_delayed_with_a_delayed_magnetometer() -> None:
     track = logged(np.arange(0.0, 20.0, 0.02))
     moved = without_lag(track, 0.05)
     t = track.time_s - 0.05
@@ -128,7 +130,7 @@ def test_all_that_is_logged_beside_a_late_magnetometer_is_as_late() -> None:
     np.testing.assert_allclose(current[inner], 3 + np.sin(0.8 * t[inner]), atol=1e-4)
     assert moved.accel_b_m_s2 is not None
     np.testing.assert_allclose(moved.accel_b_m_s2[inner, 2], t[inner], atol=1e-9)
-    # a run's first samples have nothing before them, the run before is none of it
+    # the first samples of a run have no earlier ones; the previous run is not used
     assert current[500] == track.covariates["motor_current_a"][500]
     lamp, before = moved.covariates["lamp_on"], track.covariates["lamp_on"]
     assert set(lamp) == {0.0, 1.0}
@@ -136,7 +138,7 @@ def test_all_that_is_logged_beside_a_late_magnetometer_is_as_late() -> None:
     assert late == pytest.approx(0.05, abs=0.0101)
 
 
-def test_beside_a_late_gyro_nothing_else_is_moved() -> None:
+def test_only_the_gyro_is_moved_when_the_gyro_is_delayed() -> None:
     track = logged(np.arange(0.0, 20.0, 0.02))
     moved = without_lag(track, -0.05)
     np.testing.assert_array_equal(moved.gyro_b_rad_s, delayed_gyro(track, -0.05).gyro_b_rad_s)
@@ -145,8 +147,10 @@ def test_beside_a_late_gyro_nothing_else_is_moved() -> None:
 
 
 @pytest.mark.parametrize("lag_s", [0.05, 0.09, 0.02])
-def test_rates_at_instants_are_drawn_from_value_to_value_and_are_half_a_step_early(lag_s):
-    """About one axis, where turns add up: the mean of the straight lines over the earlier step."""
+def test_instantaneous_rates_are_interpolated_and_are_half_a_step_early(lag_s):
+    """About one axis, where turns add up: the expected rate is the mean of the linear interpolation
+    over the earlier step.
+    """
     t = 0.1 * np.arange(60)
     values = np.random.default_rng(5).normal(size=60)
     rate = np.outer(values, [0.0, 0.0, 1.0])
@@ -160,8 +164,8 @@ def test_rates_at_instants_are_drawn_from_value_to_value_and_are_half_a_step_ear
     np.testing.assert_allclose(moved[2:-2], expected[2:-2], atol=1e-5)
 
 
-def test_readings_of_a_time_at_which_no_column_was_logged_yet_are_left_out():
-    """A magnetometer that is late by up to 100 ms, at 25 Hz: the first three of each run."""
+def test_readings_before_the_first_delayed_column_value_are_omitted():
+    """At 25 Hz and a delay of up to 100 ms, these are the first three readings of each run."""
     track = track_of(experiment(samples=500))
     dt_s = track.dt_s.copy()
     dt_s[200] = np.nan
@@ -173,8 +177,8 @@ def test_readings_of_a_time_at_which_no_column_was_logged_yet_are_left_out():
         assert unread.tolist() == left_out
 
 
-def test_a_recording_in_short_bursts_keeps_all_of_its_readings():
-    """Five readings a second, a step of 40 ms apart: the first three would be most of each."""
+def test_readings_of_short_bursts_are_all_kept():
+    """Bursts of five readings with steps of 40 ms: the first three would be most of each burst."""
     track = track_of(experiment(samples=500))
     dt_s = track.dt_s.copy()
     dt_s[::5] = np.nan

@@ -1,4 +1,4 @@
-"""Which recordings have delta angles, and a gyro's noise where the motion itself shakes."""
+"""Recognition of delta angles, and the gyro's noise level when the motion itself shakes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _STEP_S = 0.05
 
 
 def _tumbling(quick: float, samples: int = 6000) -> tuple[Array, Array, Array]:
-    """Of a motion of about `quick` rad/s: mean rates, rotation vectors over dt, field (mG)."""
+    """Mean rates, rotation vectors over dt, and field (mG) of a motion of about `quick` rad/s."""
     fine_s = _STEP_S / _FINE
     t = np.arange(samples * _FINE) * fine_s
     rates = [(2.1, 0.3), (1.7, 1.1), (2.6, 2.0)]
@@ -48,49 +48,51 @@ def _track(rate: Array, field_mgauss: Array, seed: int = 4) -> Track:
     return Track(time_s, dt, mag, gyro, None, {}, (slice(0, len(rate)),))
 
 
-def _told(track: Track) -> Track:
+def _with_delta_angles(track: Track) -> Track:
     return with_delta_angles(track, cold_start(track, Spec()))
 
 
-def test_mean_rates_of_a_tumbling_sensor_become_turns_of_the_steps() -> None:
+def test_mean_rates_are_converted_to_delta_angles_when_tumbling() -> None:
     mean, exact, field = _tumbling(1.0)
     before = float(np.sqrt(np.mean((mean - exact) ** 2)))
     track = _track(mean, field)
     noise = track.gyro_b_rad_s - mean
-    after = float(np.sqrt(np.mean((_told(track).gyro_b_rad_s - noise - exact)[1:] ** 2)))
-    assert before > 1e-4  # as much as the noise: it would be seen
+    after = float(
+        np.sqrt(np.mean((_with_delta_angles(track).gyro_b_rad_s - noise - exact)[1:] ** 2))
+    )
+    assert before > 1e-4  # as large as the noise: the difference would be detected
     assert after < 0.1 * before
 
 
-def test_delta_angles_stay_as_they_are() -> None:
+def test_delta_angles_are_unchanged() -> None:
     _, exact, field = _tumbling(1.0)
     track = _track(exact, field)
-    assert _told(track) is track
+    assert _with_delta_angles(track) is track
 
 
-def test_where_the_motion_is_slow_nothing_is_done() -> None:
+def test_rates_are_unchanged_when_the_motion_is_slow() -> None:
     mean, _, field = _tumbling(0.1)
     track = _track(mean, field)
-    assert _told(track) is track
+    assert _with_delta_angles(track) is track
 
 
-def test_a_gyro_of_the_wrong_scale_is_not_taken_for_mean_rates() -> None:
+def test_gyro_scale_error_is_not_taken_for_mean_rates() -> None:
     _, exact, field = _tumbling(1.0)
     track = _track(exact * np.array([1.02, 0.99, 1.01]), field)
-    assert _told(track) is track
+    assert _with_delta_angles(track) is track
 
 
-def test_rates_that_do_not_follow_the_motion_are_left_alone() -> None:
-    """A body that shakes between the samples: the neighbours say nothing of a step."""
+def test_rates_are_unchanged_when_the_sensor_shakes_between_samples() -> None:
+    """The neighbouring samples then do not determine the rate within a step."""
     mean, _, field = _tumbling(1.0)
     shaken = mean + np.random.default_rng(2).normal(0, 1.0, mean.shape)
     track = _track(shaken, field)
-    assert _told(track) is track
+    assert _with_delta_angles(track) is track
 
 
 @pytest.mark.parametrize("scenario", ["wam", "mam", "lam"])
 @pytest.mark.parametrize("rate_hz", [10.0, 25.0, 100.0])
-def test_smooth_motion_is_not_shaken(scenario: str, rate_hz: float) -> None:
+def test_smooth_motion_is_not_classified_as_shaken(scenario: str, rate_hz: float) -> None:
     for seed in range(3):
         made = experiment(scenario, seed=seed, samples=4000, rate_hz=rate_hz)
         assert not is_shaken(track_of(made))
@@ -98,13 +100,13 @@ def test_smooth_motion_is_not_shaken(scenario: str, rate_hz: float) -> None:
 
 @pytest.mark.parametrize("name", ["broad/01_undisturbed_slow_rotation_A", "vn100/drive_2022_rahul"])
 @pytest.mark.recordings
-def test_real_motion_is_shaken(name: str) -> None:
+def test_real_motion_is_classified_as_shaken(name: str) -> None:
     assert is_shaken(recorded(name))
 
 
 @pytest.mark.slow
-def test_what_else_is_wrong_is_not_taken_for_quiet() -> None:
-    """Three minutes of a motor's field of 50 mG: the noise of the gyro is not found beside it."""
+def test_gyro_noise_is_not_estimated_when_a_large_disturbance_remains() -> None:
+    """A motor's field of 50 mG during three minutes hides the noise of the gyro."""
     track = shaking(4)
     mag = track.mag_b_gauss.copy()
     mag[:, 0] += 0.05 * np.sign(np.sin(2 * np.pi * track.time_s / 17.0))
@@ -112,7 +114,7 @@ def test_what_else_is_wrong_is_not_taken_for_quiet() -> None:
     assert problem.spec.shaken_gyro_rad_s is None
 
 
-def test_one_axis_that_a_propeller_shakes_says_nothing_of_the_gyro_s_noise() -> None:
+def test_vibration_of_one_axis_does_not_raise_the_gyro_noise_estimate() -> None:
     track = track_of(experiment("wam", seed=3, samples=6000, sigma_gyro=3e-4))
     rate = track.gyro_b_rad_s.copy()
     rate[:, 0] += 5e-3 * np.sin(2 * np.pi * 11.0 * track.time_s)
@@ -121,7 +123,7 @@ def test_one_axis_that_a_propeller_shakes_says_nothing_of_the_gyro_s_noise() -> 
     )
 
 
-def test_where_the_averaged_rows_differ_by_their_motion_the_noise_is_that_of_the_recorded() -> None:
+def test_gyro_noise_is_estimated_from_recorded_rows_when_averaged_rows_wobble() -> None:
     sigma_gyro = 3e-4
     problem, _ = build_problem(wobbling(sigma_gyro), Spec())
     assert problem.thin > 1

@@ -1,4 +1,4 @@
-"""The null fit: truth within its deviations, noise found, nothing runs away, terms beside it."""
+"""The null fit: truth within its standard deviations, noise found, and no divergence."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ def _difference(fit: NullFit, truth: NullModel) -> Array:
 @pytest.mark.parametrize(
     ("scenario", "motion", "sigma_gyro"), [("mam", "rov", 5e-4), ("wam", "slow", 5e-3)]
 )
-def test_a_cold_start_finds_the_truth(scenario: str, motion: str, sigma_gyro: float) -> None:
+def test_cold_start_recovers_the_truth_within_its_covariance(
+    scenario: str, motion: str, sigma_gyro: float
+) -> None:
     squares = []
     for seed in range(2):
         made = experiment(scenario, motion=motion, seed=seed, samples=6000, sigma_gyro=sigma_gyro)
@@ -49,8 +51,10 @@ def test_a_cold_start_finds_the_truth(scenario: str, motion: str, sigma_gyro: fl
     assert 1e-3 < stats.chi2.sf(sum(squares), 22) < 1 - 1e-3
 
 
-def test_a_valley_from_which_no_start_comes_is_left() -> None:
-    """Of low angular movement: each of three starts ended 0.26 gauss off, 208 nats above this."""
+def test_fit_leaves_a_local_minimum_when_motion_is_small() -> None:
+    """With small angular motion each of three starts ended 0.26 gauss off, 208 nats above this
+    minimum.
+    """
     run = simulate(ScenarioSettings("lam", "slow", 9700, 10_000, 25.0, 1e-3, 5e-3))
     asked, cold = build_problem(track_of(run), Spec())
     fit = fit_null(asked.track, asked.spec, cold, walk=False)
@@ -59,8 +63,12 @@ def test_a_valley_from_which_no_start_comes_is_left() -> None:
 
 
 @pytest.mark.parametrize("scenario", ["wam", "mam", "lam"])
-def test_a_gyro_louder_than_the_magnetometer_still_leads_to_the_iron(scenario: str) -> None:
-    """The field's size alone says where it is; straight steps from a sphere ended 0.1 away."""
+def test_calibration_is_recovered_when_the_gyro_is_noisier_than_the_magnetometer(
+    scenario: str,
+) -> None:
+    """Only the size of the field locates the iron; Gauss-Newton steps from a sphere ended 0.1 gauss
+    off.
+    """
     made = experiment(
         scenario, motion="slow", seed=0, samples=8000, sigma_mag=1e-4, sigma_gyro=0.05
     )
@@ -71,16 +79,18 @@ def test_a_gyro_louder_than_the_magnetometer_still_leads_to_the_iron(scenario: s
     assert abs(fit.model.sigma_gyro_rad_s / 0.05 - 1) < 0.03
 
 
-def test_a_magnetometer_without_noise_leaves_the_gyro_its_own() -> None:
-    """At its floor the magnetometer's noise is not the gyro's to make good."""
+def test_gyro_noise_is_recovered_when_the_magnetometer_has_no_noise() -> None:
+    """The gyro's noise must not compensate for the floor of the magnetometer's noise."""
     made = experiment("wam", motion="slow", seed=0, samples=6000, sigma_mag=0.0, sigma_gyro=5e-3)
     fit = fit_null(track_of(made))
     assert fit.model.sigma_mag_gauss == 2e-5
     assert abs(fit.model.sigma_gyro_rad_s / 5e-3 - 1) < 0.05
 
 
-def test_slow_turns_in_loud_noise_are_no_rest() -> None:
-    """A step of the field that 0.05 gauss hides, from second to second, is no proof of a rest."""
+def test_slow_turns_at_a_high_noise_level_are_not_taken_for_rest() -> None:
+    """That 0.05 gauss of noise hides a change of the field from second to second does not prove
+    rest.
+    """
     made = experiment("wam", motion="slow", seed=3, samples=10_000, sigma_mag=0.05, sigma_gyro=0.05)
     rest = rate_at_rest(track_of(made))
     off = 0.0 if rest is None else rest.rate_rad_s - true_model(made).gyro_bias_rad_s
@@ -91,7 +101,7 @@ def test_slow_turns_in_loud_noise_are_no_rest() -> None:
     assert np.max(found / np.sqrt(np.diag(fit.covariance))[8:11]) < 4
 
 
-def test_a_wandering_gyro_bias_is_in_the_null() -> None:
+def test_null_model_contains_a_random_walk_of_the_gyro_bias() -> None:
     made = experiment(samples=8000, seed=4)
     track = track_of(made)
     rng = np.random.default_rng(2)
@@ -103,7 +113,7 @@ def test_a_wandering_gyro_bias_is_in_the_null() -> None:
     assert stats.chi2.sf(chi2, 8) > 1e-3
 
 
-def test_at_rest_the_gyro_reads_its_bias_and_nothing_runs_away() -> None:
+def test_fit_at_rest_finds_the_gyro_bias_and_does_not_diverge() -> None:
     rng = np.random.default_rng(0)
     bias = np.array([4e-3, -5e-3, 2e-3])
     field = np.array([0.2, 0.05, 0.41])
@@ -126,19 +136,19 @@ def test_at_rest_the_gyro_reads_its_bias_and_nothing_runs_away() -> None:
     fit = fit_null(still)
     assert np.abs(fit.model.soft_iron - np.eye(3)).max() < 0.05
     assert np.abs(fit.model.gyro_bias_rad_s - bias).max() < 5e-4
-    assert np.sqrt(np.diag(fit.covariance)[:8]).min() > 1e-4  # known by the prior alone
+    assert np.sqrt(np.diag(fit.covariance)[:8]).min() > 1e-4  # determined by the prior alone
 
 
-@pytest.mark.slow  # a short one, simulated: the one at rest above
+@pytest.mark.slow  # a short one, simulated: test_fit_at_rest_finds_the_gyro_bias...
 @pytest.mark.recordings
-def test_a_stationary_recording_does_not_diverge() -> None:
+def test_fit_of_a_stationary_recording_does_not_diverge() -> None:
     fit = fit_null(recorded("vn100/F00379"))
     assert np.linalg.norm(fit.model.soft_iron - np.eye(3)) < 0.3
     assert np.linalg.norm(fit.model.hard_iron_gauss) < 0.5
     assert np.abs(fit.model.gyro_bias_rad_s - [3.3e-3, 1.5e-3, 7.0e-3]).max() < 1.5e-3
 
 
-def test_what_cannot_be_fitted_is_refused_in_one_line() -> None:
+def test_track_that_cannot_be_fitted_raises_a_one_line_error() -> None:
     track = track_of(experiment(samples=200))
     none = np.full((200, 3), np.nan)
     with pytest.raises(ValueError, match="no readings"):
@@ -152,7 +162,7 @@ def test_what_cannot_be_fitted_is_refused_in_one_line() -> None:
         fit_null(alone)
 
 
-def test_short_interrupted_and_holed_tracks_are_fitted() -> None:
+def test_tracks_of_short_runs_or_with_missing_readings_are_fitted() -> None:
     track = track_of(experiment(samples=1200))
     dt_s = track.dt_s.copy()
     dt_s[::40] = np.nan
@@ -167,9 +177,9 @@ def test_short_interrupted_and_holed_tracks_are_fitted() -> None:
 
 
 @pytest.mark.slow
-def test_a_gyro_that_fits_nothing_leaves_a_finite_answer() -> None:
+def test_fit_is_finite_when_the_gyro_contradicts_the_field() -> None:
     track = track_of(experiment(samples=1200))
     for gyro in (np.zeros((1200, 3)), track.gyro_b_rad_s * 2000):
         fit = fit_null(replace(track, gyro_b_rad_s=gyro))
         assert np.isfinite(fit.model.soft_iron).all()
-        assert fit.model.sigma_mag_gauss > 0.05  # the field moved and nothing says why
+        assert fit.model.sigma_mag_gauss > 0.05  # the field moved without explanation

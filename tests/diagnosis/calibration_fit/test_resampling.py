@@ -1,4 +1,4 @@
-"""Thinning keeps rotations and the field to second order of a badly known calibration."""
+"""Thinning keeps rotations and the field to second order in the error of the calibration."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def model(hard_iron: list[float]) -> NullModel:
 
 
 @pytest.mark.parametrize("m", [2, 3, 4, 5, 6, 7])
-def test_turns_and_readings_are_those_of_the_middle_samples(m):
+def test_averaged_groups_have_the_turn_and_reading_of_their_middle_sample(m):
     track, R_nb = turning()
     thin = average_groups(track, m, model([0.05, -0.02, 0.1]))
     middle = np.arange(len(thin)) * m + m // 2
@@ -58,16 +58,16 @@ def test_turns_and_readings_are_those_of_the_middle_samples(m):
     np.testing.assert_allclose(turn, expected, atol=1e-12)
 
 
-def test_a_wrong_hard_iron_matters_little():
+def test_averaging_is_insensitive_to_a_wrong_hard_iron():
     track, _ = turning()
     right, wrong = (
         average_groups(track, 3, model(b)) for b in ([0.05, -0.02, 0.1], [0.06, -0.02, 0.1])
     )
     error = np.abs(wrong.mag_b_gauss - right.mag_b_gauss).max()
-    assert 0 < error < 0.01 * 0.01  # a hundredth of the hard iron's error
+    assert 0 < error < 0.01 * 0.01  # below a hundredth of the error in hard iron
 
 
-def test_rate_is_kept_above_what_is_wanted():
+def test_thinned_rate_stays_above_the_wanted_rate():
     track, _ = turning()
     assert [thin_factor(track, hz) for hz in (60.0, 30.0, 16.0, 12.0, 10.0, 7.0)] == [
         1,
@@ -79,13 +79,13 @@ def test_rate_is_kept_above_what_is_wanted():
     ]
 
 
-def test_a_factor_below_one_is_refused():
+def test_thinning_factor_below_one_is_refused():
     with pytest.raises(ValueError, match="cannot keep one sample in 0"):
         average_groups(turning()[0], 0, model([0.0, 0.0, 0.0]))
 
 
-def test_what_disturbs_the_readings_is_averaged_as_its_column_is():
-    """Half a sample apart a current that changes would look late."""
+def test_disturbance_and_its_column_are_averaged_alike():
+    """An offset of half a sample would make a varying current look delayed."""
     track, _ = turning()
     current = np.sin(2 * track.time_s)
     still = replace(
@@ -100,7 +100,7 @@ def test_what_disturbs_the_readings_is_averaged_as_its_column_is():
         np.testing.assert_allclose(thin.mag_b_gauss, expected, atol=1e-12)
 
 
-def test_lost_turns_are_added_up_and_each_is_a_smaller_part_of_the_step():
+def test_lost_turns_are_summed_and_their_step_share_is_divided_when_averaging():
     track, _ = turning()
     lost = np.linspace(0.0, 0.02, len(track))
     thin = average_groups(replace(track, lost_turns=lost), 3, model([0.05, -0.02, 0.1]))
@@ -111,16 +111,18 @@ def test_lost_turns_are_added_up_and_each_is_a_smaller_part_of_the_step():
 
 
 @pytest.mark.parametrize(("sigma_gyro", "samples"), [(5e-3, 3), (8e-3, 2), (5e-2, 1)])
-def test_rows_are_of_so_many_samples_as_stay_white(sigma_gyro: float, samples: int) -> None:
-    """At 25 Hz three, unless the gyro turns up more field in them than half of a reading's noise.
+def test_working_factor_keeps_the_noise_of_rows_white(sigma_gyro: float, samples: int) -> None:
+    """Three samples at 25 Hz, fewer if the gyro adds more than half of a reading's noise within
+    them.
 
-    Three of a gyro of 0.05 rad/s beside 1 mG would share a tenth of their noise with the next.
+    With a gyro noise of 0.05 rad/s and 1 mG, rows of three would share a tenth of their noise with
+    the next row.
     """
     made = experiment("mam", motion="slow", samples=3000, sigma_gyro=sigma_gyro)
     assert working_factor(track_of(made), true_model(made)) == samples
 
 
-def test_thinning_composes_rotations_exactly() -> None:
+def test_decimation_composes_rotations_exactly() -> None:
     track = track_of(experiment("wam", samples=400))
     coarse = decimate(track, 5)
     assert len(coarse) == 80
@@ -132,13 +134,13 @@ def test_thinning_composes_rotations_exactly() -> None:
     assert np.isnan(coarse.dt_s[0])
 
 
-def test_a_track_with_holes_is_thinned_at_its_readings() -> None:
+def test_decimation_selects_rows_with_readings_and_keeps_the_whole_turn() -> None:
     track = track_of(experiment("wam", samples=400))
     mag = track.mag_b_gauss.copy()
     mag[np.arange(400) % 4 != 1] = np.nan
     coarse = decimate(replace(track, mag_b_gauss=mag), 5)
     assert np.isfinite(coarse.mag_b_gauss).all()
-    # whatever the groups, the whole turn stays
+    # the total rotation is kept for any grouping
     whole, composed = np.eye(3), np.eye(3)
     last = round(float(coarse.time_s[-1] / 0.04)) - 1
     for k in range(1, last + 1):

@@ -1,4 +1,4 @@
-"""What a logger does to a column: it holds values in between, or adds noise."""
+"""Effects of a logger on a column: values held between updates, and added noise."""
 
 from __future__ import annotations
 
@@ -39,32 +39,36 @@ def wandering(count, seed=1):
 
 
 @pytest.mark.parametrize("rows", [2, 5, 13])
-def test_what_was_held_is_drawn_straight_between_its_values(plain, rows):
+def test_held_column_is_interpolated_linearly_between_its_values(plain, rows):
     values = wandering(len(plain))
     track = with_column(plain, held(values, rows))
     (one,) = find_held_columns(track)
     assert one.period_s == pytest.approx(rows / 12.5)
-    drawn = interpolate_held_columns(track, (one,)).covariates["motor_current_a"]
+    logged_values = interpolate_held_columns(track, (one,)).covariates["motor_current_a"]
     known = np.arange(0, len(values), rows)
-    np.testing.assert_allclose(drawn, np.interp(np.arange(len(values)), known, values[known]))
+    np.testing.assert_allclose(
+        logged_values, np.interp(np.arange(len(values)), known, values[known])
+    )
 
 
-def test_a_value_that_came_again_holds_until_one_period_before_the_next(plain):
+def test_repeated_value_is_kept_until_one_period_before_the_next(plain):
     values = wandering(len(plain))
     values[1000:1200] = 7.0
     track = with_column(plain, held(values, 5))
-    drawn = interpolate_held_columns(track, find_held_columns(track)).covariates["motor_current_a"]
-    np.testing.assert_array_equal(drawn[1000:1196], 7.0)
-    assert drawn[1198] != 7.0  # on the way to the next value
+    logged_values = interpolate_held_columns(track, find_held_columns(track)).covariates[
+        "motor_current_a"
+    ]
+    np.testing.assert_array_equal(logged_values[1000:1196], 7.0)
+    assert logged_values[1198] != 7.0  # on the way to the next value
 
 
 @pytest.mark.parametrize("name", ["pump_on", "vn_yaw_deg", "nobody_knows"])
-def test_switches_and_what_has_no_role_stay(plain, name):
+def test_switches_and_columns_without_a_role_are_not_interpolated(plain, name):
     values = held(np.sign(wandering(len(plain))) > 0, 5)
     assert find_held_columns(with_column(plain, values, name)) == ()
 
 
-def test_levels_that_last_as_long_as_they_like_and_quick_columns_stay(plain):
+def test_levels_of_irregular_length_and_fast_columns_are_not_interpolated(plain):
     rng = np.random.default_rng(2)
     edges = np.cumsum(rng.exponential(3.0, 200))
     t = plain.time_s - plain.time_s[0]
@@ -76,22 +80,22 @@ def test_levels_that_last_as_long_as_they_like_and_quick_columns_stay(plain):
     assert find_held_columns(with_column(plain, held(wandering(len(plain)), 80))) == ()  # 6.4 s
 
 
-def course(seed: int, rows: int = ROWS, width: float = 120.0) -> np.ndarray:
-    """A smooth course of deviation 1."""
+def smooth_values(seed: int, rows: int = ROWS, width: float = 120.0) -> np.ndarray:
+    """Smooth values with unit standard deviation."""
     values = gaussian_filter1d(np.random.default_rng(seed).normal(size=rows), width)
     return values / values.std()
 
 
-def drawn(values: np.ndarray, rows: int) -> np.ndarray:
-    """Every so many rows a value, straight lines between, with four decimals as a file has them."""
+def logged_values(values: np.ndarray, rows: int) -> np.ndarray:
+    """One value every `rows` rows, linear interpolation between, four decimals as in a file."""
     at = np.arange(0, len(values), rows)
     return np.round(np.interp(np.arange(len(values)), at, values[at]), 4)
 
 
 @pytest.mark.parametrize("rows", [4, 5, 20])
-def test_how_a_column_was_logged(rows: int) -> None:
-    values = course(1) + np.random.default_rng(2).normal(0.0, 0.05, ROWS)
-    line = find_logging_pattern(drawn(values, rows))
+def test_logging_pattern_of_interpolated_and_held_columns_is_found(rows: int) -> None:
+    values = smooth_values(1) + np.random.default_rng(2).normal(0.0, 0.05, ROWS)
+    line = find_logging_pattern(logged_values(values, rows))
     assert (line.rows, line.first, line.held) == (rows, 0, False)
     held = find_logging_pattern(np.repeat(values[::rows], rows)[3:])
     assert (held.rows, held.first, held.held) == (rows, (rows - 3) % rows, True)
@@ -99,33 +103,33 @@ def test_how_a_column_was_logged(rows: int) -> None:
 
 
 @pytest.mark.parametrize("rows", [1, 4, 10])
-def test_the_noise_goes_and_the_course_stays(rows: int) -> None:
-    true = course(3)
-    values = drawn(true + np.random.default_rng(4).normal(0.0, 0.1, ROWS), rows)
+def test_denoised_column_has_less_noise_and_the_same_signal(rows: int) -> None:
+    true = smooth_values(3)
+    values = logged_values(true + np.random.default_rng(4).normal(0.0, 0.1, ROWS), rows)
     found = denoised_column(values)
     assert found is not None
-    before, after = (np.std(v - drawn(true, rows)) for v in (values, found))
+    before, after = (np.std(v - logged_values(true, rows)) for v in (values, found))
     assert after < 0.5 * before
-    # of the course next to nothing is taken with it
+    # the signal itself is hardly reduced
     assert found @ true / (true @ true) == pytest.approx(1.0, abs=0.01)
 
 
-def test_steps_coloured_noise_and_what_is_all_noise_are_left_alone() -> None:
+def test_steps_coloured_noise_and_pure_noise_are_not_denoised() -> None:
     rng = np.random.default_rng(5)
     steps = np.repeat(rng.uniform(0.0, 10.0, ROWS // 200), 200)
     assert denoised_column(steps) is None
     assert denoised_column(steps + rng.normal(0.0, 0.03, ROWS)) is None
-    assert denoised_column(course(6) + 0.05 * course(7, width=1.0)) is None
+    assert denoised_column(smooth_values(6) + 0.05 * smooth_values(7, width=1.0)) is None
     assert denoised_column(rng.normal(size=ROWS)) is None
     assert denoised_column(np.zeros(ROWS)) is None
 
 
-def test_a_track_with_pauses_is_left_alone() -> None:
+def test_columns_are_not_denoised_when_the_track_has_pauses() -> None:
     track = track_of(experiment("wam", motion="rov", seed=4, samples=2000, rate_hz=12.5))
-    noisy = course(8, 2000) + np.random.default_rng(9).normal(0.0, 0.1, 2000)
+    noisy = smooth_values(8, 2000) + np.random.default_rng(9).normal(0.0, 0.1, 2000)
     track = track.with_columns({"speed_m_s": noisy})
     clean = denoise_columns(track, ("speed_m_s",))
     assert clean is not None
-    assert np.std(clean.covariates["speed_m_s"] - course(8, 2000)) < 0.05
+    assert np.std(clean.covariates["speed_m_s"] - smooth_values(8, 2000)) < 0.05
     parts = replace(track, runs=(slice(0, 900), slice(900, 2000)))
     assert denoise_columns(parts, ("speed_m_s",)) is None

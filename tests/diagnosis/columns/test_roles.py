@@ -1,4 +1,4 @@
-"""Roles of columns: by name and unit; what cannot be used is refused with a sentence."""
+"""Roles of columns by name and unit. A column that cannot be used is refused with a reason."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ def track(rows=200, **columns):
         ("hdop", None),
     ],
 )
-def test_a_name_gives_the_role(name, role):
+def test_role_follows_from_the_name(name, role):
     assert roles.role_of(name, RAMP) == role
 
 
-def test_two_valued_columns_are_switches_or_pulses():
+def test_columns_of_two_values_are_switches_or_pings():
     assert roles.role_of("x1", BITS) == "switch"
     assert roles.role_of("x1", PULSES) == "ping"
     assert roles.role_of("x1", 0 * BITS) is None
@@ -59,18 +59,18 @@ def test_two_valued_columns_are_switches_or_pulses():
     assert roles.role_of("lamp", BITS) == "switch"
 
 
-def test_the_reference_is_zero_or_the_mean():
+def test_reference_is_zero_or_the_mean():
     assert roles.zero_reference("current", RAMP) == 0.0
     assert roles.zero_reference("temperature", RAMP) == pytest.approx(3.0)
 
 
-def test_usable_columns_are_named_in_order():
+def test_usable_columns_are_listed_in_order():
     columns = {"b_a": RAMP, "a_a": RAMP, "temperature_c": 0 * RAMP, "x_a": RAMP * np.nan}
     assert roles.usable_columns(columns, "current") == ("b_a", "a_a")
     assert roles.usable_columns(columns, "temperature") == ()
 
 
-def test_short_holes_are_filled():
+def test_short_gaps_are_filled():
     holed = RAMP.copy()
     holed[50:65] = np.nan
     found, notes = roles.prepare_columns(track(motor_current_a=holed))
@@ -78,7 +78,7 @@ def test_short_holes_are_filled():
     assert found.covariates["motor_current_a"] == pytest.approx(RAMP)
 
 
-def test_a_slow_logger_is_filled_and_a_switch_holds_its_value():
+def test_sparse_column_is_interpolated_and_sparse_switch_holds_its_value():
     slow, bits = np.full(200, np.nan), np.full(200, np.nan)
     slow[::10], bits[::10] = RAMP[::10], BITS[::10]
     found, notes = roles.prepare_columns(track(temperature_c=slow, lamp_on=bits))
@@ -88,7 +88,7 @@ def test_a_slow_logger_is_filled_and_a_switch_holds_its_value():
 
 
 @pytest.mark.parametrize(
-    ("name", "values", "said"),
+    ("name", "values", "message"),
     [
         ("motor_current_a", np.where(np.arange(200) < 80, RAMP, np.nan), "no values from 7.9 to"),
         ("motor_current_a", np.full(200, np.nan), "100% of its values are missing"),
@@ -99,14 +99,14 @@ def test_a_slow_logger_is_filled_and_a_switch_holds_its_value():
         ("lamp_on", RAMP, "it looks like values other than 0 and 1"),
     ],
 )
-def test_what_cannot_be_used_is_refused_with_a_sentence(name, values, said):
+def test_unusable_column_is_left_out_with_a_reason(name, values, message):
     found, (note,) = roles.prepare_columns(track(**{name: values, "depth_m": RAMP}))
-    assert said in note
+    assert message in note
     assert note.startswith(f"column {name} was left out: ")
     assert list(found.covariates) == ["depth_m"]
 
 
-def test_a_hole_of_the_samples_themselves_is_none_of_the_column():
+def test_gap_of_the_samples_is_not_counted_as_a_gap_of_the_column():
     base = track(motor_current_a=RAMP)
     time_s = base.time_s + np.where(np.arange(200) >= 100, 30.0, 0.0)
     values = RAMP.copy()
@@ -117,7 +117,7 @@ def test_a_hole_of_the_samples_themselves_is_none_of_the_column():
     assert found.covariates["x_a"] == pytest.approx(RAMP)
 
 
-def test_a_gap_of_a_column_counts_beside_a_longer_pause_of_the_samples():
+def test_gap_of_a_column_counts_despite_a_longer_pause_of_the_samples():
     base = track(motor_current_a=RAMP)
     time_s = base.time_s + np.where(np.arange(200) >= 100, 30.0, 0.0)
     values = RAMP.copy()
@@ -134,14 +134,14 @@ def test_columns_without_a_role_are_kept():
     assert notes == ()
 
 
-def test_a_reference_attitude_is_no_cause() -> None:
-    """What it adds to a recording must not change what is said of the sensor."""
+def test_reference_attitude_is_not_used_as_a_cause() -> None:
+    """A reference attitude must not change the diagnosis of the sensor."""
     found, notes = roles.prepare_columns(track(ref_qw=RAMP, ref_qz=RAMP, hdop=RAMP))
     assert list(found.covariates) == ["hdop"]
     assert notes == ()
 
 
-def test_what_the_sensor_makes_of_its_own_readings_is_no_cause():
+def test_quantities_computed_by_the_sensor_are_not_used_as_causes():
     own = {"vn_yaw_deg": RAMP, "dcm_01": RAMP, "mag_n_d_gauss": RAMP, "pitch_rad": RAMP}
     own |= {"yaw": RAMP, "roll_rate_rad_s": RAMP, "yaw_angle_deg": RAMP}
     found, notes = roles.prepare_columns(track(**own, linkage_m=RAMP))
@@ -150,7 +150,7 @@ def test_what_the_sensor_makes_of_its_own_readings_is_no_cause():
 
 
 @pytest.mark.parametrize("name", ["yaw_motor_current_a", "pitch_servo_a", "gyro_temperature_c"])
-def test_a_cause_may_be_named_after_what_it_turns_or_warms(name):
+def test_columns_named_after_an_axis_or_a_sensor_are_kept(name):
     found, notes = roles.prepare_columns(track(**{name: RAMP}))
     assert list(found.covariates) == [name]
     assert notes == ()
@@ -160,7 +160,7 @@ def test_a_cause_may_be_named_after_what_it_turns_or_warms(name):
     st.text(max_size=12),
     st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=5, max_size=5),
 )
-def test_no_column_is_kept_that_is_not_finite(name, values):
+def test_all_kept_columns_are_finite(name, values):
     found, notes = roles.prepare_columns(track(5, **{f"x{name}": np.array(values)}))
     assert all(np.isfinite(column).all() for column in found.covariates.values())
     if not np.isfinite(values).all() and np.isfinite(values).any():

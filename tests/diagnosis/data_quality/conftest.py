@@ -1,4 +1,4 @@
-"""A recording with nothing wrong, which the tests spoil."""
+"""A recording without faults, which the tests modify."""
 
 from __future__ import annotations
 

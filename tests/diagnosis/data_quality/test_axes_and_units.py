@@ -1,4 +1,4 @@
-"""Wrong units, axes and signs, each with its numbers, and none of that on right ones."""
+"""Wrong units, axes and signs are found with their numbers, and none in a correct recording."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mismatch_trials import Trial, made
-from told_facts import only, value
+from single_fact import only, value
 from tracks import experiment, track_of
 
 from ahrsd import so3
@@ -34,7 +34,9 @@ QUARTER = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
         ([2, 0, 1], [1, 1, 1]),
     ],
 )
-def test_a_wrong_frame_is_named_and_undone(track: Track, axes: list[int], signs: list[int]) -> None:
+def test_wrong_gyro_axes_are_found_and_corrected(
+    track: Track, axes: list[int], signs: list[int]
+) -> None:
     wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s[:, axes] * np.array(signs))
     fact = only(find_facts(wrong))
     assert fact.effect == "frame_error"
@@ -43,8 +45,8 @@ def test_a_wrong_frame_is_named_and_undone(track: Track, axes: list[int], signs:
     assert np.array_equal(correct_track(wrong, (fact,)).gyro_b_rad_s, track.gyro_b_rad_s)
 
 
-def test_a_turn_at_a_constant_rate_says_nothing_of_axes_and_unit() -> None:
-    """Soft iron bends its circle to an ellipse, and any frame explains that a little."""
+def test_turn_at_a_constant_rate_does_not_determine_axes_or_unit() -> None:
+    """Soft iron deforms the circle to an ellipse, and any frame explains that a little."""
     rng = np.random.default_rng(8)
     time_s = np.arange(8000) / 40.0
     angle = 0.4 * time_s
@@ -59,7 +61,7 @@ def test_a_turn_at_a_constant_rate_says_nothing_of_axes_and_unit() -> None:
     assert any("would not have been seen" in line for line in detectable_faults(spin))
 
 
-def test_left_handed_axes_are_called_so(track: Track) -> None:
+def test_left_handed_axes_are_reported_as_left_handed(track: Track) -> None:
     wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s * np.array([1.0, 1.0, -1.0]))
     assert "left-handed" in only(find_facts(wrong)).words
 
@@ -73,8 +75,12 @@ def test_left_handed_axes_are_called_so(track: Track) -> None:
         (QUARTER, "is turned against the gyro: its correct x y z are its -y x z as read"),
     ],
 )
-def test_a_mirrored_magnetometer_is_no_turned_gyro(read: list[list[int]], words: str) -> None:
-    """By gyro and field alone m and -m are the same; gravity tells, or every heading is off."""
+def test_wrong_magnetometer_axes_are_attributed_to_the_magnetometer(
+    read: list[list[int]], words: str
+) -> None:
+    """Gyro and field alone do not separate m and -m. Gravity does, and otherwise every heading
+    is wrong.
+    """
     made = track_of(experiment("wam", samples=3000))
     wrong = replace(made, mag_b_gauss=made.mag_b_gauss @ np.array(read, float).T)
     fact = only(find_facts(wrong))
@@ -85,7 +91,7 @@ def test_a_mirrored_magnetometer_is_no_turned_gyro(read: list[list[int]], words:
         assert "negate its x and z" in fact.words.partition("south of the magnetic equator")[2]
 
 
-def test_without_gravity_nobody_is_told_to_turn_a_sensor() -> None:
+def test_both_sensors_are_named_as_possible_when_gravity_is_missing() -> None:
     made = track_of(experiment("wam", samples=3000))
     wrong = replace(made, mag_b_gauss=made.mag_b_gauss * np.array([1.0, -1.0, 1.0]))
     words = only(find_facts(replace(wrong, accel_b_m_s2=None))).words
@@ -93,7 +99,7 @@ def test_without_gravity_nobody_is_told_to_turn_a_sensor() -> None:
     assert "180 deg" in words
 
 
-def test_a_turned_gyro_is_told_by_the_accelerometer() -> None:
+def test_rotated_gyro_is_identified_by_the_accelerometer() -> None:
     made = track_of(experiment("wam", samples=3000))
     wrong = replace(made, gyro_b_rad_s=made.gyro_b_rad_s * np.array([-1.0, 1.0, -1.0]))
     fact = only(find_facts(wrong))
@@ -110,10 +116,10 @@ def test_a_turned_gyro_is_told_by_the_accelerometer() -> None:
         ((30.0, -30.0, 30.0), "52.0 deg ("),
     ],
 )
-def test_a_magnetometer_that_is_askew_is_told_with_its_angle(
+def test_rotated_magnetometer_is_reported_with_its_angle(
     turn_deg: tuple[float, float, float], about: str
 ) -> None:
-    """R_mg from the gyro's axes to the magnetometer's; the advice puts its readings right."""
+    """R_mg maps the gyro's axes to the magnetometer's. The advice corrects the readings."""
     whole = track_of(experiment("mam", samples=6000, seed=3))
     R_mg = so3.exp(np.radians([turn_deg]))[0]
     turned = replace(whole, mag_b_gauss=whole.mag_b_gauss @ R_mg.T)
@@ -131,27 +137,27 @@ def test_a_magnetometer_that_is_askew_is_told_with_its_angle(
     )
 
 
-def test_without_gravity_either_sensor_may_be_askew() -> None:
+def test_either_sensor_may_be_rotated_when_gravity_is_missing() -> None:
     whole = track_of(experiment("mam", samples=6000, seed=3))
     R_mg = so3.exp(np.radians([[0.0, 0.0, 45.0]]))[0]
     turned = replace(whole, mag_b_gauss=whole.mag_b_gauss @ R_mg.T, accel_b_m_s2=None)
     assert "or the gyro is the one that is turned" in only(find_facts(turned)).words
 
 
-def test_a_crooked_mount_of_five_degrees_is_no_wrong_frame() -> None:
-    """The search names it with its deviation, and what is fitted beside it means something."""
+def test_misalignment_of_five_degrees_is_not_a_wrong_frame() -> None:
+    """The search finds it with its standard deviation, and other effects can be fitted with it."""
     whole = track_of(experiment("mam", samples=6000, seed=3))
     R_mg = so3.exp(np.radians([[0.0, 5.0, 0.0]]))[0]
     assert axis_and_unit_errors(replace(whole, mag_b_gauss=whole.mag_b_gauss @ R_mg.T)) == []
 
 
-def test_iron_that_deforms_favours_no_other_frame() -> None:
-    """A slow turn of half a period; the frames' fit leaves out iron that deforms by a fifth."""
+def test_soft_iron_does_not_favour_another_frame() -> None:
+    """A slow turn of half a period. The frame fit neglects soft iron that deforms by a fifth."""
     made = experiment("wam", motion="slow", seed=0, samples=10_000, rate_hz=100.0, sigma_gyro=5e-3)
     assert find_facts(track_of(made)) == ()
 
 
-def test_degrees_and_swapped_axes_together(track: Track) -> None:
+def test_degrees_and_swapped_axes_are_found_together(track: Track) -> None:
     wrong = replace(track, gyro_b_rad_s=np.degrees(track.gyro_b_rad_s[:, [1, 0, 2]]))
     facts = find_facts(wrong)
     assert {fact.effect for fact in facts} == {"frame_error", "unit_error"}
@@ -162,7 +168,9 @@ def test_degrees_and_swapped_axes_together(track: Track) -> None:
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("uT", 100.0), ("mG", 1e3), ("nT", 1e5), ("T", 1e-4)])
-def test_the_magnetometers_unit_by_the_earths_field(track: Track, unit: str, factor: float) -> None:
+def test_magnetometer_unit_is_found_from_the_size_of_the_earth_field(
+    track: Track, unit: str, factor: float
+) -> None:
     wrong = replace(track, mag_b_gauss=track.mag_b_gauss * factor)
     facts = [fact for fact in find_facts(wrong) if fact.effect == "unit_error"]
     fact = only(tuple(facts))
@@ -171,8 +179,8 @@ def test_the_magnetometers_unit_by_the_earths_field(track: Track, unit: str, fac
     assert np.abs(right / track.mag_b_gauss - 1).max() < 1e-12
 
 
-def test_a_quiet_motion_does_not_tell_the_frame() -> None:
-    """At rest every frame fits: nothing is said, and the sensitivity says why."""
+def test_no_frame_error_is_reported_at_rest() -> None:
+    """Every frame fits at rest. Nothing is reported, and the sensitivity gives the reason."""
     made = experiment("lam", samples=2000)
     rng = np.random.default_rng(1)
     at_rest = replace(
@@ -189,14 +197,14 @@ def test_frames_are_ranked_with_their_scale(track: Track) -> None:
     found = window_equations(track)
     assert found is not None
     order = rank_frames(found)
-    assert len(order) == 24  # of each frame and its negative one has a positive scale
+    assert len(order) == 24  # of each frame and its negative, one has a positive scale
     assert order[0].is_identity
     assert 0.7 < order[0].scale < 1.3
     assert order[0].cost < order[1].cost / 3
 
 
-def test_degrees_are_told_where_noise_hides_most_of_the_turns() -> None:
-    """And radians are none, however loud the noise is."""
+def test_degrees_are_found_when_noise_hides_most_turns() -> None:
+    """No unit error is reported for radians at the same noise level."""
     track = made(Trial(seed=5, samples=8000, rate_hz=40.0, scenario="wam")).track
     noise = 0.06 * np.random.default_rng(1).standard_normal((len(track), 3))
     loud = replace(track, mag_b_gauss=track.mag_b_gauss + noise)
@@ -208,7 +216,7 @@ def test_degrees_are_told_where_noise_hides_most_of_the_turns() -> None:
 
 
 @pytest.mark.parametrize("factor", [25.0, 1 / 25.0, 3.0])
-def test_rates_that_are_off_by_the_factor_of_no_unit_may_be_the_time(
+def test_rate_factor_of_no_known_unit_is_attributed_to_unit_or_time(
     track: Track, factor: float
 ) -> None:
     wrong = replace(track, gyro_b_rad_s=track.gyro_b_rad_s * factor)
@@ -219,8 +227,10 @@ def test_rates_that_are_off_by_the_factor_of_no_unit_may_be_the_time(
     assert np.abs(right / track.gyro_b_rad_s - 1).max() < 0.1
 
 
-def test_a_magnet_that_is_put_on_and_off_is_no_unit_of_the_gyro(track: Track) -> None:
-    """While a hand moves it the field changes by more than any turn: rates look too large."""
+def test_magnet_put_on_and_taken_off_is_not_a_unit_error_of_the_gyro(track: Track) -> None:
+    """While a hand moves the magnet the field changes by more than any turn, and rates look too
+    large.
+    """
     t = track.time_s - track.time_s[0]
     middle, end = 0.4 * t[-1], 0.7 * t[-1]
     put = np.clip((t - middle) / 2.0, 0.0, 1.0) - np.clip((t - end) / 2.0, 0.0, 1.0)
@@ -229,8 +239,8 @@ def test_a_magnet_that_is_put_on_and_off_is_no_unit_of_the_gyro(track: Track) ->
     assert [one for one in find_facts(near) if one.effect == "unit_error"] == []
 
 
-def test_a_turn_about_one_axis_tells_that_axes_are_wrong_and_not_which() -> None:
-    """A finding all the same: that none of the axes is as recorded is sure."""
+def test_turn_about_one_axis_shows_a_frame_error_but_not_which() -> None:
+    """It is a finding, because it is certain that the axes are not as recorded."""
     t = np.arange(2400) / 20.0
     rate = np.column_stack([0 * t, 0 * t, 0.2 + 0.1 * np.sin(0.3 * t)])
     R = so3.products(so3.exp(rate / 20.0))

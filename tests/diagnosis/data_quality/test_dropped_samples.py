@@ -1,11 +1,11 @@
-"""Lost turns one by one: which rows, how many steps, and that none is made up."""
+"""Lost turns: their rows and numbers of steps are found, and none is invented."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from odd_tracks import without_rows
-from told_facts import only, value
+from single_fact import only, value
 from tracks import experiment, track_of, true_model
 
 from ahrsd.diagnosis.data_quality.dropped_samples import (
@@ -22,11 +22,13 @@ from ahrsd.diagnosis.data_quality.dropped_samples import (
 from ahrsd.diagnosis.data_quality.preparation import correct_track
 from ahrsd.diagnosis.innovation_filter.innovation import run_filter
 
-GYRO_RAD_S = 2e-4  # of a filter that believes its gyro: what is lost stays with it for long
+GYRO_RAD_S = 2e-4  # a filter that trusts its gyro, so that the error of a lost turn decays slowly
 
 
 def lossy(motion: str, share: float, sigma_gauss: float):
-    """The filter's run of a track without some rows, its rate, and how many each row has lost."""
+    """The filter run on a track with rows removed, its rates, and the number of rows lost before
+    each row.
+    """
     made = experiment(motion, samples=9000, seed=3, sigma_mag=sigma_gauss)
     whole, model = track_of(made), replace(true_model(made), sigma_mag_gauss=sigma_gauss)
     model = replace(model, sigma_gyro_rad_s=GYRO_RAD_S)
@@ -46,12 +48,14 @@ def lossy(motion: str, share: float, sigma_gauss: float):
 
 
 def near(rows: np.ndarray, others: np.ndarray, within: int) -> int:
-    """How many of the rows have one of the others so near."""
+    """The number of rows that have one of the others within so many rows."""
     return sum(bool(np.any(np.abs(others - row) <= within)) for row in rows)
 
 
 @pytest.mark.parametrize(("motion", "share"), [("mam", 0.01), ("lam", 0.004)])
-def test_what_the_first_ones_hid_is_found_where_it_was_lost(motion: str, share: float) -> None:
+def test_lost_turns_hidden_by_earlier_ones_are_found_at_their_rows(
+    motion: str, share: float
+) -> None:
     done, rate, lost = lossy(motion, share, 3e-4)
     found = recover_lost_steps(done, rate, np.zeros(len(lost), dtype=np.int64))
     rows, truth = np.flatnonzero(found.lost), np.flatnonzero(lost)
@@ -62,13 +66,13 @@ def test_what_the_first_ones_hid_is_found_where_it_was_lost(motion: str, share: 
     assert np.mean(found.missed) < 0.2
 
 
-def test_nothing_is_lost_where_nothing_was() -> None:
+def test_no_lost_turn_is_found_in_a_complete_recording() -> None:
     done, rate, lost = lossy("mam", 0.0, 3e-4)
     assert not lost.any()
     assert not recover_lost_steps(done, rate, np.zeros(len(lost), dtype=np.int64)).lost.any()
 
 
-def test_rows_without_a_reading_say_nothing_and_hide_none_elsewhere() -> None:
+def test_rows_without_readings_hide_no_lost_turn_in_other_rows() -> None:
     done, rate, lost = lossy("mam", 0.01, 3e-4)
     mag = done.track.mag_b_gauss.copy()
     mag[4000:4200] = np.nan
@@ -81,7 +85,7 @@ def test_rows_without_a_reading_say_nothing_and_hide_none_elsewhere() -> None:
 
 
 @pytest.mark.parametrize("motion", ["mam", "lam", "wam"])
-def test_turns_of_which_none_stands_out_are_known_by_all_together(motion: str) -> None:
+def test_share_of_lost_turns_is_estimated_when_no_single_one_is_significant(motion: str) -> None:
     done, rate, lost = lossy(motion, 0.004, 3e-3)
     (fact,) = find_lost_turns(done, rate)
     assert UNSEEN in fact.setting
@@ -92,7 +96,7 @@ def test_turns_of_which_none_stands_out_are_known_by_all_together(motion: str) -
 
 @pytest.mark.parametrize("motion", ["mam", "lam", "wam"])
 @pytest.mark.parametrize("sigma_gauss", [3e-4, 3e-3])
-def test_a_gyro_that_reads_too_little_has_lost_nothing(motion: str, sigma_gauss: float) -> None:
+def test_gyro_scale_error_is_not_taken_for_lost_turns(motion: str, sigma_gauss: float) -> None:
     done, rate, _ = lossy(motion, 0.0, sigma_gauss)
     gyro = done.model.gyro_bias_rad_s + 0.98 * rate
     slow = run_filter(replace(done.track, gyro_b_rad_s=gyro), done.model)
@@ -101,7 +105,7 @@ def test_a_gyro_that_reads_too_little_has_lost_nothing(motion: str, sigma_gauss:
 
 
 def jumps_at(starts: list[int], step: float) -> float:
-    """The surplus of means over 24 rows with jumps by so much of a lost step at some of 9000."""
+    """Evidence of forward jumps, by `step` of a lost step, at some of 9000 means over 24 rows."""
     size, near = np.full(9000, 20.0), np.zeros(9000)
     for start in starts:
         near[start - 24 : start + 24] = 1.0 - np.abs(np.arange(-24, 24)) / 24.0
@@ -109,7 +113,7 @@ def jumps_at(starts: list[int], step: float) -> float:
     return forward_excess_evidence(JumpMeans(24, np.arange(9000), z, size, np.full(9000, 2.0)))[0]
 
 
-def test_many_jumps_of_one_step_ahead_are_lost_turns_and_others_are_not() -> None:
+def test_only_many_forward_jumps_of_a_whole_step_are_evidence_of_lost_turns() -> None:
     many = list(range(500, 8500, 200))
     assert jumps_at(many, 1.0) > 12.0
     assert jumps_at([], 1.0) == 0.0
@@ -118,7 +122,7 @@ def test_many_jumps_of_one_step_ahead_are_lost_turns_and_others_are_not() -> Non
     assert jumps_at(many, -1.0) == 0.0
 
 
-def test_a_step_that_was_counted_twice_is_taken_back_and_none_that_was_lost() -> None:
+def test_step_counted_twice_is_removed_and_true_lost_steps_stay() -> None:
     done, rate, lost = lossy("mam", 0.004, 3e-4)
     right = recover_lost_steps(done, rate, np.zeros(len(lost), dtype=np.int64))
     rows = np.flatnonzero(right.lost)
@@ -126,13 +130,13 @@ def test_a_step_that_was_counted_twice_is_taken_back_and_none_that_was_lost() ->
     twice[rows[5:25:5] + 1] += 1
     again = recover_lost_steps(done, rate, twice)
     assert np.array_equal(again.lost[rows], right.lost[rows])
-    others = np.setdiff1d(np.flatnonzero(again.lost), rows)  # one, of a slow turn, here
+    others = np.setdiff1d(np.flatnonzero(again.lost), rows)  # one here, in a slow turn
     assert len(others) <= 1
     assert near(others, rows, 40) == 0
 
 
-def test_what_may_have_been_missed_is_noise_of_the_turn() -> None:
-    """As loud as turns that were lost unseen make it, along the turn and not across."""
+def test_expected_undetected_lost_turns_add_noise_along_the_turn() -> None:
+    """The noise has the variance of undetected lost turns, along the turn and not across it."""
     done, _, lost = lossy("mam", 0.03, 1e-3)
     assert done.normalised_innovation > 1.5
     expected = np.full(len(lost), float(lost.mean()))
@@ -144,7 +148,7 @@ def test_what_may_have_been_missed_is_noise_of_the_turn() -> None:
     assert never.normalised_innovation > 1.4
 
 
-def test_a_fact_says_how_many_it_expects_beyond_those_it_found() -> None:
+def test_fact_reports_expected_number_of_undetected_lost_turns() -> None:
     done, rate, lost = lossy("wam", 0.004, 1e-3)
     (fact,) = find_lost_turns(done, rate)
     found = np.round(fact.turned) - 1
@@ -153,14 +157,14 @@ def test_a_fact_says_how_many_it_expects_beyond_those_it_found() -> None:
     assert found.sum() + fact.unseen.sum() == pytest.approx(lost.sum(), rel=0.35)
 
 
-def test_a_step_is_not_taken_back_twice() -> None:
+def test_each_lost_step_is_removed_only_once() -> None:
     lost = np.array([0, 0, 1, 0, 0])
     none = np.zeros(5)
     found = _RowJumps(np.full(5, -1), none, np.ones(5, dtype=np.int64), none)
     assert _apply_jumps(lost, found, np.array([1, 3])).tolist() == [0, 0, 0, 0, 0]
 
 
-def test_the_tail_of_noise_is_no_whole_step() -> None:
+def test_tail_of_the_noise_is_no_evidence_of_whole_steps() -> None:
     rng = np.random.default_rng(3)
     scatter = np.full(9, 0.18)
     whole = 1.0 + 0.18 * rng.standard_normal(9)
@@ -174,7 +178,7 @@ def test_the_tail_of_noise_is_no_whole_step() -> None:
     )
 
 
-def test_missing_samples_without_a_gap_in_the_stamps() -> None:
+def test_missing_samples_are_found_without_a_gap_in_the_time_stamps() -> None:
     made = experiment("mam", samples=6000, seed=3, sigma_mag=5e-4)
     track = track_of(made)
     model = replace(true_model(made), sigma_mag_gauss=5e-4)
@@ -191,7 +195,7 @@ def test_missing_samples_without_a_gap_in_the_stamps() -> None:
     assert find_lost_turns(run_filter(track, model), rate) == []
 
 
-def test_missing_samples_of_a_slow_motion_are_seen_over_more_samples() -> None:
+def test_missing_samples_of_a_slow_motion_are_found() -> None:
     made = experiment("lam", samples=9000, seed=3, sigma_mag=3e-4)
     track = track_of(made)
     model = replace(true_model(made), sigma_mag_gauss=3e-4)
@@ -201,8 +205,8 @@ def test_missing_samples_of_a_slow_motion_are_seen_over_more_samples() -> None:
     assert abs(value(only(tuple(facts))) - 0.015) < 0.008
 
 
-def test_missing_samples_are_seen_where_whole_seconds_are_missing_too() -> None:
-    """On its way back from a large jump the filter makes many that no lost turn makes."""
+def test_missing_samples_are_found_when_whole_seconds_are_missing_too() -> None:
+    """While the filter recovers from a large jump it makes many jumps that no lost turn causes."""
     made = experiment("mam", samples=6000, seed=3, sigma_mag=3e-4)
     track = track_of(made)
     model = replace(true_model(made), sigma_mag_gauss=3e-4)
@@ -211,7 +215,7 @@ def test_missing_samples_are_seen_where_whole_seconds_are_missing_too() -> None:
     for first in rng.integers(300, 5600, 8):
         kept[first : first + 40] = False
     cut = without_rows(track, np.flatnonzero(kept), restamp=True)
-    # as slow as a filter is that believes its gyro
+    # as slow as a filter that trusts its gyro
     slow = replace(model, sigma_gyro_rad_s=1e-4)
     facts = find_lost_turns(run_filter(cut, slow), cut.gyro_b_rad_s - model.gyro_bias_rad_s)
     fact = only(tuple(facts))
@@ -220,8 +224,10 @@ def test_missing_samples_are_seen_where_whole_seconds_are_missing_too() -> None:
 
 
 @pytest.mark.parametrize("motion", ["mam", "wam"])
-def test_three_lost_samples_are_told_where_they_are(motion: str) -> None:
-    """What is not told of them is a step of the field: a turn that is not in the log."""
+def test_three_lost_samples_are_located(motion: str) -> None:
+    """An unreported lost sample would look like a step of the field, a turn that is not in the
+    log.
+    """
     made = experiment(motion, samples=9000, seed=3, sigma_mag=3e-4)
     track, model = track_of(made), replace(true_model(made), sigma_mag_gauss=3e-4)
     quick = np.argsort(-np.linalg.norm(track.gyro_b_rad_s, axis=1))

@@ -1,4 +1,4 @@
-"""Nothing that matters is found on simulated nulls and on clean recordings."""
+"""No significant fact is found in simulated nulls and in clean recordings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CLEAN = (
     ("scenario", "motion", "sigma"),
     [("wam", "rov", 5e-4), ("mam", "slow", 5e-3), ("lam", "slow", 5e-3), ("lam", "rov", 5e-4)],
 )
-def test_nothing_on_simulated_nulls(scenario: str, motion: str, sigma: float) -> None:
+def test_no_facts_in_simulated_nulls(scenario: str, motion: str, sigma: float) -> None:
     for seed in range(6):
         made = experiment(scenario, motion=motion, seed=seed, samples=5000, sigma_gyro=sigma)
         assert find_facts(track_of(made)) == ()
@@ -31,5 +31,5 @@ def test_nothing_on_simulated_nulls(scenario: str, motion: str, sigma: float) ->
 
 @pytest.mark.parametrize("name", CLEAN)
 @pytest.mark.recordings
-def test_nothing_that_matters_on_clean_recordings(name: str) -> None:
+def test_no_findings_in_clean_recordings(name: str) -> None:
     assert [fact.words for fact in find_facts(recorded(name)) if is_finding(fact)] == []

@@ -1,4 +1,4 @@
-"""Limits and coarse steps of a sensor's numbers, and noise that has neither."""
+"""Saturation and quantisation of a sensor, and noise that has neither."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from told_facts import only, value
+from single_fact import only, value
 
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.data_quality.preparation import correct_track, find_facts
@@ -18,8 +18,10 @@ from ahrsd.diagnosis.data_quality.range_and_resolution import (
 from ahrsd.diagnosis.track import Track
 
 
-def test_a_limit_that_the_sensor_stays_near_for_long(track: Track) -> None:
-    """A slow and small motion leaves many readings just below the limit, each of another number."""
+def test_saturation_is_distinguished_from_slow_motion_near_the_maximum(track: Track) -> None:
+    """A slow and small motion leaves many readings just below the maximum, each with another
+    value.
+    """
     rng = np.random.default_rng(5)
     mag = 0.3 + 0.02 * np.sin(0.02 * track.time_s)[:, None] * np.array([1.0, 0.6, -0.4])
     mag += 5e-4 * rng.standard_normal(mag.shape)
@@ -37,8 +39,10 @@ def test_a_limit_that_the_sensor_stays_near_for_long(track: Track) -> None:
     assert find_clipping(replace(slow, mag_b_gauss=stuck)) == []
 
 
-def test_noise_that_is_added_behind_a_limit_hides_none_of_what_stands_there(track: Track) -> None:
-    """A sensor at its limit whose converter adds noise: some readings are well below the limit."""
+def test_saturated_readings_are_marked_when_noise_is_added_after_the_limit(track: Track) -> None:
+    """The sensor is at its limit and its converter adds noise, so some readings are well below
+    it.
+    """
     rng = np.random.default_rng(6)
     clean = np.clip(track.mag_b_gauss, -0.3, 0.3)
     mag = np.clip(clean + 8e-4 * rng.standard_normal(clean.shape), -0.3, 0.3)
@@ -50,7 +54,7 @@ def test_noise_that_is_added_behind_a_limit_hides_none_of_what_stands_there(trac
     assert not fact.bad[(np.abs(clean) < 0.28).all(axis=1)].any()
 
 
-def test_saturation_of_both_sensors(track: Track) -> None:
+def test_saturation_of_either_sensor_is_found_and_its_rows_are_not_used(track: Track) -> None:
     mag = np.clip(track.mag_b_gauss, -np.inf, 0.3)
     fact = only(find_facts(replace(track, mag_b_gauss=mag)))
     assert fact.effect == "mag_saturation"
@@ -71,7 +75,7 @@ def test_saturation_of_both_sensors(track: Track) -> None:
     assert value(fact) == top
 
 
-def test_coarse_steps(track: Track) -> None:
+def test_quantisation_step_is_found(track: Track) -> None:
     coarse = replace(track, mag_b_gauss=np.round(track.mag_b_gauss / 0.01) * 0.01)
     fact = only(find_facts(coarse))  # neither a limit nor a stuck sensor, though readings repeat
     assert fact.effect == "mag_quantisation"
@@ -80,7 +84,7 @@ def test_coarse_steps(track: Track) -> None:
     assert find_facts(fine) == ()
 
 
-def test_steps_so_coarse_that_most_seconds_show_no_change(track: Track) -> None:
+def test_quantisation_step_is_found_when_most_seconds_show_no_change(track: Track) -> None:
     turn = 0.01 * (track.time_s - track.time_s[0])
     slow = 0.3 * np.column_stack([np.cos(turn), np.sin(turn), np.cos(turn + 1)])
     slow += np.random.default_rng(6).normal(0, 5e-4, slow.shape)
@@ -88,7 +92,7 @@ def test_steps_so_coarse_that_most_seconds_show_no_change(track: Track) -> None:
     assert noise_of_differences(coarse)[0] == 0.0
     [fact] = find_quantisation(coarse)
     assert abs(value(fact) / 0.02 - 1) < 1e-6
-    # a sensor that stands for three seconds each has no change either, but then it jumps
+    # a sensor stuck for three seconds at a time has no changes either, but then it jumps
     stood = np.random.default_rng(7).integers(100, 200, (len(track) // 120 + 1, 3))
     stuck = replace(track, mag_b_gauss=np.repeat(1e-3 * stood, 120, axis=0)[: len(track)])
     assert noise_of_differences(stuck)[0] == 0.0
@@ -96,8 +100,8 @@ def test_steps_so_coarse_that_most_seconds_show_no_change(track: Track) -> None:
     assert find_quantisation(stuck) == []
 
 
-def test_a_gyro_s_limit_near_its_noise(track: Track) -> None:
-    """Fine numbers repeat at a limit only."""
+def test_gyro_limit_near_its_noise_level_is_found(track: Track) -> None:
+    """Finely resolved values repeat only at a limit."""
     rate = 0.02 * np.sin(track.time_s)[:, None] * np.array([1.0, 0.5, 0.2])
     noisy = rate + 0.005 * np.random.default_rng(4).standard_normal(rate.shape)
     fact = only(find_clipping(replace(track, gyro_b_rad_s=np.clip(noisy, -0.024, 0.024))))
@@ -106,8 +110,10 @@ def test_a_gyro_s_limit_near_its_noise(track: Track) -> None:
     assert find_clipping(replace(track, gyro_b_rad_s=noisy)) == []
 
 
-def test_a_limit_with_noise_behind_it(track: Track) -> None:
-    """No two readings are equal: two axes that end at one size tell it, one axis does not."""
+def test_gyro_limit_is_found_when_noise_is_added_after_it(track: Track) -> None:
+    """No two readings are equal. Two axes that end at one magnitude show the limit; one axis
+    does not.
+    """
     rng = np.random.default_rng(5)
     rate = track.gyro_b_rad_s
     top = 0.6 * float(np.min(np.abs(rate).max(axis=0)))
@@ -121,7 +127,7 @@ def test_a_limit_with_noise_behind_it(track: Track) -> None:
     at_limit = np.any(np.abs(rate) > top, axis=1)
     assert np.isnan(fact.turned[at_limit]).mean() > 0.99
     assert np.isfinite(fact.turned[np.all(np.abs(rate) < 0.8 * top, axis=1)]).all()
-    # a vehicle that always turns at one rate, to either side
+    # a vehicle that always turns at one rate, in both directions
     turning = rate + bias + noise
     turning[:, 2] = np.clip(rate[:, 2], -top, top) + noise[:, 2]
     assert find_clipping(replace(track, gyro_b_rad_s=turning)) == []

@@ -1,4 +1,4 @@
-"""Sensors that say nothing are called so, and the motion is not blamed for it."""
+"""Stuck and dead sensors are recognised, and not attributed to the motion."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from told_facts import only, value
+from single_fact import only, value
 from tracks import experiment, recorded, track_of
 
 from ahrsd.diagnosis.data_quality.facts import is_finding
@@ -26,14 +26,14 @@ def _no_rows(track: Track) -> np.ndarray:
     return np.zeros(len(track), bool)
 
 
-def test_a_magnetometer_that_never_changes_while_the_gyro_turns(track: Track) -> None:
+def test_constant_magnetometer_is_dead_when_the_gyro_turns(track: Track) -> None:
     still = replace(track, mag_b_gauss=np.full_like(track.mag_b_gauss, 0.2))
     why = dead_sensor_reason(still)
     assert why is not None
     assert "the magnetometer reads 0.2 0.2 0.2 gauss in every row while the gyro turns by" in why
 
 
-def test_neither_ever_changes(track: Track) -> None:
+def test_two_constant_sensors_are_reported_together(track: Track) -> None:
     same = np.ones_like(track.mag_b_gauss)
     why = dead_sensor_reason(replace(track, mag_b_gauss=0.2 * same, gyro_b_rad_s=0.0 * same))
     assert why is not None
@@ -42,7 +42,9 @@ def test_neither_ever_changes(track: Track) -> None:
 
 @pytest.mark.parametrize("scenario", ["mam", "wam", "lam"])
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_one_axis_that_never_changes_while_it_turns_is_said(scenario: str, axis: int) -> None:
+def test_constant_axis_is_reported_when_the_other_sensor_turns_about_it(
+    scenario: str, axis: int
+) -> None:
     track = track_of(experiment(scenario, samples=6000, seed=axis))
     gyro, mag = track.gyro_b_rad_s.copy(), track.mag_b_gauss.copy()
     gyro[:, axis], mag[:, axis] = 0.0, 0.1
@@ -53,7 +55,7 @@ def test_one_axis_that_never_changes_while_it_turns_is_said(scenario: str, axis:
 
 
 @pytest.mark.parametrize("iron", [0.0, 0.1])
-def test_an_axis_that_has_nothing_to_say_may_be_still(iron: float) -> None:
+def test_axis_without_motion_may_be_constant(iron: float) -> None:
     """A simulation without noise that turns about one axis only, with iron."""
     t = np.arange(4000) / 25.0
     rate = 0.2 + 0.1 * np.sin(0.1 * t)
@@ -70,7 +72,7 @@ def test_an_axis_that_has_nothing_to_say_may_be_still(iron: float) -> None:
     assert dead_sensor_reason(still) is None
 
 
-def test_a_field_in_no_unit(track: Track) -> None:
+def test_field_of_impossible_size_is_refused(track: Track) -> None:
     why = dead_sensor_reason(replace(track, mag_b_gauss=1e30 * track.mag_b_gauss))
     assert why is not None
     assert "no magnetic field in any unit" in why
@@ -83,7 +85,7 @@ def test_a_field_in_no_unit(track: Track) -> None:
      "vn100/drive_2022_rahul", "vn100/walk_square_2024_sazgar"],
 )  # fmt: skip
 @pytest.mark.recordings
-def test_nothing_is_said_of_sensors_that_work(name: str) -> None:
+def test_no_fault_is_reported_for_working_sensors(name: str) -> None:
     real = recorded(name)
     assert dead_sensor_reason(real) is None
     assert dead_axis_notes(real) == ()
@@ -92,13 +94,13 @@ def test_nothing_is_said_of_sensors_that_work(name: str) -> None:
     assert find_stuck_axes(real, _no_rows(real)) == []
 
 
-def test_a_dead_axis_is_said(track: Track) -> None:
+def test_dead_axis_is_reported_in_a_note(track: Track) -> None:
     gyro = track.gyro_b_rad_s * np.array([1.0, 1.0, 0.0])
     (line,) = dead_axis_notes(replace(track, gyro_b_rad_s=gyro))
     assert line.startswith("the gyro's z reads 0 in every row")
 
 
-def test_an_axis_that_is_stuck_for_a_while_is_not_used(track: Track) -> None:
+def test_readings_of_a_temporarily_stuck_axis_are_not_used(track: Track) -> None:
     mag = track.mag_b_gauss.copy()
     mag[2000:3000, 1] = mag[2000, 1]
     (fact,) = find_facts(replace(track, mag_b_gauss=mag))
@@ -108,7 +110,7 @@ def test_an_axis_that_is_stuck_for_a_while_is_not_used(track: Track) -> None:
     assert np.array_equal(np.flatnonzero(fact.bad), np.arange(2001, 3000))
 
 
-def test_a_gyro_that_is_stuck_for_a_while_ends_the_run(track: Track) -> None:
+def test_temporarily_stuck_gyro_ends_the_run(track: Track) -> None:
     gyro = track.gyro_b_rad_s.copy()
     gyro[2000:3000] = gyro[2000]
     wrong = replace(track, gyro_b_rad_s=gyro)
@@ -120,7 +122,7 @@ def test_a_gyro_that_is_stuck_for_a_while_ends_the_run(track: Track) -> None:
     assert np.isfinite(right.dt_s[3000:]).all()
 
 
-def test_readings_of_zero_are_none(track: Track) -> None:
+def test_zero_readings_count_as_missing(track: Track) -> None:
     mag = track.mag_b_gauss.copy()
     mag[3000:] = 0.0
     (fact,) = find_facts(replace(track, mag_b_gauss=mag))
@@ -129,7 +131,7 @@ def test_readings_of_zero_are_none(track: Track) -> None:
     assert fact.bad[3000:].all()
 
 
-def test_readings_that_no_sensor_gives_are_left_out(track: Track) -> None:
+def test_impossible_readings_are_left_out(track: Track) -> None:
     mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
     mag[50, 0], gyro[70:72, 1] = 1e300, 1e9
     clean, notes = without_impossible_readings(replace(track, mag_b_gauss=mag, gyro_b_rad_s=gyro))
@@ -142,7 +144,7 @@ def test_readings_that_no_sensor_gives_are_left_out(track: Track) -> None:
     assert len(clean.runs) == 3
 
 
-def test_a_stuck_magnetometer(track: Track) -> None:
+def test_stuck_magnetometer_is_found_and_its_readings_are_not_used(track: Track) -> None:
     mag = track.mag_b_gauss.copy()
     mag[2000:2125] = mag[2000]
     stuck = replace(track, mag_b_gauss=mag)
@@ -157,7 +159,7 @@ def test_a_stuck_magnetometer(track: Track) -> None:
     assert np.isfinite(right.mag_b_gauss[2000]).all()
 
 
-def test_a_held_magnetometer(track: Track) -> None:
+def test_held_readings_are_found_with_their_hold_length(track: Track) -> None:
     at = np.arange(len(track)) // 4 * 4
     fact = only(find_facts(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
     assert fact.effect == "mag_sample_hold"
@@ -167,7 +169,7 @@ def test_a_held_magnetometer(track: Track) -> None:
 
 
 @pytest.mark.parametrize("rows", [1.34, 1.21, 2.7, 6.3])
-def test_a_magnetometer_that_is_read_a_little_more_often_than_it_measures(
+def test_hold_length_is_found_when_it_is_not_a_whole_number_of_rows(
     track: Track, rows: float
 ) -> None:
     count = np.arange(len(track))
@@ -180,16 +182,16 @@ def test_a_magnetometer_that_is_read_a_little_more_often_than_it_measures(
     assert abs(np.mean(fact.bad) - (1.0 - 1.0 / rows)) < 0.01
 
 
-def test_numbers_that_repeat_by_chance_are_not_held(track: Track) -> None:
-    """As often as of a magnetometer that is held for 1.34 rows."""
+def test_random_repeats_are_not_held_readings(track: Track) -> None:
+    """They repeat as often as those of a magnetometer that is held for 1.34 rows."""
     again = np.random.default_rng(3).random(len(track)) < 0.25
     at = np.maximum.accumulate(np.where(again, 0, np.arange(len(track))))
     assert not find_facts(replace(track, mag_b_gauss=track.mag_b_gauss[at]))
 
 
 @pytest.mark.parametrize("share", [0.005, 0.01, 0.02, 0.05])
-def test_the_few_that_repeat_by_chance_are_no_clock(track: Track, share: float) -> None:
-    """Some tens of repeated readings, of many draws: a drive of 26,857 rows has 46."""
+def test_rare_random_repeats_are_not_held_readings(track: Track, share: float) -> None:
+    """Many draws with some tens of repeated readings: a drive of 26,857 rows has 46."""
     told = []
     for seed in range(25):
         again = np.random.default_rng(seed).random(len(track)) < share
@@ -198,8 +200,8 @@ def test_the_few_that_repeat_by_chance_are_no_clock(track: Track, share: float) 
     assert [fact.words for fact in told] == []
 
 
-def test_a_clock_that_repeats_seldom_is_told(track: Track) -> None:
-    """39.2 readings a second in 40 rows."""
+def test_hold_of_1_02_samples_is_found(track: Track) -> None:
+    """39.2 new readings per second in 40 rows."""
     count = np.arange(len(track))
     at = np.ceil(np.floor(count / 1.02 + 1e-9) * 1.02 - 1e-9).astype(int)
     fact = only(find_facts(replace(track, mag_b_gauss=track.mag_b_gauss[at])))
@@ -207,8 +209,8 @@ def test_a_clock_that_repeats_seldom_is_told(track: Track) -> None:
     assert "only every 1.02 samples" in fact.words
 
 
-def test_a_rate_of_its_own_above_100_hz_is_ordinary(track: Track) -> None:
-    """Rows at 400 Hz of a magnetometer that has 200 new readings a second."""
+def test_held_readings_above_100_hz_are_no_fault(track: Track) -> None:
+    """Rows at 400 Hz from a magnetometer with 200 new readings per second."""
     time_s = np.arange(len(track)) / 400.0
     dt_s = np.where(np.isfinite(track.dt_s), 1 / 400.0, np.nan)
     at = np.arange(len(track)) // 2 * 2
@@ -222,7 +224,7 @@ def test_a_rate_of_its_own_above_100_hz_is_ordinary(track: Track) -> None:
     assert [fact.effect for fact in find_facts(fast)] == []
 
 
-def test_doubled_samples(track: Track) -> None:
+def test_doubled_samples_are_found(track: Track) -> None:
     order = np.sort(np.r_[np.arange(5900), np.arange(40, 5840, 58)])
     doubled = replace(
         track, mag_b_gauss=track.mag_b_gauss[order], gyro_b_rad_s=track.gyro_b_rad_s[order]
@@ -233,8 +235,8 @@ def test_doubled_samples(track: Track) -> None:
     assert abs(value(fact) - 100 / 6000) < 2e-3
 
 
-def test_coarse_numbers_of_a_vehicle_that_turns_about_one_axis_came_once() -> None:
-    """About the others each sensor's numbers repeat by chance, and now and then at once."""
+def test_coarse_values_in_a_turn_about_one_axis_are_not_doubled_samples() -> None:
+    """About the other axes the values of each sensor repeat by chance, sometimes both at once."""
     rng = np.random.default_rng(12)
     time_s = np.arange(16000) / 80.0
     angle = np.cumsum(0.25 + 0.2 * np.sin(0.3 * time_s)) / 80.0
@@ -252,8 +254,8 @@ def test_coarse_numbers_of_a_vehicle_that_turns_about_one_axis_came_once() -> No
     assert "dropped_samples" not in [fact.effect for fact in find_facts(spin)]
 
 
-def test_a_short_stop_of_the_magnetometer_and_another_one_that_no_turn_shows(track: Track) -> None:
-    """Ten readings alike are no chance; a second stop at rest is told by the first."""
+def test_short_stop_at_rest_is_found_if_another_stop_occurs_in_a_turn(track: Track) -> None:
+    """Ten equal readings in a turn are not chance. They make a second stop, at rest, credible."""
     mag, gyro = track.mag_b_gauss.copy(), track.gyro_b_rad_s.copy()
     mag[2000:2012], mag[3000:3012] = mag[2000], mag[3000]
     gyro[3000:3012] = np.median(gyro, axis=0)
@@ -269,10 +271,10 @@ def test_a_short_stop_of_the_magnetometer_and_another_one_that_no_turn_shows(tra
 
 
 @pytest.mark.parametrize(("rate_hz", "rows", "found"), [(286.0, 9, False), (40.0, 12, True)])
-def test_a_reading_that_came_late_is_no_stuck_magnetometer(
+def test_single_delayed_reading_is_a_note_and_no_finding(
     rate_hz: float, rows: int, found: bool
 ) -> None:
-    """Eight rows are 28 ms at 286 Hz: not used, and worth a note."""
+    """Eight rows at 286 Hz are 28 ms: they are not used, and noted."""
     made = track_of(experiment("wam", samples=4000, rate_hz=rate_hz, sigma_mag=5e-5))
     mag = made.mag_b_gauss.copy()
     mag[2000 : 2000 + rows] = mag[2000]
@@ -283,8 +285,8 @@ def test_a_reading_that_came_late_is_no_stuck_magnetometer(
     assert facts[0].bad[2001 : 2000 + rows].all()
 
 
-def test_readings_that_came_late_again_and_again_are_a_stuck_magnetometer() -> None:
-    """Four times 95 ms at 200 Hz: none of them long, .38 s in all."""
+def test_repeatedly_delayed_readings_are_a_finding() -> None:
+    """Four times 95 ms at 200 Hz: each is short, 0.38 s in total."""
     made = track_of(experiment("wam", samples=8000, rate_hz=200.0, sigma_mag=5e-5))
     mag = made.mag_b_gauss.copy()
     for first in (1000, 3000, 5000, 7000):
@@ -295,8 +297,8 @@ def test_readings_that_came_late_again_and_again_are_a_stuck_magnetometer() -> N
     assert is_finding(fact)
 
 
-def test_a_turn_about_the_field_moves_no_reading_however_large_the_hard_iron(track: Track) -> None:
-    """In steps of 8 mG a sensor then repeats itself honestly."""
+def test_turn_about_the_field_changes_no_reading_at_any_hard_iron(track: Track) -> None:
+    """A working sensor with steps of 8 mG then repeats its reading."""
     centre, field = np.array([0.0, 0.4, 0.0]), np.array([0.1, 0.0, 0.2])
     rate = np.zeros((len(track), 3))
     rate[100:200] = field / np.linalg.norm(field)  # 1 rad/s

@@ -1,6 +1,6 @@
-"""Samples taken early and late and stamped well, and samples of a regular clock stamped badly.
+"""Irregular samples with correct stamps, regular samples with jittering stamps, and clock jumps.
 
-A clock that jumps: no time that passed, no array that grows with it.
+A clock jump is no elapsed time, and no array may grow with it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from odd_tracks import without_rows
-from told_facts import only, value
+from single_fact import only, value
 from tracks import experiment, track_of
 
 from ahrsd import so3
@@ -39,7 +39,7 @@ def _track(
     taken_s: Array, stamped_s: Array, *, unit: float = 1.0, most_rad_s: float = 0.5,
     sigma_gauss: float = 1e-3,
 ) -> Track:  # fmt: skip
-    """A sensor that turns by its rate times the steps at which it was read."""
+    """A sensor that turns by its rate times the steps between its samples."""
     steps = np.diff(taken_s, prepend=taken_s[0])
     phases = np.stack([0.7 * taken_s, 1.0 + 0.9 * taken_s, 2.0 + 0.4 * taken_s], axis=1)
     rate = most_rad_s * np.sin(phases)
@@ -56,13 +56,13 @@ def _track(
 
 
 @pytest.mark.parametrize("unit", [1.0, 57.29578])
-def test_samples_taken_unevenly_and_stamped_well_are_no_jitter(unit: float) -> None:
+def test_irregular_samples_with_correct_stamps_have_no_jitter(unit: float) -> None:
     taken = _uneven(1)
     assert find_clock_faults(_track(taken, taken, unit=unit)) == []
 
 
 @pytest.mark.parametrize("unit", [1.0, 57.29578])
-def test_samples_of_a_regular_clock_stamped_unevenly_are(unit: float) -> None:
+def test_regular_samples_with_irregular_stamps_have_jitter(unit: float) -> None:
     (fact,) = find_clock_faults(
         _track(np.arange(_SAMPLES, dtype=np.float64) * _STEP_S, _uneven(1), unit=unit)
     )
@@ -70,8 +70,8 @@ def test_samples_of_a_regular_clock_stamped_unevenly_are(unit: float) -> None:
     assert fact.parameters[0].value == pytest.approx(0.1 * _STEP_S, rel=0.05)
 
 
-def test_jitter_too_small_to_be_told_is_put_right_where_the_field_shows_it() -> None:
-    # a hundredth of a step: beside turns of 4 rad/s it is 40 mrad/s of the rate
+def test_jitter_too_small_to_report_is_corrected_when_the_field_shows_it() -> None:
+    # a hundredth of a step: at turns of 4 rad/s this is 40 mrad/s of the rate
     quick = {"most_rad_s": 4.0, "sigma_gauss": 2e-4}
     even = np.arange(_SAMPLES, dtype=np.float64) * _STEP_S
     stamped = even + np.random.default_rng(1).normal(0, 0.01 * _STEP_S, _SAMPLES)
@@ -81,12 +81,12 @@ def test_jitter_too_small_to_be_told_is_put_right_where_the_field_shows_it() -> 
     assert not is_finding(fact)
     right = correct_track(track, (fact,)).dt_s[1:]
     assert np.max(np.abs(right - _STEP_S)) < 1e-4 * _STEP_S
-    # taken at those times and stamped well: left as it is
+    # sampled at those times with correct stamps: unchanged
     assert find_clock_faults(_track(stamped, stamped, **quick)) == []
 
 
 def _jumping(by_s: float, samples: int = 1000) -> Track:
-    """A recording in two runs, the clock of the second so much later than it was."""
+    """A recording in two runs; the clock of the second is shifted by `by_s`."""
     track = track_of(experiment("wam", samples=samples))
     row = samples // 2
     time_s, dt_s = track.time_s.copy(), track.dt_s.copy()
@@ -96,7 +96,7 @@ def _jumping(by_s: float, samples: int = 1000) -> Track:
 
 
 @pytest.mark.parametrize("by_s", [1.7471e9, 3600.0, -2.0, -1e6])
-def test_a_jump_is_a_short_break(by_s: float) -> None:
+def test_clock_jump_is_replaced_by_a_short_break(by_s: float) -> None:
     track = _jumping(by_s)
     done, (words,) = without_clock_jumps(track)
     assert done.time_s[500] - done.time_s[499] == pytest.approx(priors.BREAK_LEFT_S)
@@ -107,29 +107,29 @@ def test_a_jump_is_a_short_break(by_s: float) -> None:
     assert "after 1700000020.125 s" in without_clock_jumps(epoch)[1][0]
 
 
-def test_a_break_that_may_be_one_stays() -> None:
+def test_plausible_break_is_kept() -> None:
     track = _jumping(30.0)
     assert without_clock_jumps(track) == (track, ())
     whole = replace(track, runs=track.runs[:1])
     assert without_clock_jumps(whole) == (whole, ())
 
 
-def test_a_clock_that_is_set_while_it_records_is_diagnosed() -> None:
-    """From 1970 to 2025: once more than a terabyte."""
+def test_recording_whose_clock_is_set_is_diagnosed() -> None:
+    """From 1970 to 2025: this once needed more than a terabyte."""
     found = diagnose(_jumping(1.7471e9, samples=2500))
     assert not found.mismatch
     assert found.notes[0].startswith("the clock jumps by +1.7471e+09 s")
 
 
 @pytest.mark.parametrize("missing", [0.02, 0.3])
-def test_missing_samples_by_their_stamps(track: Track, missing: float) -> None:
+def test_missing_samples_are_counted_from_the_time_stamps(track: Track, missing: float) -> None:
     keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > missing)
     fact = only(find_facts(without_rows(track, keep, restamp=False)))
     assert fact.effect == "dropped_samples"
     assert abs(value(fact) - (1 - len(keep) / len(track))) < 1e-3
 
 
-def test_jittering_stamps_and_their_regular_clock(track: Track) -> None:
+def test_regular_clock_is_recovered_from_jittering_stamps(track: Track) -> None:
     rng = np.random.default_rng(2)
     stamped = track.time_s + 3e-3 * rng.standard_normal(len(track))
     jittered = replace(track, time_s=stamped, dt_s=np.diff(stamped, prepend=np.nan))
@@ -140,8 +140,10 @@ def test_jittering_stamps_and_their_regular_clock(track: Track) -> None:
     assert np.abs(np.diff(correct_track(jittered, (fact,)).time_s) - 0.04).max() < 1e-4
 
 
-def test_stamps_in_bunches_scatter_about_the_clock_and_not_within_a_bunch() -> None:
-    """Three samples a packet of a USB adapter: the median step is that of its driver's loop."""
+def test_jitter_of_bunched_stamps_is_measured_from_the_regular_clock() -> None:
+    """A USB adapter delivers three samples per packet, so the median step is that of its
+    driver's loop.
+    """
     track = track_of(experiment("wam", samples=6000, rate_hz=200.0))
     rows = np.arange(6000)
     stamps_s = 0.015 * (rows // 3 + 1) + 3e-5 * (rows % 3)
@@ -156,7 +158,7 @@ def test_stamps_in_bunches_scatter_about_the_clock_and_not_within_a_bunch() -> N
     assert is_finding(fact)
 
 
-def test_time_that_goes_back_stops_everything(track: Track) -> None:
+def test_backward_time_step_stops_the_diagnosis(track: Track) -> None:
     stamped = track.time_s.copy()
     stamped[700] -= 1.0
     facts = find_facts(replace(track, time_s=stamped))
@@ -164,7 +166,7 @@ def test_time_that_goes_back_stops_everything(track: Track) -> None:
     assert "row 700" in facts[0].words
 
 
-def test_two_clocks(track: Track) -> None:
+def test_rate_difference_of_two_logged_clocks_is_found(track: Track) -> None:
     other = 5.0 + track.time_s * 1.002
     fact = only(find_facts(replace(track, covariates={"host_time_s": other})))
     assert fact.effect == "clock_rate"

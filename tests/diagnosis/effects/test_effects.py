@@ -1,4 +1,6 @@
-"""Every effect: its columns are the derivative of its simulation, and its row is complete."""
+"""Every effect: its columns are the derivative of its simulation, and its description is
+complete.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,7 @@ def test_columns_are_the_derivative_of_the_simulation(name, seed, gap):
 
 
 @pytest.mark.parametrize("name", MEAN)
-def test_every_effect_can_be_computed_where_everything_is_logged(name):
+def test_every_effect_can_be_computed_when_all_columns_are_logged(name):
     context, readings = moving(3)
     effect = EFFECTS[name]
     value, setting = effect.example(readings, 1.0)
@@ -68,7 +70,7 @@ def test_every_effect_can_be_computed_where_everything_is_logged(name):
 
 
 @pytest.mark.parametrize("name", list(EFFECTS))
-def test_nothing_is_added_by_a_value_of_zero(name):
+def test_effect_of_zero_size_changes_nothing(name):
     _, readings = moving(4)
     effect = EFFECTS[name]
     value, setting = effect.example(readings, 0.0)
@@ -78,7 +80,7 @@ def test_nothing_is_added_by_a_value_of_zero(name):
 
 
 @pytest.mark.parametrize("name", list(EFFECTS))
-def test_the_row_is_complete_and_refers_to_what_exists(name):
+def test_description_is_complete_and_its_references_exist(name):
     effect = EFFECTS[name]
     for text in ("code", "words", "equation", "signature", "manoeuvre", "size", "source"):
         assert getattr(effect, text).strip()
@@ -94,7 +96,7 @@ def test_the_row_is_complete_and_refers_to_what_exists(name):
             assert role in roles.ROLES or role in roles.SENSORS
 
 
-def test_every_identifier_of_the_contract_is_there():
+def test_library_has_exactly_the_expected_identifiers():
     expected = {
         "hard_iron_step", "hard_iron_drift", "soft_iron_step", "motor_current_field",
         "current_derivative_field", "speed_field", "ac_interference", "sync_pulses",
@@ -115,12 +117,12 @@ def test_every_identifier_of_the_contract_is_there():
 
 
 @pytest.mark.skipif(not CONTRACT.exists(), reason="the contract is not beside the project")
-def test_the_contract_names_the_same_effects():
+def test_contract_document_lists_the_same_effects():
     text = CONTRACT.read_text().split("Effect identifiers")[1].split("\n## ")[0]
     assert set(re.findall(r"`([a-z_]+)`", text)) == set(EFFECTS)
 
 
-#: effects that know the sensor's axes: their form is another one in a turned frame
+#: effects whose form depends on the sensor's axes
 AXES = {
     "ac_interference", "hysteresis", "mag_cross_axis", "mag_nonlinearity", "mag_scale_temperature",
     "gyro_nonlinearity", "gyro_scale", "gyro_nonorthogonality",
@@ -128,7 +130,7 @@ AXES = {
 
 
 def turned(readings, R):
-    """The same recording by a sensor whose axes are turned by R."""
+    """The same recording from a sensor whose axes are rotated by R."""
     return replace(
         readings,
         mag_b_gauss=readings.mag_b_gauss @ R.T,
@@ -144,8 +146,8 @@ def turned(readings, R):
 @pytest.mark.parametrize("name", [name for name in MEAN if name not in AXES])
 @settings(max_examples=4, deadline=None)
 @given(seed=st.integers(0, 10**6))
-def test_what_an_effect_can_do_does_not_depend_on_the_sensor_s_axes(name, seed):
-    """The columns of the turned recording span the turned columns."""
+def test_space_of_an_effect_does_not_depend_on_the_sensor_axes(name, seed):
+    """The columns of the rotated recording span the rotated columns."""
     _, readings = moving(seed, rows=120)
     effect = EFFECTS[name]
     R = so3.exp(np.random.default_rng(seed).uniform(-2, 2, 3))
@@ -173,8 +175,8 @@ def test_what_an_effect_can_do_does_not_depend_on_the_sensor_s_axes(name, seed):
         assert np.abs(spans[1] @ found - wanted).max() < 1e-6 * np.abs(wanted).max()
 
 
-def test_an_effect_does_not_reach_over_a_gap():
-    """What stands behind a gap is the same whatever went before it."""
+def test_effect_does_not_carry_over_a_gap():
+    """The effect after a gap does not depend on what was before it."""
     _, readings = moving(7, rows=200, gap_at=100)
     rows = np.arange(200) >= 100
     alone = time_series.select_rows(readings, rows)

@@ -1,4 +1,4 @@
-"""What the operators behind the effects do, and the settings that effects find in a recording."""
+"""Operators of the effects, and the settings that effects find in a recording."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ahrsd.diagnosis.effects.sensor_element import alias_frequency, spectral_lin
 
 
 def seen(context, mag):
-    """The context with other readings of the magnetometer."""
+    """The context with other magnetometer readings."""
     return replace(context, track=replace(context.track, mag_b_gauss=mag))
 
 
-def test_a_line_is_found_where_it_is():
+def test_spectral_line_is_found_at_its_frequency():
     context, readings = moving(2, rows=2000)
     rng = np.random.default_rng(0)
     course = 1e-3 * np.sin(2 * np.pi * 3.217 * readings.time_s)[:, None] * [0.5, 0.3, -0.7]
@@ -28,7 +28,7 @@ def test_a_line_is_found_where_it_is():
     assert abs(second["frequency_hz"] - 3.217) > 0.01
 
 
-def test_mains_are_named_by_their_alias():
+def test_mains_frequency_is_recognised_by_its_alias():
     assert alias_frequency(60.0, 25.0) == pytest.approx(10.0)
     assert alias_frequency(50.0, 25.0) == 0.0
     assert alias_frequency(50.0, 40.0) == pytest.approx(10.0)
@@ -40,7 +40,7 @@ def test_mains_are_named_by_their_alias():
 
 
 @pytest.mark.parametrize(("hold", "phase"), [(2, 0), (4, 3), (5, 1)])
-def test_repeated_readings_are_counted(hold, phase):
+def test_hold_length_and_phase_of_repeated_readings_are_found(hold, phase):
     context, readings = moving(3)
     effect = EFFECTS["mag_sample_hold"]
     setting = {"hold_samples": hold, "phase": phase}
@@ -53,7 +53,7 @@ def test_repeated_readings_are_counted(hold, phase):
     assert effect.settings(seen(context, held.mag_b_gauss)) == (setting,)
 
 
-def test_a_passed_object_is_looked_for_where_the_field_s_size_departs():
+def test_settings_of_a_passed_object_are_near_the_departure_of_the_field_size():
     context, readings = moving(4, rows=1200)
     effect = EFFECTS["field_anomaly"]
     value = 0.03 * FIELD_N / np.linalg.norm(FIELD_N)
@@ -70,7 +70,7 @@ def test_a_passed_object_is_looked_for_where_the_field_s_size_departs():
     assert {s["searched"] for s in found} == {30}
 
 
-def test_positions_need_a_level_world():
+def test_effects_by_position_need_a_levelled_world_frame():
     context, _ = moving(5)
     adrift = replace(context, world_levelled=False)
     assert len(EFFECTS["field_gradient"].settings(context)) == 8
@@ -78,7 +78,7 @@ def test_positions_need_a_level_world():
     assert all("onset_s" in s for s in EFFECTS["field_anomaly"].settings(adrift))
 
 
-def test_without_its_columns_an_effect_offers_nothing_and_says_what_it_needs():
+def test_effect_without_its_columns_has_no_settings_and_names_what_it_needs():
     context, readings = moving(6)
     bare = replace(context, track=replace(context.track, covariates={}, accel_b_m_s2=None))
     empty = replace(readings, covariates={}, accel_b_m_s2=np.full((600, 3), np.nan))
@@ -91,7 +91,7 @@ def test_without_its_columns_an_effect_offers_nothing_and_says_what_it_needs():
             assert effect.example(empty, 1.0)[0].shape == (len(effect.parameters),)
 
 
-def test_the_earth_turns_fifteen_degrees_an_hour():
+def test_earth_rotation_is_fifteen_degrees_per_hour():
     _, readings = moving(8)
     effect = EFFECTS["earth_rotation"]
     value, setting = effect.example(readings, 1.0)
@@ -99,8 +99,8 @@ def test_the_earth_turns_fifteen_degrees_an_hour():
     assert np.linalg.norm(added, axis=1) == pytest.approx(np.full(600, 7.292e-5), rel=5e-3)
 
 
-def test_a_gradient_is_a_field_without_sources():
-    """Its matrix, read off three places, is symmetric and has no trace."""
+def test_field_gradient_is_symmetric_and_traceless():
+    """As of a field without sources: the matrix is read off three positions."""
     _, readings = moving(9, rows=3)
     places = {
         f"position_{name}_m": np.eye(3)[:, i] for i, name in enumerate(("north", "east", "down"))
@@ -115,7 +115,7 @@ def test_a_gradient_is_a_field_without_sources():
     assert np.diag(gradient)[:2] == pytest.approx(value[:2])
 
 
-def test_an_object_beside_the_way_is_found_to_a_hand_s_breadth():
+def test_object_next_to_the_path_is_located_within_15_cm():
     context, readings = moving(10, rows=1500)
     effect = EFFECTS["field_anomaly"]
     way = np.column_stack(
@@ -134,8 +134,8 @@ def test_an_object_beside_the_way_is_found_to_a_hand_s_breadth():
     ("frequency_hz", "found"),
     [(40 / 3, False), (40 / 6, False), (10.0, True), (7.3, True), (19.8, True), (20.0, False)],
 )
-def test_a_line_that_keeps_step_with_the_samples_is_no_outside_field(frequency_hz, found):
-    """10 Hz is what 50 Hz looks like at 40 Hz."""
+def test_line_synchronous_with_the_samples_is_no_external_field(frequency_hz, found):
+    """10 Hz is the alias of 50 Hz at a rate of 40 Hz."""
     time_s = np.arange(4000) / 40.0
     residual = np.random.default_rng(2).normal(size=(4000, 3))
     residual[:, 1] += 0.5 * np.cos(2 * np.pi * frequency_hz * time_s)
@@ -149,7 +149,7 @@ def test_a_line_that_keeps_step_with_the_samples_is_no_outside_field(frequency_h
     ("turns_hz", "line_hz", "found"),
     [(0.5, 0.5, False), (0.5, 0.53, False), (0.5, 1.3, True), (0.02, 0.5, True), (7.3, 7.3, True)],
 )
-def test_a_line_at_the_rate_at_which_the_vehicle_turns_to_and_fro_is_none(turns_hz, line_hz, found):
+def test_line_at_the_oscillation_rate_of_the_vehicle_is_no_external_field(turns_hz, line_hz, found):
     rng = np.random.default_rng(3)
     time_s = np.arange(4000) / 40.0
     gyro = 0.01 * rng.normal(size=(4000, 3))
@@ -162,7 +162,7 @@ def test_a_line_at_the_rate_at_which_the_vehicle_turns_to_and_fro_is_none(turns_
     assert any(abs(one - line_hz) < 5e-3 for one in at) == found
 
 
-def test_a_gain_with_temperature_is_of_the_field_within_the_iron_of_the_reading_or_of_the_field():
+def test_temperature_gain_applies_to_the_field_in_the_iron_the_reading_or_the_outside_field():
     context, readings = moving(3, rows=120)
     effect = EFFECTS["mag_scale_temperature"]
     forms = {setting["of"]: setting for setting in effect.settings(context)}

@@ -1,4 +1,4 @@
-"""The page of effects is what the library says."""
+"""The reference page of effects agrees with the library."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from ahrsd.diagnosis.effects.reference_page import page
 PROJECT = Path(__file__).parents[3]
 
 
-def test_the_page_is_written_from_the_library():
+def test_reference_page_is_generated_from_the_library():
     assert (PROJECT / "docs" / "reference" / "effects.md").read_text() == page(), (
         "run: python -m ahrsd.diagnosis.effects.reference_page > docs/reference/effects.md"
     )
 
 
-def test_every_effect_and_every_link_is_on_the_page():
+def test_reference_page_has_every_effect_and_no_broken_link():
     text = page()
     headings = re.findall(r"^### `(\w+)` \((.+)\)$", text, re.MULTILINE)
     assert [name for name, _ in headings] == sorted(EFFECTS, key=order)

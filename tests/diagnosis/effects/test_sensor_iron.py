@@ -1,4 +1,4 @@
-"""Every shape of a drift goes from nothing to the whole change."""
+"""Shapes of a drift of the hard iron."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mismatch_trials import Trial, made
 from ahrsd.diagnosis.effects.library import EFFECTS
 
 
-def test_every_shape_of_a_drift_goes_from_nothing_to_the_whole_change() -> None:
+def test_every_drift_shape_goes_from_zero_to_the_whole_change() -> None:
     readings = made(Trial(seed=8, samples=3000)).track  # 120 s
     drift = EFFECTS["hard_iron_drift"]
     span = {"start_s": float(readings.time_s[0]), "span_s": float(np.ptp(readings.time_s))}

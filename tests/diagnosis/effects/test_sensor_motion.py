@@ -1,4 +1,4 @@
-"""A mount that bends alike in all directions turns the outside field."""
+"""A mount that bends equally in all directions turns the outside field."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 MOUNT = EFFECTS["flexible_mount"]
 
 
-def test_its_trace_is_another_field_in_the_world():
+def test_trace_of_the_compliance_is_a_constant_field_in_the_world_frame():
     count, field = 50, np.array([0.2, 0.05, 0.42])
     R = Rotation.random(count, random_state=3).as_matrix()
     field_b = np.einsum("nji,j->ni", R, field)

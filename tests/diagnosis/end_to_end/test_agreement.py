@@ -1,4 +1,4 @@
-"""A recording of our own simulator agrees with it, however it is laid out."""
+"""A recording of the project's own simulator agrees with the model in any layout."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ahrsd.diagnosis.track import Track
 from ahrsd.simulation import Experiment
 from ahrsd.simulation.scenarios import columns
 
-#: scenario, motion, seed, gauss, rad/s: the default's noise, and a quiet gyro's
+#: scenario, motion, seed, gauss, rad/s: the default noise, and that of a low-noise gyro
 PLAIN = (
     ("wam", "slow", 1, 1e-3, 5e-3),
     ("lam", "slow", 2, 1e-3, 5e-3),
@@ -37,7 +37,7 @@ def _made(kind: tuple[str, str, int, float, float]) -> Experiment:
 
 
 def _with_reference(made: Experiment) -> Track:
-    """As `ahrsd simulate` writes it: with the exact attitude."""
+    """Columns as `ahrsd simulate` writes them, with the exact attitude."""
     return track_of(made).with_columns({name: columns(made)[name] for name in REFERENCE})
 
 
@@ -50,10 +50,12 @@ def _agrees(found: Diagnosis) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", PLAIN)
-def test_an_exact_reference_attitude_is_no_mismatch_and_changes_nothing(
+def test_exact_reference_attitude_changes_nothing(
     kind: tuple[str, str, int, float, float],
 ) -> None:
-    """World columns that turn by it, a filter by the noisy gyro: that was 470 nats of nothing."""
+    """World columns turned by the exact attitude, with a filter that turns by the noisy gyro,
+    once gave 470 nats of evidence for nothing.
+    """
     with_it = diagnose(_with_reference(_made(kind)))
     _agrees(with_it)
     assert with_it.to_json() == diagnose(track_of(_made(kind))).to_json()
@@ -75,17 +77,19 @@ def test_an_exact_reference_attitude_is_no_mismatch_and_changes_nothing(
         ("mam", "rov", 0, 1e-4, 5e-2),
     ],
 )
-def test_noise_far_from_the_usual_is_no_mismatch(
+def test_unusual_noise_levels_are_no_mismatch(
     kind: tuple[str, str, int, float, float],
 ) -> None:
-    """Fifty times the noise, a magnetometer without any, a gyro ten times as loud as that."""
+    """Fifty times the usual noise, a magnetometer without noise, and a gyro with ten times its
+    usual noise.
+    """
     found = diagnose(_with_reference(_made(kind)))
     _agrees(found)
     assert found.failed_checks == []
 
 
 def _turned(track: Track) -> Track:
-    """Another sensor frame: axes turned by hand."""
+    """Another sensor frame: all axes rotated."""
     R = Rotation.from_euler("zyx", [100.0, 25.0, -140.0], degrees=True).as_matrix()
     accel = None if track.accel_b_m_s2 is None else track.accel_b_m_s2 @ R.T
     mag, gyro = track.mag_b_gauss @ R.T, track.gyro_b_rad_s @ R.T
@@ -93,7 +97,7 @@ def _turned(track: Track) -> Track:
 
 
 def _permuted(track: Track) -> Track:
-    """Axes renamed, and a logged column before the attitude's."""
+    """Axes permuted, and a logged column before those of the attitude."""
     order = [1, 2, 0]
     logged = {"hdop": np.cos(0.01 * track.time_s)} | dict(reversed(track.covariates.items()))
     accel = None if track.accel_b_m_s2 is None else track.accel_b_m_s2[:, order]
@@ -117,7 +121,7 @@ def _rows(track: Track, rows: slice) -> Track:
 
 
 def _stronger(track: Track) -> Track:
-    """A field in other units of strength, a clock that began elsewhere."""
+    """A field in other units, and a clock with another start."""
     return replace(track, mag_b_gauss=1.3 * track.mag_b_gauss, time_s=track.time_s + 1.7e9)
 
 
@@ -133,7 +137,7 @@ def _stronger(track: Track) -> Track:
     ],
     ids=["turned", "permuted", "stronger", "first half", "second half", "no accelerometer"],
 )
-def test_agreement_stays_agreement(change) -> None:
+def test_agreement_does_not_depend_on_frame_scale_clock_or_length(change) -> None:
     _agrees(diagnose(change(_with_reference(_made(PLAIN[0])))))
 
 
@@ -142,7 +146,9 @@ def test_agreement_stays_agreement(change) -> None:
     ("scenario", "seed"),
     [("wam", 1), ("mam", 1), ("wam", 2)],
 )
-def test_a_loud_gyro_at_ten_hertz_has_no_delay(scenario: str, seed: int) -> None:
-    """Moved by half a step its noise is averaged: that was a delay, and a crooked gyro besides."""
+def test_noisy_gyro_at_ten_hertz_is_not_diagnosed_as_delayed(scenario: str, seed: int) -> None:
+    """A shift by half a step averages the gyro noise. This was once taken for a delay and a
+    misalignment.
+    """
     made_one = experiment(scenario, seed=seed, samples=3000, rate_hz=10.0, sigma_gyro=3e-2)
     _agrees(diagnose(track_of(made_one)))

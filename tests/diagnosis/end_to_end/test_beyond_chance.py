@@ -1,4 +1,4 @@
-"""Beside a gyro that is louder than the magnetometer."""
+"""Diagnoses with a gyro that is noisier than the magnetometer."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def _made(sigma_mag: float, sigma_gyro: float, scenario: str = "wam", seed: int 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "seed"), [("wam", 3), ("lam", 1)])
-def test_a_fit_like_those_of_simulations_is_no_mismatch(scenario: str, seed: int) -> None:
-    """Without this the engine is sure of something unknown in the first, by 1391 nats."""
+def test_fit_like_those_of_null_simulations_is_no_mismatch(scenario: str, seed: int) -> None:
+    """Without the comparison an unknown cause is found in the first case, with 1391 nats."""
     found = diagnose(track_of(_made(3.2e-4, 5.5e-2, scenario, seed)))
     assert not found.mismatch
     assert verdict(found) == "recording and model agree"
@@ -39,22 +39,22 @@ def test_a_fit_like_those_of_simulations_is_no_mismatch(scenario: str, seed: int
 
 
 @pytest.mark.slow
-def test_a_magnetometer_without_noise_is_like_its_simulations() -> None:
+def test_magnetometer_without_noise_is_no_mismatch() -> None:
     found = diagnose(track_of(_made(0.0, 5e-3, "lam", 2)))
     assert verdict(found) == "recording and model agree"
 
 
 @pytest.mark.slow
-def test_where_no_simulation_can_be_fitted_neither_yes_nor_no_is_said(monkeypatch) -> None:
-    """What was seen may be chance, and nothing says how much chance makes."""
+def test_no_verdict_when_no_null_simulation_can_be_fitted(monkeypatch) -> None:
+    """The evidence may be chance, and it is unknown how much evidence chance alone produces."""
     track = track_of(_made(1e-4, 5e-2))
     since = (np.arange(len(track)) >= 1500)[:, None]
     stepped = replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS)
 
-    def no_end(*_, **__):
+    def diverging_fit(*_, **__):
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
-    monkeypatch.setattr("ahrsd.diagnosis.answer.null_simulations.fit_null", no_end)
+    monkeypatch.setattr("ahrsd.diagnosis.answer.null_simulations.fit_null", diverging_fit)
     found = diagnose(stepped)
     assert found.findings == ()
     assert verdict(found) == (
@@ -66,7 +66,7 @@ def test_where_no_simulation_can_be_fitted_neither_yes_nor_no_is_said(monkeypatc
 
 
 @pytest.mark.slow
-def test_where_the_gyro_is_the_quieter_sensor_nothing_is_simulated() -> None:
+def test_nothing_is_simulated_when_the_gyro_is_less_noisy() -> None:
     track = track_of(_made(1e-3, 5e-3))
     since = (np.arange(len(track)) >= 1500)[:, None]
     found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + 5 * since * STEP_GAUSS))
@@ -75,9 +75,9 @@ def test_where_the_gyro_is_the_quieter_sensor_nothing_is_simulated() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="simulations of the model alone have a false drift there")
-def test_a_step_far_beyond_what_simulations_show_is_told() -> None:
-    """2 mG of hard iron beside 0.1 mG and 50 mrad/s."""
+@pytest.mark.xfail(strict=True, reason="simulations of the null model have a false drift there")
+def test_step_far_beyond_the_null_simulations_is_found() -> None:
+    """2 mG of hard iron at a noise of 0.1 mG and 50 mrad/s."""
     track = track_of(_made(1e-4, 5e-2))
     since = (np.arange(len(track)) >= 1500)[:, None]
     found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + since * STEP_GAUSS))

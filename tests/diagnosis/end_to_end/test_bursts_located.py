@@ -1,4 +1,4 @@
-"""Bursts of a second are located, and not named."""
+"""Bursts of a second are located and remain unknown."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from ahrsd.diagnosis.track import Track
 
 
 @pytest.fixture(scope="module")
-def quiet() -> Track:
+def undisturbed() -> Track:
     return replace(made(Trial(seed=8, samples=6000)).track, covariates={})
 
 
 @pytest.mark.slow
-def test_bursts_are_located_and_not_named(quiet: Track) -> None:
+def test_bursts_are_an_unknown_cause_with_their_intervals(undisturbed: Track) -> None:
     times = np.array([31.0, 62.0, 75.5, 120.0, 171.0, 203.0])
-    on = np.any(np.abs(quiet.time_s[:, None] - times) < 0.6, axis=1)[:, None]
+    on = np.any(np.abs(undisturbed.time_s[:, None] - times) < 0.6, axis=1)[:, None]
     answer = diagnose(
-        replace(quiet, mag_b_gauss=quiet.mag_b_gauss + on * np.array([4e-3, 0, -3e-3]))
+        replace(undisturbed, mag_b_gauss=undisturbed.mag_b_gauss + on * np.array([4e-3, 0, -3e-3]))
     )
     assert answer.findings == ()
     where = answer.unexplained.where

@@ -1,4 +1,4 @@
-"""Columns that a logger held, or added noise to: their cause is one name, and nothing is left."""
+"""Columns that a logger held or added noise to: one finding, and no residual."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def held(values, rows):
 
 
 @pytest.mark.slow
-def test_a_current_that_was_logged_five_times_a_second_is_one_name():
+def test_current_held_at_five_hertz_is_a_single_finding():
     one = made(
         Trial(seed=11, effects=(("motor_current_field", 1.0),), samples=8_000, rate_hz=RATE_HZ)
     )
     current = held(one.track.covariates["motor_current_a"], 5)
     track = one.track.with_columns({**one.track.covariates, "motor_current_a": current})
     found = diagnose_logged(track)
-    # as it was held it is late, which a field by its change explains
+    # a held column is delayed, which a field by the current's derivative would explain
     assert [x.effect for x in found.findings] == ["motor_current_field"]
     assert not found.unexplained.detected
     assert (
@@ -38,24 +38,24 @@ def test_a_current_that_was_logged_five_times_a_second_is_one_name():
     np.testing.assert_allclose([p.value for p in found.findings[0].parameters], value, rtol=0.02)
 
 
-def course(seed: int, rows: int, width: float = 120.0) -> np.ndarray:
-    """A smooth course of deviation 1."""
+def smooth_values(seed: int, rows: int, width: float = 120.0) -> np.ndarray:
+    """Smooth values with unit standard deviation."""
     values = gaussian_filter1d(np.random.default_rng(seed).normal(size=rows), width)
     return values / values.std()
 
 
-def drawn(values: np.ndarray, rows: int) -> np.ndarray:
-    """Every so many rows a value, straight lines between, with four decimals as a file has them."""
+def logged_values(values: np.ndarray, rows: int) -> np.ndarray:
+    """One value every `rows` rows, linear interpolation between, four decimals as in a file."""
     at = np.arange(0, len(values), rows)
     return np.round(np.interp(np.arange(len(values)), at, values[at]), 4)
 
 
 @pytest.mark.slow
-def test_a_speed_with_noise_has_its_own_field_and_leaves_nothing() -> None:
+def test_speed_field_is_found_from_a_noisy_column_without_residual() -> None:
     track = track_of(experiment("wam", motion="rov", seed=4, samples=3000, rate_hz=12.5))
-    speed = 1.2 + 0.25 * course(10, 3000)
+    speed = 1.2 + 0.25 * smooth_values(10, 3000)
     mag = track.mag_b_gauss + speed[:, None] * FIELD_PER_M_S
-    noisy = drawn(speed + np.random.default_rng(11).normal(0.0, 0.05, 3000), 3)
+    noisy = logged_values(speed + np.random.default_rng(11).normal(0.0, 0.05, 3000), 3)
     found = diagnose_logged(replace(track, mag_b_gauss=mag).with_columns({"speed_m_s": noisy}))
     assert [one.effect for one in found.findings] == ["speed_field"]
     assert not found.unexplained.detected

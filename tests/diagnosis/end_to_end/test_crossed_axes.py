@@ -1,4 +1,4 @@
-"""Axes of the magnetometer that read a part of each other."""
+"""Cross-axis sensitivity of the magnetometer."""
 
 import pytest
 from mismatch_trials import Trial, made
@@ -12,5 +12,5 @@ def crossed():
 
 
 @pytest.mark.slow
-def test_crossed_axes_are_one_name(crossed):
+def test_cross_axis_sensitivity_is_a_single_finding(crossed):
     assert [one.effect for one in diagnose(crossed).findings] == ["mag_cross_axis"]

@@ -1,4 +1,4 @@
-"""Currents of many shapes: named where they are logged, never taken for lost samples."""
+"""Currents of many waveforms: found if logged, and not taken for lost samples."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def _disturbed(track: Track, current: Array, *, logged: bool) -> Track:
     )
 
 
-@pytest.mark.slow  # quick ones: inference/test_diagnose, test_turret
+@pytest.mark.slow  # short ones: inference/test_diagnose, test_turret
 @pytest.mark.parametrize("shape", ["quick square", "pulses", "square", "levels"])
-def test_an_unlogged_current_is_one_source_on_the_vehicle(shape: str) -> None:
+def test_unlogged_current_is_one_unknown_source_on_the_vehicle(shape: str) -> None:
     track = track_of(experiment("wam", seed=6, samples=3000))
     found = diagnose(_disturbed(track, 0.3 * SHAPES[shape](track.time_s), logged=False))
     assert found.findings == ()
@@ -50,12 +50,14 @@ def test_an_unlogged_current_is_one_source_on_the_vehicle(shape: str) -> None:
 
 
 @pytest.mark.xfail(
-    reason="a step of the field is likelier beside what the lost turns leave", strict=True
+    reason="a step of the field is more probable given the residual of the lost turns", strict=True
 )
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, 6])
-def test_lost_samples_are_told_beside_a_current(seed: int) -> None:
-    """Without the current turns are put right where none was lost; of 5, steps are named there."""
+def test_lost_samples_and_a_current_are_both_found(seed: int) -> None:
+    """Without the current in the model, turns are corrected where none was lost. With seed 5,
+    steps are reported there.
+    """
     track = track_of(experiment("wam", seed=seed, samples=3000))
     track = _disturbed(track, SHAPES["square"](track.time_s), logged=True)
     keep = np.flatnonzero(np.random.default_rng(5).random(len(track)) > 0.01)
@@ -73,8 +75,10 @@ def test_lost_samples_are_told_beside_a_current(seed: int) -> None:
     assert found["dropped_samples"].parameters[0].value == pytest.approx(0.01, abs=0.005)
 
 
-def test_what_rides_with_the_sensor_is_averaged_as_it_is() -> None:
-    """Two rows of a turning sensor made one: the field is turned to the second, a motor's not."""
+def test_field_on_the_vehicle_is_averaged_without_rotation() -> None:
+    """When two rows of a turning sensor are averaged, the outside field is rotated to the second
+    row. The field of a motor is not.
+    """
     made = experiment("mam", seed=3, samples=2000, rate_hz=20.0, sigma_mag=1e-12, sigma_gyro=1e-12)
     track = track_of(made)
     riding = np.outer(SHAPES["square"](track.time_s), [0.03, -0.02, 0.03])
@@ -91,8 +95,8 @@ def test_what_rides_with_the_sensor_is_averaged_as_it_is() -> None:
 
 
 @pytest.mark.slow
-def test_a_rover_s_field_by_its_speed_is_named() -> None:
-    """50 mG per m/s over drive motors without a logged current."""
+def test_speed_field_of_a_rover_is_found() -> None:
+    """50 mG per m/s from drive motors whose current is not logged."""
     track = track_of(experiment("wam", seed=6, samples=2500))
     k = np.array([0.04, -0.02, 0.022])
     speed = 0.2 * SHAPES["ramps"](track.time_s) * (track.time_s % 40 > 8)
@@ -104,10 +108,10 @@ def test_a_rover_s_field_by_its_speed_is_named() -> None:
     np.testing.assert_allclose(values, k, atol=1e-3)
 
 
-@pytest.mark.slow  # the square one, quick and by command: test_diagnose_command
+@pytest.mark.slow  # a short one of a square current, by command: test_diagnose_command
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("seed", [6, 11])
-def test_a_logged_current_alone_is_named(shape: str, seed: int) -> None:
+def test_logged_current_is_the_only_finding(shape: str, seed: int) -> None:
     track = track_of(experiment("wam", seed=seed, samples=2500))
     found = diagnose(_disturbed(track, SHAPES[shape](track.time_s), logged=True))
     assert [one.effect for one in found.findings] == ["motor_current_field"]
@@ -118,7 +122,7 @@ def test_a_logged_current_alone_is_named(shape: str, seed: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.slow)])
-def test_the_steps_of_an_unlogged_current_are_no_lost_samples(seed: int) -> None:
+def test_steps_of_an_unlogged_current_are_not_lost_samples(seed: int) -> None:
     track = track_of(experiment("wam", seed=seed, samples=3000))
     found = diagnose(_disturbed(track, SHAPES["square"](track.time_s), logged=False))
     assert "dropped_samples" not in [one.effect for one in found.findings]
@@ -126,15 +130,19 @@ def test_the_steps_of_an_unlogged_current_are_no_lost_samples(seed: int) -> None
 
 
 def _at_the_instant(track: Track) -> Track:
-    """A gyro that is read at the sample, not averaged over the step before it: half a step late."""
+    """A gyro that is read at the sample, not averaged over the step before: half a step of
+    delay.
+    """
     rate = track.gyro_b_rad_s.copy()
     rate[:-1] = (rate[:-1] + rate[1:]) / 2
     return replace(track, gyro_b_rad_s=rate)
 
 
 @pytest.mark.slow
-def test_a_strong_current_is_not_turned_with_the_field_and_no_eddy_is_named_for_that() -> None:
-    """0.3 G of a rover's motor, averaged in pairs at 20 Hz: nothing but the current, and a lag."""
+def test_strong_current_is_found_without_false_eddy_currents() -> None:
+    """0.3 G of a rover's motor, averaged in pairs at 20 Hz: only the current and a delay are
+    found.
+    """
     track = _at_the_instant(track_of(experiment("mam", seed=3, samples=3000, rate_hz=20.0)))
     k = np.array([7.5e-3, -3.75e-3, 7.5e-3])
     current = 4.0 * SHAPES["square"](track.time_s)
@@ -148,8 +156,8 @@ def test_a_strong_current_is_not_turned_with_the_field_and_no_eddy_is_named_for_
     np.testing.assert_allclose(values, k, atol=5e-5)
 
 
-def _late(seed: int, shape: str, lag_s: float) -> Track:
-    """A magnetometer that is late with all that it measures, the field of a current as well."""
+def _delayed(seed: int, shape: str, lag_s: float) -> Track:
+    """A delayed magnetometer: all it measures is delayed, the field of a current as well."""
     made = experiment("mam", seed=seed, samples=5000)
     current = SHAPES[shape](made.samples.time_s)
     truth = readings_of(made, {})
@@ -169,8 +177,8 @@ def _late(seed: int, shape: str, lag_s: float) -> Track:
         (11, "pulses"),
     ],
 )
-def test_a_late_magnetometer_reads_a_current_late_and_no_change_of_it_is_named(seed, shape):
-    found = diagnose(_late(seed, shape, 0.07))
+def test_delay_and_current_are_found_without_a_derivative_field(seed, shape):
+    found = diagnose(_delayed(seed, shape, 0.07))
     assert {one.effect for one in found.findings} == {"motor_current_field", "mag_time_lag"}
     assert not found.unexplained.detected
     (current,) = (one for one in found.findings if one.effect == "motor_current_field")
@@ -178,12 +186,14 @@ def test_a_late_magnetometer_reads_a_current_late_and_no_change_of_it_is_named(s
         assert parameter.value == pytest.approx(truth, rel=0.02)
 
 
-@pytest.mark.slow  # a quick one: inference/test_means
+@pytest.mark.slow  # a short one: inference/test_averaged_column
 @pytest.mark.parametrize(("memory_s", "mean_s"), [(0.5, 0.4), (6.0, 0.2)])
-def test_a_current_that_is_logged_as_a_mean_has_its_field_and_no_field_of_its_change(
+def test_current_logged_as_a_mean_is_found_without_a_derivative_field(
     memory_s: float, mean_s: float
 ):
-    """Its mean comes late by half of it; what else it lacks is the current's second difference."""
+    """The mean is delayed by half its length. The remaining difference is the second derivative
+    of the current.
+    """
     track = track_of(experiment("wam", seed=16, samples=4000))
     kept, count = np.exp(-track.step_s / memory_s), round(mean_s / track.step_s)
     drawn = np.random.default_rng(16).normal(0.0, np.sqrt(1 - kept**2), len(track))

@@ -1,4 +1,4 @@
-"""A gyro that never changes."""
+"""A gyro with constant readings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def track() -> Track:
 
 
 @pytest.mark.parametrize("value", [0.0, 0.013])
-def test_a_gyro_that_never_changes_while_the_field_turns(track: Track, value: float) -> None:
+def test_constant_gyro_is_refused_when_the_field_turns(track: Track, value: float) -> None:
     still = replace(track, gyro_b_rad_s=np.full_like(track.gyro_b_rad_s, value))
     why = dead_sensor_reason(still)
     assert why is not None

@@ -1,4 +1,6 @@
-"""What the report draws: the map by regime, what each term adds, the gain of all names together."""
+"""Figures of the report: the map by regime, the contribution of each term, the gain of all
+findings.
+"""
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ def answer(*effects, seed=3):
 
 
 @pytest.mark.slow
-def test_a_field_by_place_stands_in_the_map_at_its_places_and_is_gone_after():
+def test_field_by_position_is_in_the_regime_map_before_and_not_after():
     found, _ = answer(("field_gradient", 1.0))
     maps = {one.quantity: one for one in found.regime_map}
     assert max(max(maps[f"position_{axis}_m"].before) for axis in ("north", "east", "down")) > 50.0
@@ -21,7 +23,7 @@ def test_a_field_by_place_stands_in_the_map_at_its_places_and_is_gone_after():
         (max(one.before) for one in maps.values()), reverse=True
     )
     after = np.concatenate([one.after for one in found.regime_map])
-    # half a chi-squared of three: mean 1.5, deviation 1.2; over a hundred bins hang together
+    # half a chi-squared of 3: mean 1.5, deviation 1.2; more than a hundred bins are correlated
     assert after.mean() == pytest.approx(1.5, abs=0.5)
     assert after.max() < 10.0
     assert len(maps["heading_deg"].after) == 12
@@ -31,7 +33,7 @@ def test_a_field_by_place_stands_in_the_map_at_its_places_and_is_gone_after():
 
 
 @pytest.mark.slow
-def test_without_names_nothing_is_drawn_twice():
+def test_figures_before_and_after_are_equal_when_nothing_is_found():
     found, _ = answer()
     assert found.validation.named == found.validation.free == 0.0
     assert all(one.before == one.after for one in found.regime_map)
@@ -39,7 +41,7 @@ def test_without_names_nothing_is_drawn_twice():
 
 
 @pytest.mark.slow
-def test_every_finding_has_its_own_course_in_its_own_unit():
+def test_every_finding_has_its_contribution_in_its_unit():
     found, one = answer(("hard_iron_step", 1.0), ("gyro_scale", 1.0))
     drawn = {x.effect: found.drawn.contributions[x.term] for x in found.findings}
     step, scale = drawn["hard_iron_step"], drawn["gyro_scale"]
@@ -55,17 +57,17 @@ def test_every_finding_has_its_own_course_in_its_own_unit():
 
 
 @pytest.mark.slow
-def test_a_delay_is_drawn_as_it_is_in_the_recording():
+def test_contribution_of_a_delay_has_its_full_size():
     found, _ = answer(("mag_time_lag", 3.0))  # 60 ms
     (lag,) = found.findings
     assert lag.parameters[0].value == pytest.approx(0.06, abs=2e-3)
     added = np.linalg.norm(found.drawn.contributions[lag.term].added, axis=1)
-    assert added.max() > 5e-3  # half a gauss that turns by half a radian a second: 15 mG
+    assert added.max() > 5e-3  # half a gauss that turns by half a radian per second: 15 mG
 
 
 @pytest.mark.slow
-def test_all_names_together_gain_more_than_each_and_less_than_their_sum():
-    """Without one of two names the noise takes a part of it as its own."""
+def test_held_out_gain_of_all_findings_is_between_the_largest_and_the_sum():
+    """Without one of two findings the noise model absorbs a part of it."""
     found, _ = answer(("motor_current_field", 0.5), ("gyro_scale", 1.0))
     alone = [x.heldout.nll_gain_per_sample for x in found.findings]
     assert len(alone) == 2

@@ -1,4 +1,4 @@
-"""Readings taken while a hand puts a magnet on: without weight, and the rest is named."""
+"""Readings taken while a hand puts on a magnet have no weight, and the other effects are found."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def handled(lag_s: float = 0.0, hand_s: float = HAND_S) -> Track:
 
 @pytest.mark.xfail(strict=True, reason="magnet and lag are one unknown while the magnet is there")
 @pytest.mark.slow
-def test_a_lag_is_named_with_its_value_beside_a_magnet_that_a_hand_puts_on() -> None:
+def test_delay_is_found_with_its_value_when_a_hand_puts_on_a_magnet() -> None:
     found = diagnose(handled(LAG_S))
     steps = [one for one in found.findings if one.effect == "hard_iron_step"]
     (lag,) = (one for one in found.findings if one.effect != "hard_iron_step")

@@ -1,4 +1,4 @@
-"""Columns with holes and with a clock of their own: what they say counts, and is said."""
+"""Columns with gaps, or with a clock of their own, are used, and the fault is reported."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FIELD_PER_AMPERE = np.array([1.5e-3, -1e-3, 1e-3])
 
 
 def levels(time_s: Array, seed: int) -> Array:
-    """A current whose levels hold for 8 to 30 s."""
+    """A current whose levels last 8 to 30 s."""
     rng = np.random.default_rng(seed)
     edges = np.cumsum(rng.uniform(8.0, 30.0, 60))
     return np.asarray(rng.uniform(0.5, 12.0, 61)[np.searchsorted(edges, time_s)])
@@ -25,11 +25,11 @@ def levels(time_s: Array, seed: int) -> Array:
 
 @pytest.fixture(scope="module")
 def driven() -> tuple[Track, Array]:
-    """300 s at 12.5 Hz beside a motor, and the motor's current."""
-    return beside_a_motor(3750)
+    """300 s at 12.5 Hz next to a motor, and the motor's current."""
+    return next_to_a_motor(3750)
 
 
-def beside_a_motor(samples: int) -> tuple[Track, Array]:
+def next_to_a_motor(samples: int) -> tuple[Track, Array]:
     track = track_of(experiment("wam", motion="rov", seed=4, samples=samples, rate_hz=12.5))
     current = levels(track.time_s - track.time_s[0], 7)
     mag = track.mag_b_gauss + current[:, None] * FIELD_PER_AMPERE
@@ -41,8 +41,10 @@ def logged(track: Track, name: str, values: Array) -> Track:
 
 
 @pytest.mark.slow
-def test_a_wrong_clock_is_found_beside_a_magnetometer_that_is_late(driven) -> None:
-    """What a delay of 100 ms leaves is larger than the current's field: it is taken out first."""
+def test_delayed_column_clock_is_found_with_a_delayed_magnetometer(driven) -> None:
+    """The residual of a delay of 100 ms is larger than the field of the current, so the delay is
+    removed first.
+    """
     track, _ = driven
     t = track.time_s - track.time_s[0]
     late = np.column_stack([np.interp(t - 0.1, t, axis) for axis in track.mag_b_gauss.T])
@@ -65,7 +67,7 @@ def test_a_wrong_clock_is_found_beside_a_magnetometer_that_is_late(driven) -> No
     ],
     ids=["late", "early", "drift"],
 )
-def test_a_clock_that_is_wrong_is_said_and_the_cause_named(driven, clock, words) -> None:
+def test_wrong_column_clock_is_reported_and_its_current_found(driven, clock, words) -> None:
     track, _ = driven
     at_s = clock(track.time_s - track.time_s[0])
     found = diagnose_logged(logged(track, "motor_current_a", levels(at_s, 7)))
@@ -78,7 +80,7 @@ def test_a_clock_that_is_wrong_is_said_and_the_cause_named(driven, clock, words)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, 12, 13])
-def test_another_column_is_no_cause_at_any_time(driven, seed: int) -> None:
+def test_unrelated_column_is_no_cause_at_any_time_shift(driven, seed: int) -> None:
     track, _ = driven
     other = levels(track.time_s - track.time_s[0], seed)
     found = diagnose_logged(logged(track, "shaft_rpm", 100 * other))
@@ -88,8 +90,8 @@ def test_another_column_is_no_cause_at_any_time(driven, seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_the_rest_of_a_column_with_a_hole_names_its_cause() -> None:
-    track, current = beside_a_motor(2000)
+def test_current_is_found_from_a_column_with_a_gap() -> None:
+    track, current = next_to_a_motor(2000)
     holed = np.where((track.time_s > 60.0) & (track.time_s < 85.0), np.nan, current)
     found = diagnose_logged(logged(track, "motor_current_a", holed))
     assert [one.effect for one in found.findings] == ["motor_current_field"]
@@ -98,7 +100,7 @@ def test_the_rest_of_a_column_with_a_hole_names_its_cause() -> None:
 
 
 @pytest.mark.slow
-def test_a_column_with_a_hole_that_is_no_cause_is_left_out(driven) -> None:
+def test_unrelated_column_with_a_gap_is_left_out(driven) -> None:
     track, current = driven
     holed = np.where((track.time_s > 100.0) & (track.time_s < 140.0), np.nan, 0.3 * current)
     other = logged(track, "motor_current_a", current)
@@ -107,7 +109,7 @@ def test_a_column_with_a_hole_that_is_no_cause_is_left_out(driven) -> None:
     assert any("column speed_m_s was left out: no values from" in note for note in found.notes)
 
 
-def test_columns_with_holes(driven) -> None:
+def test_usable_columns_with_gaps_are_selected(driven) -> None:
     track, current = driven
     nothing, short, long = (current.copy() for _ in range(3))
     nothing[100:] = np.nan
@@ -121,8 +123,8 @@ def test_columns_with_holes(driven) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("own", [True, False])
-def test_a_current_is_named_at_rest_if_the_field_follows_it(own: bool) -> None:
-    """The manoeuvre that tells a current from what the turning does: pulses at rest."""
+def test_current_is_found_at_rest_if_the_field_follows_it(own: bool) -> None:
+    """Pulses at rest are the manoeuvre that separates a current from effects of the motion."""
     rng = np.random.default_rng(5)
     time_s = np.arange(1500) / 10.0
     current, other = levels(time_s, 3), levels(time_s, 9)

@@ -1,4 +1,6 @@
-"""What iron remembers from before the recording is its own, and no jump in the first seconds."""
+"""Magnetisation from before the recording is a part of its effect, not a step in the first
+seconds.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.repaired_model.forward import terms_contribution
 
 
-def test_play_begins_where_it_was_left() -> None:
+def test_play_operator_starts_from_its_memory() -> None:
     values = np.array([[0.0], [0.2], [-0.3], [-0.8], [1.0], [0.9]])
     middle = time_series.play_operator(values, 0.5, (1.0,))[:, 0]
     np.testing.assert_allclose(middle, [0.5, 0.5, 0.2, -0.3, 0.5, 0.5], atol=1e-12)
@@ -27,7 +29,7 @@ def test_play_begins_where_it_was_left() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("memory", [(1.0, -1.0, 1.0), (0.5, -0.75, 1.0)])
-def test_the_memory_is_found_and_nothing_else_is_named(memory) -> None:
+def test_hysteresis_is_found_with_its_memory_as_the_only_finding(memory) -> None:
     track = made(Trial(5, scenario="wam", samples=6000)).track
     setting = {"radius_gauss": 0.03, "memory": memory}
     value = np.array([2e-3, 2.5e-3, 3e-3])
@@ -40,7 +42,7 @@ def test_the_memory_is_found_and_nothing_else_is_named(memory) -> None:
     assert abs(found.findings[0].setting["radius_gauss"] - 0.03) < 1e-3
 
 
-def test_a_low_pass_begins_where_it_was_left() -> None:
+def test_low_pass_starts_from_its_memory() -> None:
     values = np.array([[1.0], [1.0], [1.0], [2.0], [2.0]])
     dt_s = np.array([np.nan, 0.5, 0.5, np.nan, 0.5])  # the second run begins settled
     slow = time_series.low_pass(values, dt_s, 2.0, (0.3,))[:, 0]
@@ -49,7 +51,7 @@ def test_a_low_pass_begins_where_it_was_left() -> None:
 
 
 @pytest.mark.slow
-def test_iron_that_had_not_settled_is_no_step_and_no_drift() -> None:
+def test_unsettled_viscous_magnetisation_is_not_a_step_or_drift() -> None:
     track = made(Trial(6, scenario="wam", samples=2500)).track
     setting = {"time_constant_s": 25.0, "memory": (0.3, -0.25, 0.2)}
     value = np.array([0.02, 0.012, -0.008, 0.004, -0.006, 0.005])
@@ -64,7 +66,7 @@ def test_iron_that_had_not_settled_is_no_step_and_no_drift() -> None:
 
 
 @pytest.mark.slow
-def test_iron_that_had_settled_is_given_no_memory() -> None:
+def test_settled_viscous_magnetisation_has_no_memory() -> None:
     track = made(Trial(6, (("viscous_magnetisation", 2.0),), scenario="wam", samples=6000)).track
     (seen,) = diagnose(track).findings
     assert seen.effect == "viscous_magnetisation"

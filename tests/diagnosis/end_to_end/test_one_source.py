@@ -1,4 +1,4 @@
-"""A source that no name has, beside logged columns that go with it in part."""
+"""A source that is not in the library, with logged columns that correlate with it."""
 
 from __future__ import annotations
 
@@ -29,8 +29,12 @@ def _found(added: Array, current: Array, speed: Array) -> Diagnosis:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 4, 5, 6, 7, 8])
-def test_columns_that_go_with_an_unlogged_source_in_part_are_no_names_of_it(seed: int) -> None:
-    """What they draw of it and what is left have one direction: it was a field of the speed."""
+def test_columns_correlated_with_an_unlogged_source_are_not_reported_as_its_cause(
+    seed: int,
+) -> None:
+    """The part they explain and the residual have one direction. It was once reported as a speed
+    field.
+    """
     rng = np.random.default_rng(seed)
     load = _slow(rng, 0.08)
     current = 0.6 * load + 0.8 * _slow(rng, 0.08)
@@ -44,7 +48,7 @@ def test_columns_that_go_with_an_unlogged_source_in_part_are_no_names_of_it(seed
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 4])
-def test_a_current_keeps_its_name_beside_another_source_of_another_direction(seed: int) -> None:
+def test_current_is_found_with_an_unknown_source_of_another_direction(seed: int) -> None:
     rng = np.random.default_rng(seed)
     current, load = _slow(rng, 0.08), _slow(rng, 0.08)
     added = 1.5e-3 * current[:, None] * AXIS + 1.5e-3 * load[:, None] * ACROSS

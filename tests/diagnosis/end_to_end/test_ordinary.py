@@ -1,4 +1,4 @@
-"""How large what is left is: against fields that were added with a known size."""
+"""Size of the remaining residual, compared with fields of known size that were added."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def with_field(track: Track, added: np.ndarray) -> Track:
 
 
 @pytest.mark.slow
-def test_a_current_that_nobody_logged_is_unknown_in_a_simulation(made):
-    """A recording that is likelier without what real ones leave has nothing ordinary."""
+def test_unlogged_current_is_unknown_and_not_ordinary_in_a_simulation(made):
+    """A recording that is more probable without the ordinary remainder has no ordinary residual."""
     track = track_of(made)
     current = np.repeat(np.random.default_rng(3).uniform(0.0, 1.0, 30), SAMPLES // 30)
     added = current[:, None] * np.array([4e-3, -8e-3, 5e-3])
@@ -37,7 +37,7 @@ def test_a_current_that_nobody_logged_is_unknown_in_a_simulation(made):
 
 @pytest.mark.slow
 @pytest.mark.recordings
-def test_a_rotated_board_is_ordinary_and_a_watch_beside_a_sensor_is_not():
+def test_rotated_board_is_ordinary_and_a_watch_near_the_sensor_is_not():
     board = diagnose(recorded("broad/02_undisturbed_slow_rotation_B"))
     assert not board.unexplained.detected
     assert board.unexplained.ordinary.field_gauss == pytest.approx(5.0e-3, rel=0.3)
@@ -48,8 +48,10 @@ def test_a_rotated_board_is_ordinary_and_a_watch_beside_a_sensor_is_not():
 
 @pytest.mark.slow
 @pytest.mark.recordings
-def test_a_step_that_is_ordinary_is_in_what_is_left_with_its_time_and_size():
-    """It is not told, being no larger than what such recordings have, and not silent either."""
+def test_step_of_ordinary_size_is_reported_in_the_residual_with_time_and_size():
+    """It is no finding, because such recordings have steps of this size, but it is reported as a
+    part of the ordinary residual.
+    """
     track = recorded("broad/02_undisturbed_slow_rotation_B")
     middle_s = float(np.mean(track.time_s[[0, -1]]))
     step = np.array([12e-3, -4e-3, -10e-3])

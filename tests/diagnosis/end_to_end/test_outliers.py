@@ -1,4 +1,4 @@
-"""A handful of wild readings is no physics."""
+"""A few outliers are no physical cause."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
 @pytest.mark.slow
-def test_wild_readings_are_no_object_and_no_step():
+def test_outliers_are_not_an_object_or_a_step():
     track = made(Trial(9, samples=4_500, rate_hz=25.0)).track
     rng = np.random.default_rng(4)
     mag = track.mag_b_gauss.copy()

@@ -1,4 +1,4 @@
-"""What is too quick for the working rate: pulses, lines."""
+"""Disturbances above the working rate: pulses and lines."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ RATE_HZ = 40.0
 
 
 @pytest.fixture(scope="module")
-def quiet() -> Track:
+def undisturbed() -> Track:
     return made(Trial(seed=5, samples=7000, rate_hz=RATE_HZ)).track
 
 
-@pytest.mark.slow  # a quick one: the next
-def test_unlogged_pulses_are_named(quiet: Track) -> None:
-    since = (quiet.time_s - 0.4) % 1.37
+@pytest.mark.slow  # a short one: the next
+def test_unlogged_pulses_are_found(undisturbed: Track) -> None:
+    since = (undisturbed.time_s - 0.4) % 1.37
     hit = np.where(since < 0.06, 1.0, 0.0)[:, None]
-    pulsed = replace(quiet, mag_b_gauss=quiet.mag_b_gauss + 2.5e-3 * hit * np.array([0.8, 0, 0.6]))
+    pulsed = replace(
+        undisturbed, mag_b_gauss=undisturbed.mag_b_gauss + 2.5e-3 * hit * np.array([0.8, 0, 0.6])
+    )
     found = diagnose(pulsed).findings
     assert [one.effect for one in found] == ["sync_pulses"]
     assert abs(found[0].setting["period_s"] - 1.37) < 1e-3
@@ -34,15 +36,17 @@ def test_unlogged_pulses_are_named(quiet: Track) -> None:
 
 
 @pytest.mark.slow
-def test_pulses_that_swell_and_fade_are_one_name() -> None:
-    """Folded by the working rate they look like what real recordings leave.
+def test_smooth_pulses_are_a_single_finding() -> None:
+    """Aliased by the working rate they look like the ordinary residual of real recordings.
 
-    Held for a box, they leave multiples of their rate.
+    Modelled as a box, they leave multiples of their rate.
     """
-    quiet = made(Trial(seed=5, samples=4500, rate_hz=RATE_HZ)).track
-    part = np.minimum(((quiet.time_s - 0.4) % 1.0661) / 0.12, 1.0)
+    undisturbed = made(Trial(seed=5, samples=4500, rate_hz=RATE_HZ)).track
+    part = np.minimum(((undisturbed.time_s - 0.4) % 1.0661) / 0.12, 1.0)
     swell = np.sin(np.pi * part)[:, None] ** 2
-    pulsed = replace(quiet, mag_b_gauss=quiet.mag_b_gauss + 1e-2 * swell * np.array([0.6, 0, 0.8]))
+    pulsed = replace(
+        undisturbed, mag_b_gauss=undisturbed.mag_b_gauss + 1e-2 * swell * np.array([0.6, 0, 0.8])
+    )
     found = diagnose(pulsed)
     assert [one.effect for one in found.findings] == ["sync_pulses"]
     assert abs(found.findings[0].setting["period_s"] - 1.0661) < 1e-3
@@ -50,8 +54,8 @@ def test_pulses_that_swell_and_fade_are_one_name() -> None:
 
 
 @pytest.mark.slow
-def test_an_alternating_field_needs_no_turns() -> None:
-    """A vehicle that hardly turns says little of a field, but a line is none of a gyro's doing."""
+def test_alternating_field_is_found_without_turns() -> None:
+    """Without turns little is known about the field, but no gyro error makes a line."""
     still = _rocking(np.random.default_rng(5))
     assert field_hardly_turns(fit_null(still))
     wave = np.cos(2 * np.pi * 18.46 * still.time_s)[:, None] * np.array([3e-4, -4e-4, 0.0])
@@ -61,12 +65,12 @@ def test_an_alternating_field_needs_no_turns() -> None:
 
 
 @pytest.mark.slow
-def test_where_hardly_anything_turns_no_line_is_named_of_none() -> None:
+def test_no_line_is_found_without_turns_when_there_is_none() -> None:
     assert diagnose(_rocking(np.random.default_rng(5))).findings == ()
 
 
 def _rocking(rng: np.random.Generator) -> Track:
-    """Three minutes of a vehicle that rocks by a degree or so and hardly turns."""
+    """Three minutes of a vehicle that rocks by about a degree and hardly turns."""
     time_s = np.arange(7200) / RATE_HZ
     angles = 0.02 * np.sin(time_s[:, None] * np.array([0.11, 0.17, 0.23]) + [0.0, 1.0, 2.0])
     R_nb = so3.exp(angles)

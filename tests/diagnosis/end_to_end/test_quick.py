@@ -1,4 +1,4 @@
-"""What is too quick for the working rate: lines, rotors, pulses."""
+"""Disturbances above the working rate: lines, rotors and pulses."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ RATE_HZ = 40.0
 
 
 @pytest.fixture(scope="module")
-def quiet() -> Track:
+def undisturbed() -> Track:
     return made(Trial(seed=5, samples=7000, rate_hz=RATE_HZ)).track
 
 
-def test_this_recording_is_averaged(quiet: Track) -> None:
-    assert working_factor(quiet, cold_start(quiet, Spec())) in (3, 4, 5)
+def test_recording_of_these_tests_is_averaged(undisturbed: Track) -> None:
+    assert working_factor(undisturbed, cold_start(undisturbed, Spec())) in (3, 4, 5)
 
 
-def test_a_train_of_pulses_is_found_with_period_phase_and_width() -> None:
+def test_pulse_train_is_found_with_period_phase_and_width() -> None:
     rng = np.random.default_rng(1)
     time_s = 1e6 + np.arange(8000) / RATE_HZ
     truth = {"start_s": 1e6, "period_s": 1.7313, "phase_s": 0.62, "width_s": 0.07}
@@ -40,8 +40,8 @@ def test_a_train_of_pulses_is_found_with_period_phase_and_width() -> None:
     assert found["searched"] > 1000
 
 
-def test_strong_pulses_leave_no_edge_of_theirs_behind() -> None:
-    """A period that is off by half a ten-thousandth misses a sample at either end of 300 s."""
+def test_edges_of_strong_pulses_are_modelled_exactly() -> None:
+    """A relative error of the period of 5e-5 would miss a sample at each end of 300 s."""
     rng = np.random.default_rng(2)
     time_s = np.arange(15_000) / 50.0
     truth = {"start_s": 0.0, "period_s": 1.40335, "phase_s": 1.241, "width_s": 0.06}
@@ -52,8 +52,8 @@ def test_strong_pulses_leave_no_edge_of_theirs_behind() -> None:
 
 
 @pytest.mark.parametrize("seed", [3, 4])
-def test_a_pulse_lasts_a_sample_at_least_and_its_search_is_paid(seed: int) -> None:
-    """Narrower ones would hit nothing but the outliers of a heavy tail."""
+def test_pulse_lasts_at_least_one_sample_and_its_search_is_penalised(seed: int) -> None:
+    """Narrower pulses would only fit the outliers of a heavy tail."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(8000) / RATE_HZ
     (found,) = find_pulse_trains(1e-3 * rng.standard_t(3, (8000, 3)), time_s, 1 / RATE_HZ)
@@ -61,15 +61,15 @@ def test_a_pulse_lasts_a_sample_at_least_and_its_search_is_paid(seed: int) -> No
     assert found["searched"] > 1000 * found["period_s"] * RATE_HZ * 16
 
 
-def test_a_short_recording_holds_no_train() -> None:
+def test_no_pulse_train_in_a_short_recording() -> None:
     assert find_pulse_trains(np.zeros((200, 3)), np.arange(200) / RATE_HZ, 1 / RATE_HZ) == ()
 
 
 @pytest.mark.slow
-def test_a_line_above_the_working_rate_is_named_at_its_frequency(quiet: Track) -> None:
-    phase = 2 * np.pi * 13.217 * quiet.time_s[:, None]
+def test_line_above_the_working_rate_is_found_at_its_frequency(undisturbed: Track) -> None:
+    phase = 2 * np.pi * 13.217 * undisturbed.time_s[:, None]
     added = 0.8e-3 * np.cos(phase) * np.array([0.48, 0.6, -0.64])
-    answer = diagnose(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + added))
+    answer = diagnose(replace(undisturbed, mag_b_gauss=undisturbed.mag_b_gauss + added))
     assert [one.effect for one in answer.findings] == ["ac_interference"]
     assert abs(answer.findings[0].setting["frequency_hz"] - 13.217) < 1e-3
     size = np.linalg.norm([one.value for one in answer.findings[0].parameters])
@@ -79,13 +79,15 @@ def test_a_line_above_the_working_rate_is_named_at_its_frequency(quiet: Track) -
     assert check.inside_after
 
 
-def test_a_rotor_is_found_though_its_tachometer_is_rounded(quiet: Track) -> None:
+def test_rotor_is_found_with_a_rounded_tachometer(undisturbed: Track) -> None:
     turns_hz = 31.2718
-    rpm = np.full(len(quiet), round(60 * turns_hz, 0))
-    phase = 2 * np.pi * turns_hz * quiet.time_s[:, None]
+    rpm = np.full(len(undisturbed), round(60 * turns_hz, 0))
+    phase = 2 * np.pi * turns_hz * undisturbed.time_s[:, None]
     field = np.cos(phase) * np.array([1.0, 0, 0]) + np.sin(phase) * np.array([0, 0.8, 0.6])
     turning = replace(
-        quiet, mag_b_gauss=quiet.mag_b_gauss + 1e-3 * field, covariates={"pump_rpm": rpm}
+        undisturbed,
+        mag_b_gauss=undisturbed.mag_b_gauss + 1e-3 * field,
+        covariates={"pump_rpm": rpm},
     )
     effect = EFFECTS["rotor_field"]
     context = fit_null(turning, walk=False).context()

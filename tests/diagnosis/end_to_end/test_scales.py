@@ -1,4 +1,4 @@
-"""Settings that are a size, sought between the values of their grid; ways that nobody logged."""
+"""Settings that are refined between the values of their grid, and unlogged paths."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.diagnose import diagnose
 from ahrsd.diagnosis.track import Track
 
-#: what is known wrong of a compensation that updates in steps
+#: known failure for a compensation that updates in steps
 _STEPS_LEFT = "its part is 2.8 deviations off: its steps leave something unknown"
 
 
@@ -24,7 +24,7 @@ def _quiet(seed: int) -> tuple[Track, Readings]:
 
 
 @pytest.mark.slow
-def test_a_compensation_on_board_is_named_once_with_its_part() -> None:
+def test_onboard_compensation_is_a_single_finding_with_its_share() -> None:
     track, readings = _quiet(3)
     effect = EFFECTS["onboard_calibration_active"]
     setting = {"onset_s": float(track.time_s[0]), "time_constant_s": 105.0}
@@ -44,8 +44,10 @@ def test_a_compensation_on_board_is_named_once_with_its_part() -> None:
 @pytest.mark.parametrize(
     "seed", [3, pytest.param(6, marks=pytest.mark.xfail(strict=True, reason=_STEPS_LEFT))]
 )
-def test_what_creeps_in_steps_is_known_to_what_its_onset_leaves_open(seed: int) -> None:
-    """A device that updates every eight seconds; of a smooth curve the part is known too well."""
+def test_deviation_of_a_stepwise_compensation_includes_its_unknown_onset(seed: int) -> None:
+    """The device updates every eight seconds. A smooth curve would give too small a deviation of
+    the share.
+    """
     track, readings = _quiet(seed)
     effect = EFFECTS["onboard_calibration_active"]
     first = float(track.time_s[0])
@@ -58,11 +60,11 @@ def test_what_creeps_in_steps_is_known_to_what_its_onset_leaves_open(seed: int) 
     assert [one.effect for one in answer.findings] == ["onboard_calibration_active"]
     part = answer.findings[0].parameters[0]
     assert abs(part.value - 0.08) < 2.5 * part.std
-    assert 4e-4 < part.std < 6e-3  # of an onset that is known, 2.5e-4
+    assert 4e-4 < part.std < 6e-3  # 2.5e-4 if the onset were known
 
 
 @pytest.mark.slow
-def test_a_slow_pulsation_of_the_outside_field_is_one_name_where_positions_are_logged() -> None:
+def test_slow_geomagnetic_pulsation_is_a_single_finding_when_positions_are_logged() -> None:
     pulsed, setting = _pulsed()
     logged = made(Trial(seed=5, samples=7000)).track.covariates
     placed = {name: values for name, values in logged.items() if name.startswith("position")}
@@ -85,7 +87,7 @@ def _pulsed() -> tuple[Track, Setting]:
 
 
 @pytest.mark.slow
-def test_a_field_that_falls_off_by_e_in_metres_of_height_is_one_name() -> None:
+def test_field_that_decays_exponentially_with_height_is_a_single_finding() -> None:
     track, readings = _quiet(6)
     passed = (track.time_s - track.time_s[0]) / np.ptp(track.time_s)
     height = 7.0 + 5.0 * np.sin(2 * np.pi * 2.3 * passed + 1.0) * np.cos(2 * np.pi * 0.7 * passed)
@@ -100,7 +102,7 @@ def test_a_field_that_falls_off_by_e_in_metres_of_height_is_one_name() -> None:
 
 
 @pytest.mark.slow
-def test_a_start_up_between_the_grids_time_constants() -> None:
+def test_gyro_startup_with_a_time_constant_between_grid_values_is_found() -> None:
     track, readings = _quiet(4)
     effect = EFFECTS["gyro_startup"]
     setting = {"start_s": float(track.time_s[0]), "time_constant_s": 35.0}
@@ -117,8 +119,8 @@ def test_a_start_up_between_the_grids_time_constants() -> None:
 
 
 @pytest.mark.slow
-def test_a_way_through_a_gradient_is_unknown_where_no_position_is_logged() -> None:
-    """Most of it is a wave of some length, and the rest may look like bumps."""
+def test_path_through_a_gradient_is_unknown_when_no_position_is_logged() -> None:
+    """Most of it is a wave of some length, and the remaining part may look like bumps."""
     track, readings = _quiet(5)
     logged = made(Trial(seed=5, samples=7000)).track.covariates
     north, east = logged["position_north_m"], logged["position_east_m"]
@@ -131,8 +133,10 @@ def test_a_way_through_a_gradient_is_unknown_where_no_position_is_logged() -> No
 
 
 @pytest.mark.slow
-def test_a_slow_pulsation_is_told_by_its_form_where_no_position_is_logged() -> None:
-    """A way through a gradient is hardly half a wave to the digit: above, it is unknown."""
+def test_slow_geomagnetic_pulsation_is_found_by_its_form_without_positions() -> None:
+    """A path through a gradient is rarely an exact half wave; the test above has one, which is
+    unknown.
+    """
     pulsed, setting = _pulsed()
     (drift,) = diagnose(pulsed).findings
     assert drift.effect == "geomagnetic_drift"

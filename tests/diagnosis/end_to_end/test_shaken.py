@@ -1,4 +1,4 @@
-"""Where the motion itself shakes."""
+"""Recordings whose motion itself shakes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ahrsd.diagnosis.track import Spec
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
-def test_the_noise_is_found_below_what_differences_say(seed: int) -> None:
+def test_noise_is_found_below_the_level_of_differences_when_shaken(seed: int) -> None:
     track = shaking(seed)
     assert is_shaken(track)
     problem, start = build_problem(track, Spec())
@@ -28,7 +28,7 @@ def test_the_noise_is_found_below_what_differences_say(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_bias_that_jumps_is_seen_through_the_shaking() -> None:
+def test_bias_step_is_found_when_shaken() -> None:
     track = shaking(3)
     gyro = track.gyro_b_rad_s.copy()
     gyro[6000:, 1] += 4e-4

@@ -1,4 +1,6 @@
-"""Noise that forgets within seconds: alone no unknown, and sources and names beside it."""
+"""Noise with a correlation time of seconds: no unknown by itself, and other causes are found in
+it.
+"""
 
 from __future__ import annotations
 
@@ -14,30 +16,30 @@ from ahrsd.diagnosis.track import Track
 
 
 def slow(rng: np.random.Generator, count: int, rate_hz: float, time_s: float) -> np.ndarray:
-    """First-order noise (count, 3) of unit deviation."""
+    """First-order noise (count, 3) with unit standard deviation."""
     keep = np.exp(-1.0 / (rate_hz * time_s))
     white = rng.standard_normal((count, 3)) * np.sqrt(1 - keep**2)
     return np.asarray(lfilter([1.0], [1.0, -keep], white, axis=0))
 
 
 @pytest.fixture(scope="module")
-def quiet() -> Track:
+def undisturbed() -> Track:
     return replace(made(Trial(seed=8)).track, covariates={})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3])
-def test_noise_that_forgets_in_two_seconds_is_no_unknown(seed: int) -> None:
-    quiet = replace(made(Trial(seed=8, samples=6000)).track, covariates={})
-    noise = 5e-4 * slow(np.random.default_rng(seed), len(quiet), 25.0, 2.0)
-    answer = diagnose(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + noise))
+def test_noise_with_a_correlation_time_of_two_seconds_is_no_unknown(seed: int) -> None:
+    undisturbed = replace(made(Trial(seed=8, samples=6000)).track, covariates={})
+    noise = 5e-4 * slow(np.random.default_rng(seed), len(undisturbed), 25.0, 2.0)
+    answer = diagnose(replace(undisturbed, mag_b_gauss=undisturbed.mag_b_gauss + noise))
     assert answer.findings == ()
     assert not answer.unexplained.detected
 
 
 @pytest.mark.slow
-def test_a_name_holds_beside_slow_noise_that_seen_as_white_would_be_a_rest() -> None:
-    """Seen as white, what such noise leaves is a rest that no name of this size stands out of."""
+def test_gyro_scale_is_found_in_slow_noise() -> None:
+    """Modelled as white, such noise would leave a residual that hides an effect of this size."""
     one = made(Trial(12, (("gyro_scale", 1.0),), samples=10_000, rate_hz=40.0, noise="red"))
     answer = diagnose(one.track)
     assert [found.effect for found in answer.findings] == ["gyro_scale"]
@@ -48,11 +50,11 @@ def test_a_name_holds_beside_slow_noise_that_seen_as_white_would_be_a_rest() -> 
 
 
 @pytest.mark.slow
-def test_a_source_is_told_beside_slow_noise(quiet: Track) -> None:
-    noise = 5e-4 * slow(np.random.default_rng(1), len(quiet), 25.0, 2.0)
-    on = (quiet.time_s % 97.0) < 41.0
+def test_unknown_source_is_found_in_slow_noise(undisturbed: Track) -> None:
+    noise = 5e-4 * slow(np.random.default_rng(1), len(undisturbed), 25.0, 2.0)
+    on = (undisturbed.time_s % 97.0) < 41.0
     field = on[:, None] * np.array([1.5e-3, 1e-3, -1.5e-3])
-    answer = diagnose(replace(quiet, mag_b_gauss=quiet.mag_b_gauss + noise + field))
+    answer = diagnose(replace(undisturbed, mag_b_gauss=undisturbed.mag_b_gauss + noise + field))
     assert answer.findings == ()
     where = answer.unexplained.where
     assert where is not None

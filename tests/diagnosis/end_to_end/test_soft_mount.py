@@ -1,4 +1,4 @@
-"""A mount that bends beside a noisy accelerometer."""
+"""A flexible mount with a noisy accelerometer."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
 @pytest.mark.slow
-def test_a_mount_that_bends_is_as_soft_as_it_is_beside_a_noisy_accelerometer() -> None:
-    """From the readings as they are it is not told at all."""
+def test_compliance_of_a_mount_is_unbiased_with_a_noisy_accelerometer() -> None:
+    """From the unsmoothed force the effect is not found at all."""
     one = made(Trial(7, (("flexible_mount", 2.0),), samples=9000, sigma_gyro=2e-3))
     rng = np.random.default_rng(3)
     noisy = one.track.accel_b_m_s2 + 0.5 * rng.standard_normal((9000, 3))

@@ -1,4 +1,4 @@
-"""`ahrsd diagnose` of a step of the hard iron: named, in the contract's form, with a report."""
+"""`ahrsd diagnose` on a step of the hard iron: the finding, its JSON form and the report."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def recording(tmp_path_factory):
 
 
 class Reported(NamedTuple):
-    """What `ahrsd diagnose --report FOLDER` says and writes."""
+    """Output and files of `ahrsd diagnose --report FOLDER`."""
 
     code: int | str | None
     words: str
@@ -56,7 +56,7 @@ def reported(recording, tmp_path_factory):
     return Reported(ended.value.code, said.getvalue(), folder)
 
 
-def test_the_step_is_named(reported):
+def test_step_is_found_with_its_onset_and_size(reported):
     assert reported.code == 0
     body = reported.body
     assert body["schema"] == "ahrsd.diagnosis/1"
@@ -68,7 +68,7 @@ def test_the_step_is_named(reported):
     assert "hard_iron_step" in reported.words
 
 
-def test_a_report_has_all_that_is_told_of_it(reported):
+def test_report_has_figures_model_and_checks(reported):
     page = (reported.folder / "report.html").read_text()
     assert page.count("<figure") + page.count("<svg") > 4
     assert (reported.folder / "diagnosis.rrd").stat().st_size > 100_000
@@ -86,7 +86,7 @@ def test_a_report_has_all_that_is_told_of_it(reported):
 
 
 @pytest.mark.slow
-def test_what_the_simulation_has_as_well_is_no_difference(run, recording, capsys):
+def test_effect_that_the_simulation_contains_is_no_mismatch(run, recording, capsys):
     words = ["diagnose", str(recording), "--simulation", str(recording)]
     assert run(*words) == 0
     told = capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""A vehicle that turned before something happened, and hardly turns afterwards."""
+"""A vehicle that turned before an event and hardly turns afterwards."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ahrsd.diagnosis.track import Track
 
 
 def _straight(seed: int, straight_s: float, swings_deg: float) -> Track:
-    """Turning in any attitude, from `straight_s` on swinging slowly about its own z by so much."""
+    """Turns in any attitude; from `straight_s` on, slow swings by `swings_deg` about its own z."""
     made = experiment("wam", seed=seed, samples=3000, sigma_mag=1e-3)
     track, truth, rng = track_of(made), made.truth, np.random.default_rng(seed)
     first = int(np.searchsorted(track.time_s, straight_s))
@@ -32,8 +32,10 @@ def _straight(seed: int, straight_s: float, swings_deg: float) -> Track:
 
 
 @pytest.mark.slow
-def test_a_magnet_that_a_hand_brings_on_a_straight_course_is_one_of_the_iron() -> None:
-    """Step for step without its way the field's was likelier; beside their ways it is not."""
+def test_magnet_brought_by_hand_on_a_straight_course_is_a_hard_iron_step() -> None:
+    """As plain steps a field step was more probable; with the forms of the hand's motion it is
+    not.
+    """
     track, step = _straight(2, 52.0, 2.0), np.array([-0.026, 0.129, 0.054])
     there = np.clip((track.time_s - 60.0) / 2.0, 0.0, 1.0)
     there = there**2 * (3.0 - 2.0 * there)

@@ -1,4 +1,4 @@
-"""A field that goes by the heading, or by the tilt, is unknown and on the vehicle."""
+"""A field that depends on the heading or the tilt is unknown and fixed to the vehicle."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ahrsd.simulation import simulate
 
 
 def turret(gauss: float) -> Track:
-    """Four waves in a turn, each axis of the turret's own."""
+    """Four waves per turn, with another phase on each axis."""
     trial = made(Trial(4))
     R_nb = simulate(trial.settings).R_nb
     phase = 4 * np.arctan2(R_nb[:, 1, 0], R_nb[:, 0, 0])[:, None]
@@ -26,8 +26,8 @@ def turret(gauss: float) -> Track:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("library", [{}, EFFECTS])
-def test_a_weak_turret_is_unknown_and_on_the_vehicle(library) -> None:
-    """Of 60 uG, 29 nats: courses in time and forms of the library's own see nothing."""
+def test_weak_field_by_heading_is_unknown_and_on_the_vehicle(library) -> None:
+    """60 uG, 29 nats: free processes in time and the effects of the library do not describe it."""
     found = diagnose(turret(6e-5), library=library)
     assert found.findings == ()
     assert found.unexplained.detected
@@ -35,14 +35,14 @@ def test_a_weak_turret_is_unknown_and_on_the_vehicle(library) -> None:
 
 
 @pytest.mark.slow
-def test_what_does_not_turn_with_the_heading_is_no_turret() -> None:
+def test_no_field_by_heading_is_found_when_there_is_none() -> None:
     assert not diagnose(turret(0.0), library={}).unexplained.detected
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 7])
-def test_a_magnet_that_a_gimbal_keeps_level_is_no_error_of_the_sensor(seed: int) -> None:
-    """Of 2 mG; names that go by the field's direction in the sensor explain most of it."""
+def test_magnet_kept_level_by_a_gimbal_is_not_a_sensor_error(seed: int) -> None:
+    """2 mG. Effects that depend on the field's direction in the sensor explain most of it."""
     trial = made(Trial(seed))
     down = simulate(trial.settings).R_nb[:, 2]
     pitch, roll = -np.arcsin(down[:, 0]), np.arctan2(down[:, 1], down[:, 2])

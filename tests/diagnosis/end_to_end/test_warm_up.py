@@ -1,4 +1,4 @@
-"""A hard iron that settles: one course, one name."""
+"""A hard iron that settles is a single finding."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
 @pytest.mark.slow
-def test_a_warm_up_that_nobody_logged_is_one_drift() -> None:
+def test_unlogged_warm_up_is_a_single_drift() -> None:
     quiet = replace(made(Trial(seed=8, samples=6000)).track, covariates={})
     passed_s = quiet.time_s - quiet.time_s[0]
     part = -np.expm1(-passed_s / 90.0) / -np.expm1(-passed_s[-1] / 90.0)

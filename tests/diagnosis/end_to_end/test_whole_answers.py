@@ -1,4 +1,6 @@
-"""Whole diagnoses of small simulated recordings: names, silence, the unknown, what stops."""
+"""Whole diagnoses of short simulated recordings: findings, agreement, unknown causes, and facts
+that stop.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +20,9 @@ def answer(*effects, seed=3, samples=SAMPLES, **more):
     return diagnose(one.track), one
 
 
-@pytest.mark.slow  # a shorter one: test_quiet
+@pytest.mark.slow  # a shorter one: test_undisturbed
 @pytest.mark.parametrize("noise", ["white", "red"])
-def test_nothing_is_said_where_nothing_is_wrong(noise):
+def test_undisturbed_recording_has_no_findings(noise):
     found, _ = answer(noise=noise)
     assert not found.mismatch
     assert found.findings == ()
@@ -30,7 +32,7 @@ def test_nothing_is_said_where_nothing_is_wrong(noise):
 
 
 @pytest.mark.slow
-def test_a_lag_is_named_with_its_size_and_told_apart_from_a_low_pass():
+def test_delay_is_found_with_its_size_and_not_as_a_low_pass():
     found, _ = answer(("mag_time_lag", 0.7))  # 20 ms would be half a sample
     assert [one.effect for one in found.findings] == ["mag_time_lag"]
     value = found.findings[0].parameters[0]
@@ -40,14 +42,14 @@ def test_a_lag_is_named_with_its_size_and_told_apart_from_a_low_pass():
 
 
 @pytest.mark.slow
-def test_a_slow_low_pass_is_one_name_and_leaves_nothing_for_others():
+def test_slow_low_pass_is_a_single_finding():
     found, _ = answer(("mag_low_pass", 3.0))
     assert [one.effect for one in found.findings] == ["mag_low_pass"]
     assert found.findings[0].parameters[0].value == pytest.approx(0.09, abs=1e-3)
 
 
 @pytest.mark.slow
-def test_two_effects_are_both_named_and_nothing_else():
+def test_two_effects_are_both_found_and_nothing_else():
     found, one = answer(("hard_iron_step", 1.0), ("gyro_scale", 1.0), samples=5000)
     assert sorted(x.effect for x in found.findings) == ["gyro_scale", "hard_iron_step"]
     step = next(x for x in found.findings if x.effect == "hard_iron_step")
@@ -58,7 +60,7 @@ def test_two_effects_are_both_named_and_nothing_else():
 
 
 @pytest.mark.slow
-def test_the_current_is_named_if_logged_and_unknown_if_not():
+def test_current_is_found_if_logged_and_unknown_if_not():
     seen, one = answer(("motor_current_field", 0.5))
     assert [x.effect for x in seen.findings] == ["motor_current_field"]
     np.testing.assert_allclose(
@@ -73,14 +75,14 @@ def test_the_current_is_named_if_logged_and_unknown_if_not():
     assert abs(direction @ k) > 0.9
 
 
-def test_swapped_axes_stop_everything_else():
+def test_swapped_axes_end_the_diagnosis():
     found, _ = answer(("frame_error", 1.0))
     assert [x.effect for x in found.findings] == ["frame_error"]
     assert found.baseline is None
 
 
 @pytest.mark.slow
-def test_the_answer_is_the_contracts_object_and_the_same_every_time():
+def test_answer_has_the_documented_json_form_and_is_deterministic():
     found, one = answer(("mag_time_lag", 1.0))
     body = found.to_json()
     assert body == diagnose(one.track).to_json()

@@ -1,4 +1,6 @@
-"""A strong current, noise in its log, and a gyro that tells rates at instants, all averaged."""
+"""A strong current with noise in its column, and a gyro with instantaneous rates, in averaged
+rows.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ FIELD_PER_A = np.array([7.5e-3, -3.75e-3, 7.5e-3])
 
 
 def _motor(track: Track) -> Array:
-    """(N,) A: 5 A on the average, whose field is forty times the magnetometer's noise."""
+    """(N,) A: a mean of 5 A, whose field is forty times the magnetometer's noise."""
     rng = np.random.default_rng(3)
     slow = gaussian_filter1d(rng.normal(size=len(track)), 1.0 / track.step_s)
     return np.maximum(5.0 + 3.5 * slow / np.std(slow), 0.0)
@@ -25,7 +27,7 @@ def _motor(track: Track) -> Array:
 
 @pytest.fixture(scope="module")
 def driven() -> Track:
-    """20 Hz, averaged by two: what a cold start takes for the hard iron is 40 mG off."""
+    """20 Hz, averaged in pairs: the hard iron of a cold start is wrong by 40 mG."""
     track = track_of(experiment("wam", seed=4, samples=4800, rate_hz=20.0))
     rate = track.gyro_b_rad_s
     at_instants = np.vstack([(rate[:-1] + rate[1:]) / 2, rate[-1:]])
@@ -36,7 +38,7 @@ def driven() -> Track:
 
 
 @pytest.mark.slow
-def test_nothing_is_named_beside_the_current_but_half_a_step(driven: Track) -> None:
+def test_current_and_half_a_step_of_delay_are_the_only_findings(driven: Track) -> None:
     found = diagnose(driven)
     names = {one.effect: one for one in found.findings}
     assert names.keys() in ({"motor_current_field", "gyro_integration"},

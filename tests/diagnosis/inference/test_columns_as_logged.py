@@ -1,4 +1,4 @@
-"""Columns that a logger held, or added noise to: read as they were written, in one search."""
+"""Columns that a logger held or added noise to are reconstructed before the search."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def held(values, rows):
 
 
 def notes_at_the_richest_model(track):
-    """What is said of the columns before anything is searched."""
+    """Notes about the columns before anything is searched."""
     problem, fit = build_and_fit_null(track, Spec())
     return richest_model.fit_richest_model(
         problem, fit.filtered, EFFECTS
@@ -32,14 +32,14 @@ def notes_at_the_richest_model(track):
 
 @pytest.fixture(scope="module")
 def driven():
-    """160 s beside a motor, its current in every row."""
+    """160 s next to a motor, with its current in every row."""
     return made(
         Trial(seed=11, effects=(("motor_current_field", 1.0),), samples=4_000, rate_hz=RATE_HZ)
     )
 
 
 @pytest.mark.slow
-def test_a_quick_current_that_was_held_is_drawn_straight_where_the_field_follows_it():
+def test_held_current_is_interpolated_if_the_field_follows_it():
     track = track_of(experiment("wam", motion="rov", seed=4, samples=3000, rate_hz=RATE_HZ))
     course = gaussian_filter1d(np.random.default_rng(5).normal(size=3000), 8.0)
     current = 6.0 + 2.0 * course / course.std()
@@ -50,15 +50,15 @@ def test_a_quick_current_that_was_held_is_drawn_straight_where_the_field_follows
 
 
 @pytest.mark.slow
-def test_a_current_that_was_logged_in_every_row_stays_as_it_is(driven):
+def test_current_logged_in_every_row_is_unchanged(driven):
     current = driven.track.covariates["motor_current_a"]
     track = driven.track.with_columns({"motor_current_a": current})
     assert not any("motor_current_a" in said for said in notes_at_the_richest_model(track))
 
 
 @pytest.mark.slow
-def test_a_column_that_the_field_does_not_follow_stays_as_it_was_held(driven):
-    """A speed of another trip, and the readings without the motor's field."""
+def test_held_column_is_unchanged_if_the_field_does_not_follow_it(driven):
+    """The speed of another trip."""
     speed = 1.2 + 0.25 * gaussian_filter1d(np.random.default_rng(3).normal(size=4_000), 40.0)
     track = driven.track.with_columns({"speed_m_s": held(speed, 5)})
     assert not any("speed_m_s" in said for said in notes_at_the_richest_model(track))

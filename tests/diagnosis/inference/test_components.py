@@ -1,4 +1,4 @@
-"""Laws of coefficients, functions of the remainder, and the noise's weights."""
+"""Laws of coefficients, functions of the remainder, and the noise weights."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ahrsd.estimator.locked import harmonics, rate_products
 
 
 @pytest.mark.parametrize("psi", [np.array([0.3, 0.5]), np.array([-1.0, 3.0])])
-def test_a_course_has_the_size_that_its_law_says(psi):
+def test_gaussian_process_has_the_standard_deviation_of_its_law(psi):
     law = GaussianProcessLaw(np.repeat(np.arange(1.0, 41.0), 3), 1e-3)
     variance = np.exp(law.log_variance(psi))
     t = np.linspace(0.0, 1.0, 4001)
@@ -27,7 +27,7 @@ def test_a_course_has_the_size_that_its_law_says(psi):
     assert np.sqrt(over_time) == pytest.approx(1e-3 * np.exp(psi[0]), rel=1e-3)
 
 
-def test_slopes_are_those_of_differences():
+def test_slopes_of_the_process_law_agree_with_finite_differences():
     law = GaussianProcessLaw(np.repeat(np.arange(1.0, 21.0), 3), 1e-3, mean=0.5, spread=1.2)
     psi = np.array([0.2, 1.1])
     for k in range(2):
@@ -38,7 +38,7 @@ def test_slopes_are_those_of_differences():
         assert law.log_prior(psi)[1][k] == pytest.approx(density, abs=1e-6)
 
 
-def test_an_ordinary_size_is_a_lognormal_density():
+def test_prior_of_an_ordinary_size_is_log_normal():
     law = ScaledLaw(np.ones(2), np.array([-20.0]), np.array([20.0]), mean=-1.0, spread=0.7)
     grid = np.linspace(-10.0, 10.0, 4001)
     density = np.exp([law.log_prior(np.array([x]))[0] for x in grid])
@@ -46,7 +46,7 @@ def test_an_ordinary_size_is_a_lognormal_density():
     assert law.log_variance(np.array([-1.0]))[0] == pytest.approx(-2.0)
 
 
-def test_harmonics_are_orthonormal_and_no_calibration():
+def test_harmonics_are_orthonormal_and_orthogonal_to_the_calibration():
     rng = np.random.default_rng(1)
     n = rng.normal(size=(200_000, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
@@ -55,11 +55,11 @@ def test_harmonics_are_orthonormal_and_no_calibration():
     np.testing.assert_allclose(H.T @ np.column_stack([np.ones(len(n)), n]) / len(n), 0.0, atol=0.02)
 
 
-def test_squares_of_the_rates():
+def test_rate_products_of_one_row():
     np.testing.assert_allclose(rate_products(np.array([[2.0, 3.0, 5.0]])), [[4, 9, 25, 6, 15, 10]])
 
 
-def test_octaves_cover_all_cosines():
+def test_octaves_cover_all_cosine_frequencies():
     edges = noise_model.octave_edges(6000)
     assert edges[0] == 0
     assert edges[-1] == 6000
@@ -67,7 +67,7 @@ def test_octaves_cover_all_cosines():
     assert np.all(edges[2:-1] * 2 <= edges[3:] + 1)
 
 
-def test_the_noise_prior_has_the_slope_of_its_differences():
+def test_gradient_of_the_noise_prior_agrees_with_finite_differences():
     x = np.array([0.3, -0.2, 0.9, 0.1])
     _, gradient = noise_model.log_prior(x, 0.6)
     for k in range(4):
@@ -78,20 +78,20 @@ def test_the_noise_prior_has_the_slope_of_its_differences():
         assert gradient[k] == pytest.approx(slope, abs=1e-6)
 
 
-def test_a_wild_reading_counts_less_and_rows_that_are_normal_count_alike():
+def test_outliers_have_low_weight_and_normal_rows_equal_weights():
     rng = np.random.default_rng(2)
     residual = rng.normal(size=(2000, 3))
     used = np.ones(2000, dtype=bool)
     calm = noise_model.fit_noise_levels(residual, used, 10.0)
-    assert np.ptp(np.log(calm.amplitude)) < 0.9  # the level alone, a median of forty
+    assert np.ptp(np.log(calm.amplitude)) < 0.9  # due to the level only, a median of forty rows
     residual[500:2000:50] = 30.0
     weight = noise_model.fit_noise_levels(residual, used, 10.0).amplitude
     assert np.all(weight[500:2000:50] > 5.0)
     assert np.median(weight) == pytest.approx(1.0, abs=0.15)
 
 
-def test_rows_of_students_law_are_as_likely_as_that_law_says():
-    """The tangent at the residual of which they were made, in its density's own units."""
+def test_log_likelihood_of_weighted_rows_equals_that_of_the_student_distribution():
+    """The tangent at the residual from which the weights were made, in units of its density."""
     rng = np.random.default_rng(5)
     scale = np.sqrt(rng.chisquare(3.0, size=4000) / 3.0)
     residual = rng.normal(size=(4000, 3)) / scale[:, None]
@@ -100,11 +100,11 @@ def test_rows_of_students_law_are_as_likely_as_that_law_says():
     nats = loud.tails - 0.5 * np.sum(rows**2) - 3.0 * np.sum(np.log(loud.amplitude))
     nats -= 1.5 * len(rows) * np.log(2 * np.pi)
     law = multivariate_t(np.zeros(3), np.eye(3), df=3.0)
-    # a level of its own every few seconds costs some nats
+    # a separate level every few seconds costs some nats
     assert nats == pytest.approx(law.logpdf(residual).sum(), abs=150.0)
 
 
-def test_the_level_follows_noise_that_is_louder_for_long():
+def test_noise_level_follows_a_lasting_change_of_the_noise():
     rng = np.random.default_rng(3)
     residual = rng.normal(size=(4000, 3))
     residual[2500:] *= 4.0
@@ -112,7 +112,7 @@ def test_the_level_follows_noise_that_is_louder_for_long():
     assert np.median(weight[3000:]) / np.median(weight[:2000]) == pytest.approx(4.0, rel=0.15)
 
 
-def test_identifiers_of_effects_stand_in_the_library_alone():
+def test_no_module_of_the_inference_names_an_effect():
     sources = sorted(Path(next(iter(inference.__path__))).rglob("*.py"))
     texts = {
         (path.name, node.value)
@@ -124,7 +124,7 @@ def test_identifiers_of_effects_stand_in_the_library_alone():
     assert {(name, text) for name, text in texts if text in EFFECTS} == set()
 
 
-def test_what_the_model_must_know_of_an_effect_is_in_its_row():
+def test_library_marks_jumps_delays_and_ordinary_effects():
     jumps = {name: row.frame or row.family for name, row in EFFECTS.items() if row.jumps}
     assert jumps == {"hard_iron_step": "sensor", "field_step": "world", "gyro_bias_step": "gyro"}
     assert {name for name, row in EFFECTS.items() if row.recurs} - set(jumps) == {"soft_iron_step"}

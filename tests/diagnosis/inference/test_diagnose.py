@@ -1,4 +1,4 @@
-"""Whole diagnoses by one model: nothing on a null, a step at its time, a source that is hidden."""
+"""Whole diagnoses: nothing for a null, effects with time and size, and unknown sources."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from ahrsd.simulation import ScenarioSettings, simulate
 
 
 @pytest.mark.parametrize("scenario", ["wam", pytest.param("mam", marks=pytest.mark.slow)])
-def test_a_null_has_no_name_and_no_unknown(scenario):
+def test_null_recording_has_no_finding_and_no_unknown_cause(scenario):
     found = diagnose(track_of(experiment(scenario, seed=3, samples=4000)))
     assert found.findings == ()
     assert not found.unexplained.detected
     assert not found.mismatch
-    # how far from another answer: no name's odds reach what is asked whatever was assumed
+    # distance to another answer: no effect's odds reach the threshold under any assumed prior
     (near,) = (
         note for note in found.notes if note.startswith("the effect nearest to a finding is ")
     )
@@ -37,7 +37,7 @@ def test_a_null_has_no_name_and_no_unknown(scenario):
     assert all(check.inside_after for check in found.posterior_predictive.values())
 
 
-def test_a_step_of_the_hard_iron_is_dated_and_sized():
+def test_hard_iron_step_is_found_with_onset_and_size():
     track = track_of(experiment("wam", seed=4, samples=2000))
     step = np.array([8e-3, -5e-3, 3e-3])
     later = track.time_s[:, None] >= 35.0
@@ -50,14 +50,14 @@ def test_a_step_of_the_hard_iron_is_dated_and_sized():
     assert first == pytest.approx(35.0, abs=0.5)
     assert last == pytest.approx(track.time_s[-1], abs=0.2)
     np.testing.assert_allclose([p.value for p in one.parameters], step, atol=6e-4)
-    # without it the hard iron is the mean over the recording, of which it is on in 58 %
+    # without it the hard iron is the mean over the recording; the step is on in 58 % of it
     mean_gauss = np.linalg.norm(step) * np.mean(later)
     assert one.cost_if_left_out.hard_iron_shift_gauss == pytest.approx(mean_gauss, rel=0.3)
     assert one.cost_if_left_out.heading_error_deg > 0.3
     assert not found.unexplained.detected
 
 
-def test_a_current_that_nobody_logged_is_unknown_on_the_sensor():
+def test_unlogged_current_is_an_unknown_cause_on_the_sensor():
     track = track_of(experiment("wam", seed=5, samples=2000))
     t = track.time_s - track.time_s[0]
     level = sum(np.sin(2 * np.pi * t / period + k) for k, period in enumerate((23.0, 41.0, 71.0)))
@@ -75,7 +75,7 @@ def test_a_current_that_nobody_logged_is_unknown_on_the_sensor():
     assert abs(np.corrcoef(source, logged)[0, 1]) > 0.9
 
 
-_TOLD = """
+_SCRIPT = """
 import sys
 import numpy as np
 from ahrsd.diagnosis.effects.library import EFFECTS
@@ -89,8 +89,8 @@ print(diagnose(track, library=steps).to_json())
 """
 
 
-def test_the_answer_is_the_same_in_another_process(tmp_path):
-    """Names are strings, and where a set of them begins differs from process to process."""
+def test_answer_is_the_same_in_another_process(tmp_path):
+    """The order of a set of strings differs from process to process."""
     track = track_of(experiment("wam", seed=6, samples=900))
     later = track.time_s[:, None] >= 20.0
     mag = track.mag_b_gauss + later * np.array([8e-3, -5e-3, 3e-3])
@@ -98,7 +98,7 @@ def test_the_answer_is_the_same_in_another_process(tmp_path):
     np.savez(tmp_path / "track.npz", **parts, mag_b_gauss=mag)
     told = [
         subprocess.run(
-            [sys.executable, "-c", _TOLD, str(tmp_path / "track.npz")],
+            [sys.executable, "-c", _SCRIPT, str(tmp_path / "track.npz")],
             env={**os.environ, "PYTHONHASHSEED": seed},
             capture_output=True,
             check=True,
@@ -111,7 +111,7 @@ def test_the_answer_is_the_same_in_another_process(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_gyro_bias_that_walks_is_a_drift_whatever_its_course():
+def test_random_walk_of_the_gyro_bias_is_a_drift():
     track = track_of(experiment("wam", seed=7, samples=2000))
     walk = np.cumsum(np.random.default_rng(3).normal(size=(len(track), 3)), axis=0)
     walk *= 2e-3 / np.std(walk, axis=0)
@@ -129,7 +129,7 @@ def test_a_gyro_bias_that_walks_is_a_drift_whatever_its_course():
 
 
 @pytest.mark.slow
-def test_pulses_that_averaging_loses_are_named_at_the_recorded_rate():
+def test_pulses_lost_by_averaging_are_found_at_the_recorded_rate():
     track = track_of(experiment("wam", seed=9, samples=2000))
     since_s = track.time_s - track.time_s[0]
     hit = np.mod(since_s - 0.5, 2.0) < 0.06
@@ -142,7 +142,7 @@ def test_pulses_that_averaging_loses_are_named_at_the_recorded_rate():
 
 
 @pytest.mark.slow
-def test_the_bias_of_a_gyro_that_stands_is_told_without_the_field():
+def test_temperature_dependent_gyro_bias_is_found_at_rest():
     warmth = warming(2400)
     slope = np.array([5e-5, -2e-5, -1.5e-4])
     found = diagnose(standing(1e-3 + (warmth - 12.0)[:, None] * slope, warmth))
@@ -152,13 +152,13 @@ def test_the_bias_of_a_gyro_that_stands_is_told_without_the_field():
     assert any("hardly turned" in note for note in found.notes)
 
 
-def test_a_dead_sensor_is_refused_in_words():
+def test_dead_sensor_is_refused_with_a_reason():
     track = track_of(experiment("wam", seed=3, samples=2000))
     with pytest.raises(NothingToFit, match="stuck or was not logged"):
         diagnose(replace(track, gyro_b_rad_s=np.zeros_like(track.gyro_b_rad_s)))
 
 
-def test_a_recording_with_facts_that_stop_is_told_them_and_nothing_else():
+def test_facts_that_stop_the_diagnosis_are_the_only_findings():
     track = track_of(experiment("wam", seed=3, samples=2000))
     swapped = track.gyro_b_rad_s[:, [1, 0, 2]] * np.array([1.0, 1.0, 1.0])
     found = diagnose(replace(track, gyro_b_rad_s=swapped))
@@ -168,7 +168,7 @@ def test_a_recording_with_facts_that_stop_is_told_them_and_nothing_else():
 
 
 @pytest.mark.slow
-def test_half_a_step_of_delay_is_told_with_what_would_tell_it_from_a_lag():
+def test_half_a_step_of_delay_is_found_with_advice_to_separate_it_from_a_lag():
     size = {"samples": 1400, "rate_hz": 12.5}
     made_one = made(Trial(seed=31, effects=(("gyro_integration", 1.0),), **size))
     (one,) = diagnose(made_one.track).findings
@@ -186,7 +186,7 @@ def test_half_a_step_of_delay_is_told_with_what_would_tell_it_from_a_lag():
     ("name", "strength"),
     [("mag_low_pass", 3.0), ("gyro_time_lag", 2.0)],
 )
-def test_a_delay_of_any_kind_is_in_the_repaired_model_as_it_was(name, strength):
+def test_repaired_model_contains_the_delay_with_its_value(name, strength):
     one = made(Trial(seed=34, effects=((name, strength),), samples=2500, rate_hz=12.5))
     found = diagnose(one.track)
     (term,) = found.terms
@@ -196,7 +196,7 @@ def test_a_delay_of_any_kind_is_in_the_repaired_model_as_it_was(name, strength):
     kept = from_text(to_text(repaired_model_of(found)))
     clean = context_along(one.track, kept.calibration)
     mag, gyro = terms_contribution(clean, kept.terms)
-    # as large as the field turns in that time
+    # as large as the rotation of the field in that time
     if name == "mag_low_pass":
         late = np.linalg.norm(clean.field_dot_b, axis=1) * float(value[0])
         assert np.median(np.linalg.norm(mag, axis=1)) == pytest.approx(np.median(late), rel=0.2)
@@ -204,8 +204,8 @@ def test_a_delay_of_any_kind_is_in_the_repaired_model_as_it_was(name, strength):
         assert np.max(np.abs(gyro)) > 1e-3
 
 
-def test_a_current_that_comes_late_into_the_log_is_named_and_moved_to_its_time():
-    """Held against the field as it was logged it explains nothing."""
+def test_current_logged_with_a_delay_is_found_and_shifted():
+    """As logged it does not explain the field."""
     track = track_of(experiment("wam", seed=10, samples=3000))
     rng = np.random.default_rng(4)
     changes = np.sort(rng.uniform(track.time_s[0], track.time_s[-1], size=160))
@@ -224,10 +224,12 @@ def test_a_current_that_comes_late_into_the_log_is_named_and_moved_to_its_time()
 
 
 @pytest.mark.slow
-def test_the_way_of_a_hand_with_a_magnet_is_no_name_beside_its_step():
+def test_hand_motion_with_a_magnet_is_no_finding_besides_its_step():
     track = track_of(experiment("wam", seed=11, samples=4000))
     t = track.time_s - track.time_s[0]
-    near = 0.3 * np.exp(-0.5 * ((t - 65.5) / 0.5) ** 2)  # it passes the sensor, and is put on
+    near = 0.3 * np.exp(
+        -0.5 * ((t - 65.5) / 0.5) ** 2
+    )  # the magnet passes the sensor and is then put on
     put = near[:, None] * [0.5, 0.8, -0.3] + (t > 66.5)[:, None] * [0.04, -0.03, 0.02]
     found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + put))
     assert [one.effect for one in found.findings] == ["hard_iron_step"]
@@ -239,7 +241,7 @@ def test_the_way_of_a_hand_with_a_magnet_is_no_name_beside_its_step():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("varies", [0.0, 1.5])
-def test_a_name_whose_coefficient_varies_by_as_much_as_itself_is_not_told(varies):
+def test_effect_with_a_strongly_varying_coefficient_is_unknown(varies):
     track = made(Trial(seed=31, effects=(), samples=4000)).track
     amps, since_s = track.covariates["motor_current_a"], track.time_s - track.time_s[0]
     by = 1.0 + varies * np.cos(2 * np.pi * since_s / track.duration_s)
@@ -261,7 +263,7 @@ def test_a_name_whose_coefficient_varies_by_as_much_as_itself_is_not_told(varies
 
 
 @pytest.mark.slow
-def test_a_line_that_wanders_in_frequency_is_no_alternating_field_but_unknown():
+def test_line_of_wandering_frequency_is_unknown():
     track = track_of(experiment("wam", seed=9, samples=2000))
     since_s = track.time_s - track.time_s[0]
     turns = 8.0 * since_s + 1.5 * np.sin(2 * np.pi * since_s / 60.0)
@@ -273,8 +275,8 @@ def test_a_line_that_wanders_in_frequency_is_no_alternating_field_but_unknown():
 
 
 @pytest.mark.slow
-def test_eddy_currents_that_differ_by_axis_are_named_without_a_delay():
-    # the vehicle yaws: its field along one axis hardly changes, and a factor of that is none
+def test_anisotropic_eddy_currents_are_found_without_a_delay():
+    # the vehicle yaws: the field along one axis hardly changes, so its factor is not determined
     one = made(Trial(seed=54, effects=(("eddy_current", 1.0),), samples=2000, rate_hz=25.0))
     found = diagnose(one.track)
     assert [finding.effect for finding in found.findings] == ["eddy_current"]
@@ -285,7 +287,7 @@ def test_eddy_currents_that_differ_by_axis_are_named_without_a_delay():
 
 
 @pytest.mark.slow
-def test_a_delay_is_no_eddy_current():
+def test_delay_is_not_taken_for_eddy_currents():
     one = made(Trial(seed=44, effects=(("mag_time_lag", 3.0),), samples=3000, rate_hz=25.0))
     found = diagnose(one.track)
     assert [finding.effect for finding in found.findings] == ["mag_time_lag"]
@@ -293,11 +295,11 @@ def test_a_delay_is_no_eddy_current():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("aligned", [0.0, 1.0])
-def test_a_mount_that_was_aligned_under_its_load_is_no_crooked_gyro_as_well(aligned):
+@pytest.mark.parametrize("zeroed_at_rest", [0.0, 1.0])
+def test_flexible_mount_is_found_without_a_misalignment_when_aligned_under_load(zeroed_at_rest):
     run = simulate(ScenarioSettings("mam", "rov", 47, 6000, 25.0, 0.0, 0.0))
     track, rng = track_of(run), np.random.default_rng(47)
-    rest_g = aligned * track.accel_b_m_s2.mean(axis=0) / 9.80665
+    rest_g = zeroed_at_rest * track.accel_b_m_s2.mean(axis=0) / 9.80665
     bend = np.array([[0.004, 0.016, -0.006], [-0.018, 0.003, 0.008], [0.004, -0.006, 0.002]])
     load_g = track.accel_b_m_s2 / 9.80665 - rest_g
     turned = np.einsum("nij,nj->ni", so3.exp(load_g @ bend.T), run.field_b)
@@ -313,8 +315,8 @@ def test_a_mount_that_was_aligned_under_its_load_is_no_crooked_gyro_as_well(alig
 
 
 @pytest.mark.slow
-def test_a_scale_that_creeps_is_no_compensation_on_board():
-    """A compensation takes hard iron away: a part of it below a hundredth is another source."""
+def test_slow_scale_change_is_not_an_onboard_compensation():
+    """An on-board compensation removes hard iron: a share below 0.01 is another source."""
     track = track_of(experiment("wam", seed=12, samples=4000))
     since_s = track.time_s - track.time_s[0]
     warmer = 0.012 * (1.0 - np.exp(-since_s / 50.0))
@@ -328,7 +330,7 @@ def test_a_scale_that_creeps_is_no_compensation_on_board():
 
 
 @pytest.mark.slow
-def test_beside_a_large_unknown_of_one_sensor_a_small_name_of_the_other_is_not_told():
+def test_small_effect_of_one_sensor_is_not_reported_with_a_large_unknown_of_the_other():
     track = made(Trial(seed=71, effects=(("gyro_g_sensitivity", 1.0),), samples=3000)).track
     assert [one.effect for one in diagnose(track).findings] == ["gyro_g_sensitivity"]
     t = track.time_s - track.time_s[0]

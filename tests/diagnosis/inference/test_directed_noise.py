@@ -1,4 +1,4 @@
-"""Noise that is louder along one direction: a source, and no sensor's own noise of a colour."""
+"""Noise with a higher level along one direction is a source, not coloured sensor noise."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ def _field(rows: int) -> np.ndarray:
     return experiment("wam", seed=15, samples=rows).field_b
 
 
-def test_noise_of_any_colour_that_is_independent_by_axis_has_no_direction():
-    """Red, with axes of different levels: 12 draws, none near to what is asked of an unknown."""
+def test_noise_independent_between_axes_has_no_direction():
+    """Red noise with different levels of the axes: none of 12 draws comes near the threshold of
+    an unknown cause.
+    """
     rng, most, field_b = np.random.default_rng(3), -np.inf, _field(3000)
     for _ in range(12):
         left = rng.normal(size=(3000, 3)) + coloured(rng, (3000, 3), (0.0, 1.0))
@@ -33,7 +35,7 @@ def test_noise_of_any_colour_that_is_independent_by_axis_has_no_direction():
 
 
 @pytest.mark.parametrize("band_hz", [(0.3, 1.2), (2.0, 6.0)])
-def test_a_source_has_its_direction_its_octaves_and_its_power(band_hz: tuple[float, float]):
+def test_directed_source_is_found_with_direction_octaves_and_power(band_hz: tuple[float, float]):
     rng, level = np.random.default_rng(4), np.array([1.2, 1.0, 1 / 1.2])
     left = rng.normal(size=(6000, 3)) * level
     left += 0.5 * coloured(rng, (6000, 1), band_hz) * AXIS
@@ -49,8 +51,8 @@ def test_a_source_has_its_direction_its_octaves_and_its_power(band_hz: tuple[flo
     assert power[inside].sum() > 0.9 * power.sum()
 
 
-def test_the_power_is_the_same_where_the_residual_was_divided_by_all_that_is_in_it():
-    """As a noise of a colour takes the source for its own, where names that are surer stand."""
+def test_directed_power_is_recovered_from_a_fully_whitened_residual():
+    """Coloured noise absorbs the source when effects of higher odds are in the model."""
     rng, band_hz = np.random.default_rng(7), (2.0, 6.0)
     left = rng.normal(size=(6000, 3)) + 2.0 * coloured(rng, (6000, 1), band_hz) * AXIS
     whole = float(np.mean(left**2))
@@ -61,7 +63,7 @@ def test_the_power_is_the_same_where_the_residual_was_divided_by_all_that_is_in_
     assert power == pytest.approx(4.0, rel=0.1)
 
 
-def test_what_a_loud_gyro_leaves_across_the_field_is_no_source():
+def test_gyro_noise_across_the_field_is_no_source():
     rng, field_b = np.random.default_rng(5), _field(4000)
     field_b = np.broadcast_to(field_b[0], field_b.shape)  # a vehicle that does not turn
     unit = field_b / np.linalg.norm(field_b, axis=1, keepdims=True)
@@ -70,7 +72,7 @@ def test_what_a_loud_gyro_leaves_across_the_field_is_no_source():
     assert fit_directed_noise(left, field_b, RATE_HZ, 1.0).nats < priors.UNKNOWN_ODDS
 
 
-def test_whitened_rows_are_alike_on_all_axes_and_their_density_is_counted():
+def test_whitening_by_directed_noise_and_its_log_determinant():
     track = track_of(experiment("wam", seed=14, samples=2000, sigma_mag=5e-4))
     problem, start = build_and_fit_null(track, Spec())
     point = initial_point(problem, start.filtered, ())
@@ -99,8 +101,8 @@ def test_whitened_rows_are_alike_on_all_axes_and_their_density_is_counted():
     assert made.log_whitening - plain.log_whitening == pytest.approx(denser, rel=1e-6)
 
 
-def test_a_quick_current_that_nobody_logged_is_unknown_along_its_direction():
-    """Noise of a colour swallowed it, and nothing was told."""
+def test_fast_unlogged_current_is_unknown_along_its_direction():
+    """It was once absorbed by coloured noise, and nothing was reported."""
     track = track_of(experiment("wam", seed=14, samples=4000, sigma_mag=5e-4))
     rng = np.random.default_rng(8)
     added = 4e-4 * coloured(rng, (len(track), 1), (0.8, 2.5)) * AXIS
@@ -117,7 +119,7 @@ def test_a_quick_current_that_nobody_logged_is_unknown_along_its_direction():
 
 
 @pytest.mark.slow
-def test_a_source_that_is_louder_for_a_while_is_no_louder_noise():
+def test_temporarily_stronger_source_is_not_taken_for_noise():
     track = track_of(experiment("wam", seed=14, samples=4000, sigma_mag=5e-4))
     rng = np.random.default_rng(8)
     louder = np.where(track.time_s > 90.0, 2.0, 0.8)
@@ -129,9 +131,11 @@ def test_a_source_that_is_louder_for_a_while_is_no_louder_noise():
 
 
 @pytest.mark.slow
-def test_iron_on_a_joint_that_nobody_logged_is_unknown_on_the_sensor():
+def test_iron_on_an_unlogged_joint_is_unknown_on_the_sensor():
     track = track_of(experiment("wam", seed=14, samples=3500, sigma_mag=5e-4))
-    angle = coloured(np.random.default_rng(5), (len(track), 1), (0.1, 0.4))  # to and fro in seconds
+    angle = coloured(
+        np.random.default_rng(5), (len(track), 1), (0.1, 0.4)
+    )  # it oscillates within seconds
     added = 7e-4 * angle * AXIS
     found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + added))
     assert found.findings == ()

@@ -1,4 +1,4 @@
-"""The evidence against a dense Gaussian, its slope against differences, and its one maximum."""
+"""The evidence compared with a dense Gaussian, its gradient with differences, and its maximum."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ROWS, STEP = (20, 20, 40, 80), 0.7
 
 
 def design(seed: int, widths: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Columns that overlap, and readings that hold some of them."""
+    """Correlated columns, and readings that contain some of them."""
     rng = np.random.default_rng(seed)
     count = sum(ROWS)
     B = rng.normal(size=(count, sum(widths))) + 0.5 * rng.normal(size=(count, 1))
@@ -59,7 +59,7 @@ WIDTHS = (3, 3, 4, 10)
 
 
 def dense(B: np.ndarray, y: np.ndarray, log_noise: np.ndarray, psi: np.ndarray) -> float:
-    """Log density of the readings by their whole covariance, and of the hyperparameters."""
+    """Log density of the readings by their full covariance, plus that of the hyperparameters."""
     at, variance, prior = 0, [], 0.0
     for law in laws():
         mine = psi[at : at + len(law.start)]
@@ -74,13 +74,13 @@ def dense(B: np.ndarray, y: np.ndarray, log_noise: np.ndarray, psi: np.ndarray) 
 LOG_NOISE, PSI = np.array([0.4, 0.1, -0.2, 0.3]), np.array([-0.4, -0.9, 0.2, 0.8])
 
 
-def test_the_evidence_is_that_of_the_dense_gaussian():
+def test_evidence_equals_that_of_the_dense_gaussian():
     B, y = design(1, WIDTHS)
     at = evaluate(products(B, y), laws(), LOG_NOISE, PSI)
     assert at.nats == pytest.approx(dense(B, y, LOG_NOISE, PSI), abs=1e-6)
 
 
-def test_the_gradient_is_that_of_differences():
+def test_gradient_of_the_evidence_agrees_with_finite_differences():
     B, y = design(2, WIDTHS)
     at = evaluate(products(B, y), laws(), LOG_NOISE, PSI)
     x = np.concatenate([LOG_NOISE, PSI])
@@ -90,7 +90,7 @@ def test_the_gradient_is_that_of_differences():
         assert at.gradient[k] == pytest.approx((ahead - behind) / 2e-5, rel=1e-5, abs=1e-5)
 
 
-def test_the_mean_and_covariance_are_those_of_bayes():
+def test_posterior_mean_and_deviation_equal_those_of_bayesian_regression():
     B, y = design(3, WIDTHS)
     at = evaluate(products(B, y), laws(), LOG_NOISE, PSI)
     weight = np.repeat(np.exp(-LOG_NOISE), ROWS)
@@ -104,8 +104,8 @@ def test_the_mean_and_covariance_are_those_of_bayes():
     np.testing.assert_allclose(at.mean, covariance @ (B.T @ (weight * y)), atol=1e-7)
 
 
-def test_adding_and_dropping_agree_on_200_hypotheses():
-    """A set is worth the same whether the search came to it from fewer members or from more."""
+def test_evidence_does_not_depend_on_the_search_path_for_200_sets():
+    """A set has the same evidence whether it is reached by adding or by removing members."""
     rng = np.random.default_rng(4)
     width, members = 3, 8
     worst = 0.0
@@ -131,7 +131,7 @@ def test_adding_and_dropping_agree_on_200_hypotheses():
     assert worst < 1.0
 
 
-def test_what_is_not_there_is_small_and_what_is_there_is_found():
+def test_maximum_has_the_true_size_and_a_small_size_for_an_absent_component():
     rng = np.random.default_rng(5)
     B = rng.normal(size=(sum(ROWS), 16))
     y = B[:, :8] @ rng.normal(scale=2.0, size=8) + rng.normal(size=len(B))
@@ -146,7 +146,7 @@ def test_what_is_not_there_is_small_and_what_is_there_is_found():
     np.testing.assert_allclose(np.exp(found.log_noise), 1.0, rtol=0.6)
 
 
-def test_a_climb_is_given_up_only_where_it_would_not_reach_what_is_asked():
+def test_maximisation_is_abandoned_only_below_the_threshold():
     for seed in range(30):
         B, y = design(60 + seed, WIDTHS)
         start = (np.full(4, 1.5), np.full(len(PSI), -0.5))
@@ -157,7 +157,7 @@ def test_a_climb_is_given_up_only_where_it_would_not_reach_what_is_asked():
         assert maximise_above(products(B, y), laws(), start, top.nats + 1e3) is None
 
 
-def test_the_curvature_is_the_average_information_and_no_less_than_the_expected():
+def test_curvature_is_the_average_information_bounded_by_the_expected():
     B, y = design(6, WIDTHS)
     at = evaluate(products(B, y), laws(), LOG_NOISE, PSI)
     begin, variance, slopes, stiff = 0, [], [], []
@@ -186,8 +186,8 @@ def test_the_curvature_is_the_average_information_and_no_less_than_the_expected(
     np.testing.assert_allclose(np.diag(found)[k:], most, rtol=1e-6)
 
 
-def test_the_maximum_is_that_of_another_climb():
-    """Newton's steps against a quasi-Newton search of the same function, from far away."""
+def test_maximum_equals_that_of_a_quasi_newton_search():
+    """Newton steps compared with a quasi-Newton search of the same function from far away."""
     for seed in range(10):
         B, y = design(20 + seed, WIDTHS)
         found = maximise(products(B, y), laws(), (np.full(4, 1.5), np.zeros(4)))
@@ -206,7 +206,7 @@ def test_the_maximum_is_that_of_another_climb():
         assert found.nats == pytest.approx(-other.fun, abs=0.05)
 
 
-def test_bands_that_stand_alone_may_have_any_power() -> None:
+def test_narrow_bands_may_have_any_power() -> None:
     edges, alone = noise_model.insert_narrow_bands(noise_model.octave_edges(4000), 700, 900, 50)
     assert edges.tolist() == [0, 62, 125, 250, 500, 700, 750, 800, 850, 900, 2000, 4000]
     assert edges[alone].tolist() == [700, 750, 800, 850]
@@ -225,8 +225,8 @@ def test_bands_that_stand_alone_may_have_any_power() -> None:
 
 
 @pytest.mark.parametrize("size", [0.03, 0.1])
-def test_a_climb_goes_on_where_size_and_corner_are_nearly_one(size: float) -> None:
-    """As many half waves as are seen, one as loud as the other: the corner ends at its highest."""
+def test_maximisation_continues_when_size_and_corner_are_nearly_degenerate(size: float) -> None:
+    """All half waves that are seen have equal power: the corner ends at its upper bound."""
     rng, count, known = np.random.default_rng(1), 200, 1e4
     w = size * rng.normal(size=count)
     s = known * w + np.sqrt(known) * rng.normal(size=count)

@@ -1,4 +1,6 @@
-"""One recording linearised: candidates beside a model, delays that hold, where nothing is known."""
+"""Linearisation of a recording: candidates given a model, contained delays, intervals without
+readings.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,7 @@ def richest(track: Track) -> richest_model.FittedPoint:
 
 
 def delayed(track: Track, lag_s: float) -> Track:
-    """The magnetometer's readings late by so much."""
+    """The magnetometer's readings delayed by `lag_s`."""
     t, m = track.time_s, track.mag_b_gauss
     late = [np.interp(t - lag_s, t, m[:, axis]) for axis in range(3)]
     return replace(track, mag_b_gauss=np.column_stack(late))
@@ -62,13 +64,13 @@ def bare() -> richest_model.FittedPoint:
     return richest(replace(track_of(experiment("wam", seed=8, samples=3000)), accel_b_m_s2=None))
 
 
-def test_without_an_accelerometer_nothing_is_asked_of_it(bare):
+def test_remainder_has_no_parts_by_force_without_an_accelerometer(bare):
     assert np.isfinite(bare.nats)
     assert {"by_force", "bending"}.isdisjoint(bare.base.remainder)
     assert "by_direction" in bare.base.remainder
 
 
-def test_a_candidate_beside_a_model_is_worth_what_it_adds_to_the_evidence(bare):
+def test_log_bayes_factor_of_a_candidate_equals_its_gain_in_evidence(bare):
     made, keys = bare.base.made, (CALIBRATION, "gyro_matrix")
     laws = [made.seen[key].component.law for key in keys]
     noise = np.linspace(-0.3, 0.4, len(made.edges) - 1)
@@ -81,13 +83,13 @@ def test_a_candidate_beside_a_model_is_worth_what_it_adds_to_the_evidence(bare):
     assert worth[LAG] == pytest.approx(with_it.nats - without.nats, abs=1e-5)
 
 
-def test_a_delay_that_is_long_is_found_from_none():
+def test_long_delay_is_found_from_zero():
     found = richest(delayed(track_of(experiment("wam", seed=9, samples=4000)), 0.11))
     value = coefficients_by_key(found.base.made, found.base.whole, found.at)[LAG]
     assert value[0] == pytest.approx(0.11, abs=0.006)
 
 
-def test_eddy_currents_hold_a_delay_and_no_other_effect_does(bare):
+def test_only_eddy_currents_contain_a_delay(bare):
     delay = bare.base.made.seen[LAG].component
     parts = dict(library_components(bare.base.made.context, EFFECTS))
     assert [name for name, some in parts.items() if contains_component(some[0], delay)] == [
@@ -101,7 +103,7 @@ def test_eddy_currents_hold_a_delay_and_no_other_effect_does(bare):
     np.testing.assert_allclose(shared, 0.0, atol=1e-9)
 
 
-def test_columns_hold_others_that_are_a_sum_of_them():
+def test_component_contains_linear_combinations_of_its_columns():
     rng = np.random.default_rng(1)
     X = rng.normal(size=(50, 3, 4))
     law = FixedLaw(np.ones(4))
@@ -113,7 +115,7 @@ def test_columns_hold_others_that_are_a_sum_of_them():
     assert not contains_component(part, whole)
 
 
-def test_spells_at_rest_are_those_in_which_a_sensor_hardly_turns():
+def test_still_intervals_are_those_with_small_rates():
     t = np.arange(0.0, 100.0, 0.1)
     gyro = np.zeros((len(t), 3))
     moving = (t >= 20.0) & (t < 60.0)
@@ -124,15 +126,15 @@ def test_spells_at_rest_are_those_in_which_a_sensor_hardly_turns():
     np.testing.assert_allclose(found, expected, atol=0.31)
 
 
-def test_what_hardly_turns_in_most_of_its_time_is_never_at_rest():
+def test_no_still_intervals_when_the_recording_is_mostly_still():
     t = np.arange(0.0, 100.0, 0.1)
     gyro = np.zeros((len(t), 3))
     gyro[:100, 2] = 1.0
     assert still_intervals(t, gyro) == []
 
 
-def test_a_logged_cause_is_the_same_component_at_every_point():
-    """Its reference follows the readings, and what it took out of them has to be put back."""
+def test_logged_cause_is_the_same_component_at_every_linearisation_point():
+    """Its reference follows the readings, and what it subtracted must be added again."""
     track = track_of(experiment("wam", seed=4, samples=3000))
     warm = 15.0 + np.cumsum(np.random.default_rng(2).normal(size=len(track))) / 500.0
     track = replace(track, covariates={"temperature_c": warm})
@@ -146,8 +148,8 @@ def test_a_logged_cause_is_the_same_component_at_every_point():
     assert set(keys[1]) - set(keys[0]) == {LAG_FORM}
 
 
-def test_what_a_point_takes_out_of_the_readings_is_what_it_puts_back():
-    """A course of 40 mG on the sensor: the readings with everything in are those of before."""
+def test_terms_subtracted_at_a_linearisation_point_are_added_again():
+    """A field of 40 mG on the sensor: with all terms added, the readings are the original ones."""
     track = track_of(experiment("wam", seed=11, samples=3000))
     t = track.time_s - track.time_s[0]
     added = 0.04 * np.sin(2 * np.pi * t / 31.0)[:, None] * np.array([0.6, -0.7, 0.39])
@@ -166,7 +168,7 @@ def test_what_a_point_takes_out_of_the_readings_is_what_it_puts_back():
     assert there.nats > here.nats
 
 
-def test_a_run_ends_where_a_step_turns_too_far_to_be_told():
+def test_run_ends_at_a_step_with_too_large_a_turn():
     track = track_of(experiment("wam", seed=8, samples=400))
     gyro = track.gyro_b_rad_s.copy()
     gyro[250] = [0.0, 20.0, 5.0]
@@ -176,7 +178,7 @@ def test_a_run_ends_where_a_step_turns_too_far_to_be_told():
     assert split_at_large_turns(track) is track
 
 
-def test_a_span_in_which_something_was_moved_is_unread_and_the_gyro_carries_the_field_across():
+def test_gyro_bridges_the_field_over_omitted_readings():
     track = track_of(experiment("wam", seed=8, samples=3000))
     problem, cold = build_problem(track, Spec())
     point = initial_point(problem, fit_null(problem.track, problem.spec, cold).filtered, (LAG,))
@@ -191,8 +193,10 @@ def test_a_span_in_which_something_was_moved_is_unread_and_the_gyro_carries_the_
 
 
 @pytest.mark.parametrize("name", ["by_direction", "viscous_magnetisation", "hysteresis"])
-def test_what_is_made_of_the_field_row_by_row_does_not_follow_that_rows_reading(name):
-    """Beside a loud gyro the smooth field is nearly the reading, which then explains itself."""
+def test_columns_made_of_the_field_do_not_depend_on_the_reading_of_their_row(name):
+    """With a noisy gyro the smoothed field is nearly the reading, which would then explain
+    itself.
+    """
     loud = track_of(experiment("wam", seed=31, samples=600, rate_hz=10.0, sigma_gyro=0.03))
     problem, cold = build_problem(loud, Spec())
     model = fit_null(problem.track, problem.spec, cold, walk=False).model

@@ -1,4 +1,6 @@
-"""Magnets that a hand put on a sensor and took off again: BROAD, by the optical attitude."""
+"""Magnets put on a sensor by hand and taken off again: BROAD, compared with the optical
+attitude.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ pytestmark = [pytest.mark.recordings, pytest.mark.slow]
 
 
 @pytest.mark.parametrize(
-    ("trial", "on_s", "off_s", "gauss"),  # `bench_known_values.py`; of 33 the size is not known
+    ("trial", "on_s", "off_s", "gauss"),  # `bench_known_values.py`; the size of 33 is not known
     [
         ("32_disturbed_attached_magnet_1cm", 38.5, 95.5, 0.5855),
         ("33_disturbed_attached_magnet_2cm", 41.5, 98.5, None),
@@ -20,9 +22,7 @@ pytestmark = [pytest.mark.recordings, pytest.mark.slow]
         ("36_disturbed_attached_magnet_5cm", 37.5, 98.0, 0.0556),
     ],
 )
-def test_a_magnet_is_one_vector_from_when_it_was_put_on_until_it_was_taken_off(
-    trial, on_s, off_s, gauss
-):
+def test_magnet_is_one_vector_over_the_interval_in_which_it_was_on(trial, on_s, off_s, gauss):
     found = diagnose(recorded(f"broad/{trial}"))
     named = {one.effect: one for one in found.findings}
     assert named.keys() == {"hard_iron_step", "mag_time_lag"}

@@ -1,4 +1,4 @@
-"""What an answer is held against, where the right answer is known."""
+"""Checks of an answer on recordings whose correct answer is known."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ NOTHING = frozenset()
 
 
 def with_current(track: Track, *, field: bool) -> Track:
-    """A logged current that goes up and down at random; field: whether it has one."""
+    """A logged current that varies at random; `field`: whether it causes a field."""
     seconds = np.arange(0.0, track.duration_s + 8.0, 7.0)
     levels = np.random.default_rng(4).uniform(0.0, 12.0, len(seconds))
     amps = np.interp(track.time_s - track.time_s[0], seconds, levels)
@@ -78,7 +78,7 @@ def track():
 
 @pytest.fixture(scope="module")
 def idle(track):
-    """A current that does nothing."""
+    """A current without a field."""
     return sets_of(with_current(track, field=False))
 
 
@@ -93,7 +93,7 @@ def key_of(space: Space, name: str) -> str:
 
 
 def gains(found: tuple[Hypotheses, Space], name: str) -> tuple[float, float]:
-    """Nats on all readings of an effect that is put in, and of its best copy."""
+    """Held-out gain, in nats over all readings, of an effect and of its best time-shifted copy."""
     all_sets, space = found
     key = key_of(space, name)
     held = HeldOut(all_sets, all_sets.judge({key}))
@@ -101,8 +101,8 @@ def gains(found: tuple[Hypotheses, Space], name: str) -> tuple[float, float]:
     return told.nll_gain_per_sample * held.samples, told.placebo_gain * held.samples
 
 
-def test_what_is_not_reported_is_compared_with_an_unknown_cause_in_its_place(track):
-    """As the decision does: over nothing it may be beyond what is required."""
+def test_nearest_effect_is_compared_with_an_unknown_cause_in_its_place(track):
+    """As in the decision: compared with no effect it may exceed the required odds."""
     all_sets, space = sets_of(with_current(track, field=True))
     bare, key = all_sets.judge(()), key_of(space, "motor_current_field")
     answer = Answer(bare, (), (), {}, (), (), Unexplained(False), 0.0)
@@ -115,23 +115,25 @@ def test_what_is_not_reported_is_compared_with_an_unknown_cause_in_its_place(tra
     assert f"motor_current_field: {named.score - free.score:+.1f} nats over an unknown" in beside
 
 
-def test_a_set_with_too_many_coefficients_is_no_candidate_and_its_neighbours_are(idle, monkeypatch):
+def test_set_with_too_many_coefficients_is_skipped_as_a_candidate(idle, monkeypatch):
     all_sets, space = idle
     key = key_of(space, "motor_current_field")
     bare, course = all_sets.judge(()), space.courses[0]
     width = all_sets.component(course).width
-    monkeypatch.setattr(priors, "WIDEST", width)  # beside the calibration there is less room
+    monkeypatch.setattr(priors, "WIDEST", width)  # with the calibration there is less room
     before = all_sets.too_wide
     assert all_sets.judge_above({course}, bare, -np.inf) is None
     assert all_sets.too_wide == before + 1
     assert all_sets.judge_above({key}, bare, -np.inf) is not None
-    assert all_sets.judge({course}).names == {course}  # what is asked for by itself has a score
+    assert all_sets.judge({course}).names == {
+        course
+    }  # a set that is requested directly has a score
 
 
-def test_what_is_not_there_foretells_nothing(idle):
-    """Over the library nothing on the mean, and none more than chance.
+def test_absent_effects_have_no_held_out_gain(idle):
+    """Over the library the mean gain is near zero, and none exceeds chance.
 
-    Sizes and the noise's spectrum are of all readings: half a nat is theirs.
+    Sizes and the noise spectrum are fitted to all readings, which gives half a nat.
     """
     found = {name: gains(idle, name)[0] for name in idle[1].effects}
     assert len(found) > 15
@@ -142,21 +144,21 @@ def test_what_is_not_there_foretells_nothing(idle):
     assert max(gain, copy) < 2.0
 
 
-def test_a_cause_foretells_readings_and_its_copies_do_not(driven):
+def test_true_effect_has_held_out_gain_and_its_shifted_copies_do_not(driven):
     gain, copy = gains(driven, "motor_current_field")
     assert gain > 200.0
     assert copy < 0.1 * gain
     all_sets, space = driven
     key = key_of(space, "motor_current_field")
     told = HeldOut(all_sets, all_sets.judge({key})).held_out_gain((key,))
-    # the next reading is off by the sensor's own noise, a row being a mean of so many readings
+    # the prediction error is the sensor's noise; a row is a mean of several readings
     noise = 1e-3 / np.sqrt(all_sets.made.point.problem.averaged)
     assert told.rms_after_gauss == pytest.approx(noise, rel=0.15)
     assert told.rms_before_gauss > 1.05 * told.rms_after_gauss
 
 
-def test_an_effect_that_says_the_wrong_thing_loses(driven):
-    """A step beside the current's field: what is left to say is nothing."""
+def test_superfluous_effect_has_no_held_out_gain(driven):
+    """With the current's field in the model, a step has nothing left to explain."""
     all_sets, space = driven
     cause, step = (key_of(space, name) for name in ("motor_current_field", "hard_iron_step"))
     held = HeldOut(all_sets, all_sets.judge({cause, step}))
@@ -164,7 +166,7 @@ def test_an_effect_that_says_the_wrong_thing_loses(driven):
     assert held.gain(held.without((cause,))) * held.samples > 200.0
 
 
-def test_a_part_is_foretold_with_the_density_that_the_dense_gaussian_has():
+def test_held_out_density_equals_that_of_the_dense_gaussian():
     short = replace(track_of(experiment("wam", seed=22, samples=900)), accel_b_m_s2=None)
     all_sets, space = sets_of(with_current(short, field=True))
     held = HeldOut(all_sets, all_sets.judge({key_of(space, "motor_current_field")}))
@@ -183,14 +185,14 @@ def test_a_part_is_foretold_with_the_density_that_the_dense_gaussian_has():
     assert held.predict(held.best.names).nats == pytest.approx(expected, rel=1e-6)
 
 
-def test_stretches_are_dealt_in_turn(driven):
+def test_intervals_are_assigned_to_folds_in_turn(driven):
     rows = HeldOut(driven[0], driven[0].judge(NOTHING)).rows(NOTHING)
     track, part = rows.made.point.problem.track, assign_folds(rows)
     since_s = track.time_s[rows.rows] - track.time_s[0]
     np.testing.assert_array_equal(part, (since_s // 2.0).astype(int) % 5)
 
 
-def test_a_course_gains_in_its_own_frame_alone(track):
+def test_free_process_gains_most_in_its_own_frame(track):
     t = track.time_s - track.time_s[0]
     level = np.sin(2 * np.pi * t / 31.0) + np.sin(2 * np.pi * t / 47.0)
     added = 4e-3 * level[:, None] * np.array([0.6, -0.7, 0.4])
@@ -204,7 +206,7 @@ def test_a_course_gains_in_its_own_frame_alone(track):
 # -- priors -------------------------------------------------------------------------------------
 
 
-def test_odds_move_with_the_probability_of_a_name_by_its_logarithm(driven):
+def test_odds_change_by_the_logarithm_of_the_effect_prior(driven):
     all_sets, space = driven
     best = all_sets.judge({key_of(space, "motor_current_field")})
     found = prior_sensitivity(all_sets, best, all_sets.judge(NOTHING), required=3.0)
@@ -216,7 +218,7 @@ def test_odds_move_with_the_probability_of_a_name_by_its_logarithm(driven):
     assert not prior_sensitivity(all_sets, best, all_sets.judge(NOTHING), found.log_odds).stays
 
 
-def test_odds_in_another_noise_are_those_of_a_search_that_assumed_it(driven, monkeypatch):
+def test_odds_with_another_noise_prior_agree_with_a_refit(driven, monkeypatch):
     all_sets, space = driven
     names = frozenset({key_of(space, "motor_current_field")})
     found = prior_sensitivity(
@@ -230,7 +232,7 @@ def test_odds_in_another_noise_are_those_of_a_search_that_assumed_it(driven, mon
     assert by_noise.double_nats - found.log_odds == pytest.approx(change, rel=0.5, abs=1.0)
 
 
-def test_a_rival_course_is_as_likely_as_it_is_assumed_to_be(driven):
+def test_odds_over_a_free_process_change_by_its_assumed_prior(driven):
     all_sets, space = driven
     best = all_sets.judge({key_of(space, "motor_current_field")})
     rival = all_sets.judge({"free sensor"})
@@ -239,10 +241,10 @@ def test_a_rival_course_is_as_likely_as_it_is_assumed_to_be(driven):
     assert ORDINARY not in by
 
 
-# -- what is left -------------------------------------------------------------------------------
+# -- the residual -------------------------------------------------------------------------------
 
 
-def test_a_null_is_like_its_copies_and_no_bin_has_a_field_of_its_own(idle):
+def test_residual_of_a_null_is_like_its_simulated_copies_in_every_bin(idle):
     all_sets, _ = idle
     held = HeldOut(all_sets, all_sets.judge(NOTHING))
     found = fit_residuals(held.rows(NOTHING))
@@ -258,7 +260,7 @@ def test_a_null_is_like_its_copies_and_no_bin_has_a_field_of_its_own(idle):
     assert limit == pytest.approx(chdtri(3.0, 0.01 / (len(maps) * bins)) / 2.0)
 
 
-def test_what_follows_a_column_fails_before_and_not_after_it_is_named(driven):
+def test_check_by_column_fails_before_and_passes_with_the_effect(driven):
     all_sets, space = driven
     names = frozenset({key_of(space, "motor_current_field")})
     held = HeldOut(all_sets, all_sets.judge(names))
@@ -272,7 +274,7 @@ def test_what_follows_a_column_fails_before_and_not_after_it_is_named(driven):
     assert max(current.after) < 10.0
 
 
-def test_a_source_that_is_in_no_set_fails_by_time_and_by_whiteness(track):
+def test_unmodelled_source_fails_the_checks_by_time_and_whiteness(track):
     t = track.time_s - track.time_s[0]
     pulse = ((t > 50.0) & (t < 75.0))[:, None] * np.array([4e-3, -3e-3, 2e-3])
     problem, cold = build_problem(replace(track, mag_b_gauss=track.mag_b_gauss + pulse), Spec())
@@ -291,7 +293,7 @@ def test_a_source_that_is_in_no_set_fails_by_time_and_by_whiteness(track):
     assert whiteness(start, found)["ljung_box"].p_after < 1e-4
 
 
-def test_what_would_have_shown_shows_and_a_third_of_it_does_not(idle, track):
+def test_sensitivity_limit_is_detectable_and_a_third_of_it_is_not(idle, track):
     all_sets, space = idle
     found = effect_evidence(all_sets, space, NOTHING)
     told = {(one.effect, one.parameter): one for one in limits(found)}
@@ -307,11 +309,11 @@ def test_what_would_have_shown_shows_and_a_third_of_it_does_not(idle, track):
         key = key_of(asked, "motor_current_field")
         return sets.judge({key}).score - sets.judge(NOTHING).score
 
-    assert odds(1.2 * limit.smallest) > priors.NAME_ODDS  # with the noise that is there
+    assert odds(1.2 * limit.smallest) > priors.NAME_ODDS  # at the actual noise
     assert odds(limit.smallest / 3.0) < priors.NAME_ODDS
 
 
-def test_sizes_of_what_is_left_are_those_that_were_put_in(track):
+def test_size_of_the_remaining_residual_is_that_of_the_added_field(track):
     rng = np.random.default_rng(5)
     t = (track.time_s - track.time_s[0]) / track.duration_s
     waves = np.cos(np.pi * np.outer(t, np.arange(2, 8)))
@@ -326,7 +328,7 @@ def test_sizes_of_what_is_left_are_those_that_were_put_in(track):
     rows = np.column_stack([np.interp(at_s, times, column) for column in world.T])
     put_in = rms_about_mean(project_out_calibration(rows, calibration_basis(all_sets.made.context)))
     assert found.within
-    # the filter follows what is slow: the likeliest course is smaller than the true one, never more
+    # the filter follows slow changes: the most probable process is smaller than the true one
     assert 0.5 * put_in < parts["world_course"].size < 1.1 * put_in
     assert parts["world_course"].there
     assert parts["world_course"].up_to > 5.0 * parts["world_course"].size
@@ -335,7 +337,7 @@ def test_sizes_of_what_is_left_are_those_that_were_put_in(track):
     assert found.heading_deg > 0.3
 
 
-def test_a_name_that_gains_no_more_than_its_copies_or_owes_itself_to_a_prior_is_doubted():
+def test_doubt_is_noted_for_a_finding_without_held_out_gain_or_dependent_on_a_prior():
     held = Heldout(1e-3, 9e-4, 0.01, 0.001)
     sure = OnPriors(20.0, 3.0, True, (Assumed(EFFECT, 19.3, 20.7),))
     told = Finding(

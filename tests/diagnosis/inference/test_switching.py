@@ -1,4 +1,4 @@
-"""Sources that switch: states of a chain, moments of change, and the law of a spell."""
+"""Switching sources: states of a Markov chain, change points, and the law of an interval."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ PIECE_S, ROWS = 0.2, 5
 
 
 def squares(left: np.ndarray) -> np.ndarray:
-    """Of the sum of each piece's rows."""
+    """Squared sums of the rows of each piece."""
     return np.sum(left.reshape(-1, ROWS, 3).sum(axis=1) ** 2, axis=1)
 
 
-def test_spells_are_on_and_paid_with_the_probability_of_their_chain():
+def test_most_probable_states_have_the_prior_odds_of_their_chain():
     left = np.random.default_rng(1).standard_normal((600 * ROWS, 3))
     on = np.zeros(600, dtype=bool)
     on[100:110] = on[400:407] = True
@@ -44,20 +44,20 @@ def test_spells_are_on_and_paid_with_the_probability_of_their_chain():
     assert log_odds == pytest.approx(chain, abs=1e-9)
 
 
-def test_noise_is_never_on_and_never_changes():
+def test_noise_has_no_on_state_and_no_change_points():
     left = np.random.default_rng(2).standard_normal((3000, 3))
     found, _ = most_probable_states(squares(left), np.full(600, float(ROWS)), PIECE_S)
     assert not found.any()
     assert change_points(left, 10) == []
 
 
-def test_a_chain_of_noise_and_ever_less_is_off():
+def test_pieces_below_the_noise_level_are_off():
     found, log_odds = most_probable_states(np.zeros(50), np.full(50, float(ROWS)), PIECE_S)
     assert not found.any()
     assert log_odds == pytest.approx(-50 * PIECE_S / priors.BETWEEN_S)
 
 
-def test_levels_change_where_they_do():
+def test_change_points_are_found_at_their_rows():
     left = np.random.default_rng(3).standard_normal((2000, 3))
     for row, change in ((400, 6.0), (700, -6.0), (705, 0.0), (1500, 5.0)):
         left[row:, 1] += change
@@ -66,7 +66,7 @@ def test_levels_change_where_they_do():
     assert np.abs(found - [400, 700, 1500]).max() <= 1
 
 
-def test_a_spell_s_slopes_are_those_of_differences():
+def test_slopes_of_the_interval_law_agree_with_finite_differences():
     law = IntervalLaw(np.array([0.0, 0.5, 1.0, 3.0]), 1e-3)
     psi = np.array([0.4, 0.7])
     assert law.log_variance(psi)[0] == pytest.approx(2 * np.log(1e-3) + 0.8)
@@ -80,7 +80,7 @@ def test_a_spell_s_slopes_are_those_of_differences():
 
 
 @pytest.mark.slow
-def test_spells_are_found_to_a_second_and_what_was_tried_is_not_kept():
+def test_intervals_are_found_within_a_second_and_trials_are_not_kept():
     track = replace(track_of(experiment("wam", seed=22, samples=3000)), accel_b_m_s2=None)
     since_s = track.time_s - track.time_s[0]
     true = [(20.0, 22.0), (50.0, 51.5), (80.0, 83.0)]
@@ -107,7 +107,7 @@ def test_spells_are_found_to_a_second_and_what_was_tried_is_not_kept():
 
 
 def runs_once(begin_s: float, end_s: float, gauss: float):
-    """A recording beside iron that turns to and fro, twice a second or less; and its field."""
+    """A recording with iron that oscillates up to twice a second in one interval, and its field."""
     track = replace(track_of(experiment("wam", seed=23, samples=3000)), accel_b_m_s2=None)
     since_s = track.time_s - track.time_s[0]
     turned = np.random.default_rng(4).standard_normal((len(track), 3))
@@ -117,8 +117,8 @@ def runs_once(begin_s: float, end_s: float, gauss: float):
 
 
 @pytest.mark.slow
-def test_what_runs_for_seven_seconds_once_is_unknown_where_it_does():
-    """A single spell is a source."""
+def test_source_that_is_on_once_for_seven_seconds_is_unknown_in_its_interval():
+    """A single interval is a source."""
     track, _ = runs_once(56.0, 63.0, 0.005)
     found = diagnose(track)
     left = found.unexplained
@@ -131,8 +131,10 @@ def test_what_runs_for_seven_seconds_once_is_unknown_where_it_does():
 
 
 @pytest.mark.slow
-def test_a_short_spell_has_the_size_and_direction_that_it_has():
-    """It is drawn within itself: moments of the whole recording would lie beside it."""
+def test_short_interval_has_the_true_size_and_direction():
+    """Size and direction are taken within the interval; time segments of the whole recording
+    would miss it.
+    """
     track, added = runs_once(60.0, 62.0, 0.01)
     left = diagnose(track).unexplained
     assert left.detected

@@ -1,4 +1,4 @@
-"""The context: attitude, field, rates and force against the simulation's truth."""
+"""The context: attitude, field, rates and force compared with the simulation's truth."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def _context(track: Track, made: Experiment) -> Context:
 
 
 def _apart_deg(R: Array, truth: Array) -> Array:
-    """Angles in degrees between attitudes that may differ by one constant rotation of the world."""
+    """Angles in degrees between attitudes, up to one constant rotation of the world."""
     offset = R @ np.swapaxes(truth, 1, 2)
     mean = Rotation.from_matrix(offset).mean().as_matrix()
     return np.asarray(np.degrees(np.linalg.norm(so3.log(np.swapaxes(offset, 1, 2) @ mean), axis=1)))
 
 
-def test_attitude_is_level_and_does_not_drift() -> None:
-    """The accelerometer levels it and the field keeps it, under 5 mrad/s of gyro noise."""
+def test_attitude_is_levelled_and_does_not_drift() -> None:
+    """The accelerometer levels it and the field fixes it, at 5 mrad/s of gyro noise."""
     made = experiment("wam", samples=6000, sigma_gyro=5e-3)
     context = _context(track_of(made), made)
     assert context.world_levelled
@@ -54,17 +54,19 @@ def test_attitude_is_level_and_does_not_drift() -> None:
     assert np.abs(np.linalg.det(context.R_nb) - 1).max() < 1e-9
 
 
-def test_without_an_accelerometer_the_field_holds_still() -> None:
+def test_field_is_constant_in_the_world_frame_without_an_accelerometer() -> None:
     made = experiment("wam", samples=6000, sigma_gyro=5e-3)
     context = _context(replace(track_of(made), accel_b_m_s2=None), made)
     assert not context.world_levelled
     field = np.einsum("nij,nj->ni", context.R_nb, made.field_b)
     assert np.degrees(np.linalg.norm(field - field[0], axis=1) / np.linalg.norm(field[0])).max() < 1
-    assert _apart_deg(context.R_nb, made.R_nb).max() < 12  # about the field it may drift
+    assert _apart_deg(context.R_nb, made.R_nb).max() < 12  # it may drift about the field
 
 
-def test_a_reference_attitude_changes_nothing() -> None:
-    """The filter turns its field by the gyro; a field of the world must turn by it as well."""
+def test_context_ignores_a_reference_attitude() -> None:
+    """The filter turns its field by the gyro, so a field of the world has to turn by the gyro as
+    well.
+    """
     made = experiment("wam", samples=600, sigma_gyro=5e-3)
     q = Rotation.from_matrix(made.R_nb).as_quat(scalar_first=True)
     names = ("ref_qw", "ref_qx", "ref_qy", "ref_qz")
@@ -80,7 +82,7 @@ def test_rates_are_smoothed_but_not_delayed(motion: str) -> None:
     inner = slice(50, -50)
     error = (context.rate_b_rad_s - made.rate_b_rad_s)[inner]
     assert np.sqrt(np.mean(error**2)) < 0.35 * 5e-3
-    # a delay of d would leave d * dw/dt
+    # a delay of d would give an error of d * dw/dt
     slope = np.gradient(made.rate_b_rad_s, 0.04, axis=0)[inner]
     delay_s = float(np.sum(error * slope) / np.sum(slope**2))
     assert abs(delay_s) < 0.03 if motion == "slow" else abs(delay_s) < 0.004
@@ -89,7 +91,7 @@ def test_rates_are_smoothed_but_not_delayed(motion: str) -> None:
     assert np.sqrt(np.mean(off**2)) < 0.35 * 5e-3 * 0.5
 
 
-def test_quick_motion_keeps_its_bandwidth() -> None:
+def test_fast_motion_keeps_its_bandwidth() -> None:
     rng = np.random.default_rng(1)
     t = np.arange(4000) / 100.0
     clean = np.column_stack([3 * np.sin(2 * np.pi * 5 * t), np.cos(2 * np.pi * 3 * t), 0 * t])
@@ -102,8 +104,10 @@ def test_quick_motion_keeps_its_bandwidth() -> None:
     assert bandwidth_hz(slow, runs, 0.01, 0.01) == 0.5
 
 
-def test_a_slow_motion_is_smoothed_as_long_as_it_is_slow() -> None:
-    """Minutes a turn beside 5 mrad/s of noise: over a second its slope would be mostly noise."""
+def test_slow_motion_is_smoothed_over_a_long_time() -> None:
+    """One turn takes minutes at 5 mrad/s of noise: the slope over a second would be mostly
+    noise.
+    """
     rng = np.random.default_rng(5)
     t = np.arange(10_000) / 25.0
     clean = 0.08 * np.cos(2 * np.pi * np.outer(t, [8e-3, 6e-3, 5e-3]))
@@ -118,8 +122,8 @@ def test_a_slow_motion_is_smoothed_as_long_as_it_is_slow() -> None:
     assert bandwidth_hz(briefly, runs, 0.04, 5e-3) > 5.0
 
 
-def test_a_rate_that_does_not_change_is_no_noise() -> None:
-    """Columns made of the gyro's noise would be held against what it did to the field."""
+def test_constant_rate_is_smoothed_to_its_mean() -> None:
+    """Columns made of the gyro's noise would correlate with what that noise did to the field."""
     rng = np.random.default_rng(1)
     t = np.arange(40_000) / 100.0
     slowly = 0.01 * np.sin(2 * np.pi * t / 200)  # far slower than a segment of four seconds
@@ -131,8 +135,10 @@ def test_a_rate_that_does_not_change_is_no_noise() -> None:
     assert np.corrcoef(smooth[:, 2], slowly)[0, 1] > 0.97
 
 
-def test_noise_alone_has_no_bandwidth_where_no_run_is_long() -> None:
-    """A hundred lost rows: the spectrum of the longest run alone crossed any floor by chance."""
+def test_noise_has_no_bandwidth_when_all_runs_are_short() -> None:
+    """With a hundred lost rows, the spectrum of the longest run alone exceeded any floor by
+    chance.
+    """
     rng = np.random.default_rng(4)
     edges = np.unique(np.concatenate([[0, 3200], rng.integers(0, 3200, 110)]))
     runs = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
@@ -143,8 +149,8 @@ def test_noise_alone_has_no_bandwidth_where_no_run_is_long() -> None:
     assert bandwidth_hz(shaken, runs, 0.1, 2e-3) >= 4.2
 
 
-def test_the_field_of_the_columns_has_none_of_the_readings_own_noise() -> None:
-    """Beside a poor gyro the smooth field is a good part the reading itself."""
+def test_predicted_field_has_no_noise_of_its_own_reading() -> None:
+    """With a poor gyro a large part of the smoothed field is the reading itself."""
     made = experiment("mam", samples=3000, sigma_gyro=2e-2, sigma_mag=4e-4)
     track, row = track_of(made), 1500
     noisy = track.mag_b_gauss.copy()
@@ -153,14 +159,16 @@ def test_the_field_of_the_columns_has_none_of_the_readings_own_noise() -> None:
         _context(replace(track, mag_b_gauss=m), made) for m in (track.mag_b_gauss, noisy)
     )
     foretold, smooth = after.field_b - before.field_b, after.smooth_b - before.smooth_b
-    assert np.abs(foretold[: row + 1]).max() < 1e-6  # by the gains alone
+    assert np.abs(foretold[: row + 1]).max() < 1e-6  # through the gains only
     assert np.linalg.norm(foretold[row + 1]) > 1e-4
     assert np.linalg.norm(smooth[row]) > 5e-5
-    np.testing.assert_allclose(after.field_b[0], after.smooth_b[0], atol=4e-4)  # the run opens
+    np.testing.assert_allclose(
+        after.field_b[0], after.smooth_b[0], atol=4e-4
+    )  # the first row of the run
 
 
-def test_a_column_of_rates_has_nothing_of_its_own_rows_noise() -> None:
-    """Held against what that noise did to the field it would be a scale of its share."""
+def test_column_of_rates_has_no_noise_of_its_own_row() -> None:
+    """It would correlate with what that noise did to the field, and look like a scale error."""
     draw = np.random.default_rng(4)
     t = np.arange(200_000) / 25.0
     clean = 0.1 * np.cos(2 * np.pi * np.outer(t, [0.03, 0.05, 0.04]))
@@ -177,8 +185,8 @@ def test_a_column_of_rates_has_nothing_of_its_own_rows_noise() -> None:
     assert np.std((others - clean)[inner]) < 0.3 * 0.05
 
 
-def test_an_axis_that_does_not_turn_keeps_its_mean_row_by_row() -> None:
-    """Its smooth rate has no part of a row in it: taken out, that row's noise would be put in."""
+def test_axis_without_rotation_keeps_its_mean() -> None:
+    """Its smoothed rate has no part of a single row. Removing one would add that row's noise."""
     draw = np.random.default_rng(6)
     t = np.arange(5000) / 25.0
     clean = np.column_stack([np.full(len(t), 0.02), 0.2 * np.cos(0.3 * t), 0.2 * np.sin(0.2 * t)])
@@ -192,7 +200,7 @@ def test_an_axis_that_does_not_turn_keeps_its_mean_row_by_row() -> None:
     assert np.all(np.std(others - smooth, axis=0)[1:] > 0.0)
 
 
-def test_quick_rates_are_not_taken_from_their_neighbours() -> None:
+def test_rates_without_smoothing_are_unchanged() -> None:
     rate = np.random.default_rng(1).standard_normal((100, 3))
     assert rate_without_own_row(rate, rate, 1.0) is rate
 
@@ -203,23 +211,23 @@ def swaying(count: int = 8000) -> np.ndarray:
     return np.column_stack([x, 0.4 * np.cos(2 * np.pi * 0.07 * t), -9.8 + 0.2 * np.sin(t)])
 
 
-def test_a_slow_force_is_kept_and_the_noise_is_not() -> None:
+def test_slow_force_is_kept_and_its_noise_is_removed() -> None:
     force = swaying()
     noise = 0.2 * np.random.default_rng(1).standard_normal(force.shape)
     found = denoised_force(force + noise, [slice(0, len(force))])
     assert np.sqrt(np.mean((found - force) ** 2)) < 0.25 * 0.2
-    # nothing of the force has gone with the noise (the third axis sways no more than the noise)
+    # the force itself is not reduced (the third axis sways no more than the noise)
     along = np.sum((found - found.mean(0)) * (force - force.mean(0)), axis=0)
     np.testing.assert_allclose(along / np.sum((found - found.mean(0)) ** 2, axis=0), 1.0, atol=0.03)
 
 
-def test_at_rest_there_is_one_force() -> None:
+def test_force_is_constant_at_rest() -> None:
     noise = 0.2 * np.random.default_rng(2).standard_normal((4000, 3))
     found = denoised_force(np.array([0.1, -0.2, -9.8]) + noise, [slice(0, 4000)])
     assert found.std(axis=0).max() < 0.01
 
 
-def test_runs_are_apart_and_what_is_short_or_has_holes_is_as_it_was() -> None:
+def test_runs_are_smoothed_separately_and_short_or_incomplete_ones_are_unchanged() -> None:
     force = swaying(600)
     force[400:] += 50.0
     runs = [slice(0, 400), slice(400, 450), slice(450, 600)]

@@ -1,6 +1,7 @@
-"""The filter: equal to the plain loop, exact sensitivities, white on nulls, none of the traps.
+"""The filter: equal to a plain loop, exact sensitivities, white innovations on nulls, no known
+pitfalls.
 
-Columns that pass the filter together, and the small inverse of its gains.
+Also columns that pass the filter together, and the 3x3 inverse of its gains.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def _sequential(track: Track, model: NullModel, nominal: Array) -> tuple[Array, 
     return white, predicted
 
 
-def test_blocks_equal_the_plain_loop_across_a_gap() -> None:
+def test_block_filter_equals_the_plain_loop_across_a_gap() -> None:
     made = experiment(samples=900)
     track = _with_gap(track_of(made), 310, 40)
     model = true_model(made)
@@ -84,7 +85,7 @@ def test_blocks_equal_the_plain_loop_across_a_gap() -> None:
     assert np.abs(done.predicted_b - predicted).max() < 1e-12
     assert not done.used[[0, 310]].any()
     assert done.used.sum() == len(track) - 2
-    # a product of one row and of many differ in the last bit on some processors
+    # products of one row and of many rows differ in the last bit on some processors
     first = _first_field(track, model, 310)
     np.testing.assert_allclose(done.predicted_b[310], first, rtol=1e-14)
 
@@ -95,7 +96,7 @@ def _first_field(track: Track, model: NullModel, row: int) -> Array:
     )
 
 
-def test_rows_without_a_reading_are_passed_over() -> None:
+def test_rows_without_readings_are_bridged_by_the_gyro() -> None:
     made = experiment(samples=600)
     track = track_of(made)
     mag = track.mag_b_gauss.copy()
@@ -104,13 +105,13 @@ def test_rows_without_a_reading_are_passed_over() -> None:
     done = run_filter(holed, true_model(made))
     assert np.isfinite(done.whitened).all()
     assert not done.used[200:220].any()
-    # twenty samples later the gyro has carried the field to where it is
+    # twenty samples later the gyro has propagated the field correctly
     assert np.linalg.norm(done.predicted_b[220] - made_field(made)[220]) < 2e-3
 
 
 @pytest.mark.parametrize("unread", [slice(500, 660), slice(500, 1100), slice(0, 600)])
-def test_rows_far_from_any_reading_have_the_field_that_lies_between(unread: slice) -> None:
-    """A limit that is stood at, or a sensor that is stuck, for a minute, beside a loud gyro."""
+def test_field_and_gains_stay_bounded_far_from_any_reading(unread: slice) -> None:
+    """A saturated or stuck sensor for a minute, with a noisy gyro."""
     made = experiment("wam", samples=1500)
     track = track_of(made)
     mag = track.mag_b_gauss.copy()
@@ -126,8 +127,10 @@ def test_rows_far_from_any_reading_have_the_field_that_lies_between(unread: slic
     assert largest.max() < 1e6 * np.abs(whole.gains.innovation_covariance).max()
 
 
-def test_a_run_that_begins_without_a_reading_begins_with_its_first_one() -> None:
-    """A magnetometer at its limit as the recording begins: the field was zero there, and sure."""
+def test_run_without_initial_readings_starts_at_its_first_reading() -> None:
+    """The magnetometer is saturated at the start of the recording. The field was once zero
+    there, with full weight.
+    """
     made = experiment(samples=900)
     track = track_of(made)
     model = true_model(made)
@@ -147,7 +150,7 @@ def test_a_run_that_begins_without_a_reading_begins_with_its_first_one() -> None
     alone = run_filter(later, model)
     assert not done.used[:130].any()
     assert done.used[130:].all()
-    # the first innovation is as unsure as the start; from then on they are the same
+    # the first innovation is as uncertain as the start; the later ones are equal
     assert np.abs(done.whitened[130]).max() < 1.0
     assert np.abs(done.whitened[131:] - alone.whitened[1:]).max() < 0.05
     columns = nuisance_columns(done)
@@ -156,7 +159,7 @@ def test_a_run_that_begins_without_a_reading_begins_with_its_first_one() -> None
 
 
 def made_field(made: object) -> Array:
-    """True field of an experiment in the units of trace A = 3."""
+    """True field of an experiment in units in which trace A = 3."""
     scale = np.trace(made.truth.soft_iron) / 3  # type: ignore[attr-defined]
     return np.asarray(made.field_b * scale)  # type: ignore[attr-defined]
 
@@ -165,7 +168,9 @@ def made_field(made: object) -> Array:
 def test_sensitivities_equal_finite_differences_with_the_gain_held(
     walk: float, tolerance: float
 ) -> None:
-    """With a wandering bias to first order in that bias: its lever is the nominal field's."""
+    """With a wandering bias this is exact to first order in the bias: its lever is the nominal
+    field.
+    """
     made = experiment(samples=700, rate_hz=40.0)
     track = _with_gap(track_of(made), 240, 15)
     model = replace(true_model(made), gyro_walk_rad_s_sqrt_s=walk)
@@ -180,7 +185,7 @@ def test_sensitivities_equal_finite_differences_with_the_gain_held(
         assert np.abs(X[:, :, at] - numeric).max() < tolerance * max(1.0, np.abs(numeric).max())
 
 
-def test_what_is_regressed_on_is_the_derivative_where_the_rates_have_no_noise() -> None:
+def test_regression_columns_equal_the_sensitivities_for_noise_free_rates() -> None:
     made = experiment(samples=700, rate_hz=40.0)
     track, model = _with_gap(track_of(made), 240, 15), true_model(made)
     done = run_filter(track, model)
@@ -190,7 +195,7 @@ def test_what_is_regressed_on_is_the_derivative_where_the_rates_have_no_noise() 
     assert np.abs(sensitivities(same, columns) - X).max() < 1e-9 * np.abs(X).max()
 
 
-def test_sensitivities_of_terms_on_both_sides() -> None:
+def test_sensitivities_of_magnetometer_and_gyro_terms_add_up() -> None:
     made = experiment(samples=500)
     track, model = track_of(made), true_model(made)
     rng = np.random.default_rng(3)
@@ -214,8 +219,8 @@ def test_sensitivities_of_terms_on_both_sides() -> None:
 
 
 @pytest.mark.parametrize("walk", [0.0, 1e-4])
-def test_few_columns_and_many_are_seen_alike(walk: float) -> None:
-    """The band and the blocks are the same recursion, across a gap too."""
+def test_few_and_many_columns_have_equal_sensitivities(walk: float) -> None:
+    """The banded and the block recursion agree, across a gap too."""
     made = experiment(samples=500)
     track = _with_gap(track_of(made), 240, 15)
     done = run_filter(track, replace(true_model(made), gyro_walk_rad_s_sqrt_s=walk))
@@ -229,7 +234,7 @@ def test_few_columns_and_many_are_seen_alike(walk: float) -> None:
         assert np.abs(sensitivities(done, few) - many[:, :, :-1]).max() < 1e-9 * np.abs(many).max()
 
 
-def test_bearings_are_those_of_the_run() -> None:
+def test_nominal_motion_equals_that_of_the_filter() -> None:
     made = experiment(samples=500)
     track, model = _with_gap(track_of(made), 240, 15), true_model(made)
     mag, gyro = np.random.default_rng(6).standard_normal((2, len(track), 3)) * 1e-3
@@ -238,7 +243,7 @@ def test_bearings_are_those_of_the_run() -> None:
     assert np.array_equal(quick.orientation, done.orientation)
 
 
-def test_columns_without_anything_are_refused() -> None:
+def test_empty_columns_are_refused() -> None:
     made = experiment(samples=100)
     with pytest.raises(ValueError, match="input"):
         sensitivities(run_filter(track_of(made), true_model(made)), Columns())
@@ -265,7 +270,9 @@ def test_innovations_of_a_null_are_white(scenario: str, motion: str, sigma_gyro:
 
 
 def _t_of(done: Filtered, extra: Array) -> float:
-    """Estimate over its deviation of one magnetometer column, the calibration projected out."""
+    """Estimate divided by its deviation for one magnetometer column, with the calibration
+    projected out.
+    """
     columns = nuisance_columns(done)
     assert columns.mag is not None
     assert columns.gyro is not None
@@ -283,8 +290,8 @@ def _t_of(done: Filtered, extra: Array) -> float:
     return float((inverse @ X.T @ y)[11] / np.sqrt(inverse[11, 11]))
 
 
-def test_trap_a_the_field_does_not_grow_on_a_noisy_gyro() -> None:
-    """At 5 mrad/s an additive update on its own sphere finds a trend in |h| on every null."""
+def test_predicted_field_has_no_trend_with_a_noisy_gyro() -> None:
+    """At 5 mrad/s an additive update on its own sphere finds a trend in |h| in every null."""
     values = []
     for seed in range(8):
         made = experiment("wam", seed=seed, samples=5000, sigma_gyro=5e-3)
@@ -297,8 +304,8 @@ def test_trap_a_the_field_does_not_grow_on_a_noisy_gyro() -> None:
     assert np.sum(np.square(values)) < stats.chi2.ppf(0.999, 8)
 
 
-def test_trap_d_a_direction_without_information_has_none() -> None:
-    """At rest the sum of hard iron and field is all that is seen."""
+def test_sensitivities_at_rest_have_no_information_on_the_iron() -> None:
+    """At rest only the sum of hard iron and field is observed."""
     made = experiment("lam", samples=600)
     track = track_of(made)
     still = replace(
@@ -309,12 +316,12 @@ def test_trap_d_a_direction_without_information_has_none() -> None:
     done = run_filter(still, true_model(made))
     X = sensitivities(done, nuisance_columns(done))[done.used].reshape(-1, 11)
     scaled = X / np.maximum(np.linalg.norm(X, axis=0), 1e-300)
-    # hard iron and soft iron move the first reading and every later one alike
+    # hard iron and soft iron change the first reading and all later ones equally
     assert np.abs(X[:, :8]).max() < 1e-6 * np.abs(X[:, 8:]).max()
     assert np.isfinite(scaled).all()
 
 
-def test_traceless_directions_keep_the_trace() -> None:
+def test_traceless_directions_have_no_trace_and_full_rank() -> None:
     assert np.abs(np.trace(TRACELESS, axis1=1, axis2=2)).max() == 0
     assert np.linalg.matrix_rank(TRACELESS.reshape(5, 9)) == 5
 
@@ -325,7 +332,7 @@ def of(mag: int = 0, gyro: int = 0) -> Columns:
     return Columns(*sides)
 
 
-def test_batches_are_of_one_side_and_no_wider_than_wanted() -> None:
+def test_batches_have_one_sensor_and_a_limited_width() -> None:
     columns = [
         of(mag=3),
         of(gyro=2),

@@ -30,7 +30,7 @@ def _filtered(seed: int, extra: Array | None = None, samples: int = 4000) -> Fil
 
 
 def _red(seed: int, power: float, samples: int = 4000, memory_s: float = 1.0) -> Array:
-    """Red noise of `power` times the white noise's 1 mG^2."""
+    """Red noise with `power` times the white noise's 1 mG^2."""
     keep = np.exp(-0.04 / memory_s)
     white = np.random.default_rng([seed, 77]).standard_normal((samples, 3))
     return np.asarray(
@@ -46,7 +46,7 @@ def test_white_innovations_have_no_colour_and_no_tails() -> None:
         assert level_facts(done, spec_given=True) == []
 
 
-def test_colour_is_found() -> None:
+def test_colour_is_found_and_removed_by_its_filter() -> None:
     done = _filtered(0, _red(0, 0.3))
     colour = fit_colour(done)
     assert colour.order >= 1
@@ -59,7 +59,7 @@ def test_colour_is_found() -> None:
     assert abs(np.var(again) - 1) < 0.03
 
 
-def test_heavy_tails() -> None:
+def test_degrees_of_freedom_of_heavy_tails_are_found() -> None:
     rng = np.random.default_rng(4)
     made = experiment("wam", samples=6000, sigma_mag=1e-6)
     track = track_of(made)
@@ -70,7 +70,7 @@ def test_heavy_tails() -> None:
     assert level_facts(done) == []
 
 
-def test_a_burst_is_found_with_its_time_and_size() -> None:
+def test_noise_burst_is_found_with_its_time_and_size() -> None:
     rng = np.random.default_rng(6)
     extra = np.zeros((4000, 3))
     extra[1500:1900] = 3e-3 * rng.standard_normal((400, 3))
@@ -82,7 +82,7 @@ def test_a_burst_is_found_with_its_time_and_size() -> None:
     assert abs(fact.parameters[0].value / 3e-3 - 1) < 0.25
 
 
-def test_several_bursts_are_told_apart() -> None:
+def test_several_bursts_are_separated() -> None:
     rng = np.random.default_rng(6)
     extra = np.zeros((4000, 3))
     spans = [(400, 560), (1700, 1850), (3700, 3880)]
@@ -97,7 +97,7 @@ def test_several_bursts_are_told_apart() -> None:
 
 
 def _heavy(seed: int, samples: int) -> Filtered:
-    """White innovations of Student's t with 3.5 degrees of freedom and variance 1."""
+    """White innovations from Student's t with 3.5 degrees of freedom and variance 1."""
     done = _filtered(0)
     drawn = np.random.default_rng([seed, 35]).standard_t(3.5, (samples, 3)) / np.sqrt(3.5 / 1.5)
     track = replace(
@@ -110,7 +110,7 @@ def _heavy(seed: int, samples: int) -> Filtered:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_heavy_tails_are_no_bursts_and_hide_none(seed: int) -> None:
+def test_heavy_tails_are_no_bursts_and_do_not_hide_one(seed: int) -> None:
     done = _heavy(seed, 10000)
     assert level_facts(done) == []
     louder = done.whitened.copy()
@@ -126,7 +126,7 @@ def test_heavy_tails_are_no_bursts_and_hide_none(seed: int) -> None:
 
 
 @pytest.mark.parametrize("onset", [0, 1800])
-def test_a_higher_level(onset: int) -> None:
+def test_higher_noise_level_is_found_with_onset_and_size(onset: int) -> None:
     rng = np.random.default_rng(7)
     extra = np.zeros((4000, 3))
     extra[onset:] = 1.5e-3 * rng.standard_normal((4000 - onset, 3))
@@ -137,16 +137,16 @@ def test_a_higher_level(onset: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_few_outliers_are_no_level_above_the_data_sheet(seed: int) -> None:
+def test_outliers_are_not_a_higher_noise_level(seed: int) -> None:
     rng = np.random.default_rng([seed, 8])
     extra = np.where(rng.random((4000, 1)) < 0.003, 15e-3 * rng.standard_normal((4000, 3)), 0.0)
     done = _filtered(seed, extra)
     _, variance, size = block_variances(done)
-    assert np.average(variance, weights=size) > 1.3  # the power is well above
+    assert np.average(variance, weights=size) > 1.3  # the power is well above the specification
     assert level_facts(done, spec_given=True) == []
 
 
-def test_a_level_that_falls_is_no_burst_that_begins_with_the_recording() -> None:
+def test_decreasing_noise_level_is_not_a_burst() -> None:
     extra = np.zeros((4000, 3))
     extra[:1300] = 1.2e-3 * np.random.default_rng(8).standard_normal((1300, 3))
     (fact,) = level_facts(_filtered(3, extra))
@@ -156,7 +156,7 @@ def test_a_level_that_falls_is_no_burst_that_begins_with_the_recording() -> None
     assert abs(fact.parameters[0].value / 1.2e-3 - 1) < 0.2
 
 
-def test_a_field_that_stands_still_bit_by_bit_has_no_noise_to_judge() -> None:
+def test_constant_field_has_no_noise_facts() -> None:
     done = _filtered(0)
     flat = replace(done.track, mag_b_gauss=np.tile(done.track.mag_b_gauss[:1], (4000, 1)))
     still = replace(flat, gyro_b_rad_s=np.zeros((4000, 3)))
@@ -166,14 +166,14 @@ def test_a_field_that_stands_still_bit_by_bit_has_no_noise_to_judge() -> None:
     assert fit_colour(filtered).order == 0
 
 
-def test_motion_without_a_gyro_is_no_burst() -> None:
+def test_motion_with_a_dead_gyro_is_not_a_burst() -> None:
     done = _filtered(0)
     lost = replace(done.track, gyro_b_rad_s=np.zeros((4000, 3)))
     model = replace(done.model, sigma_mag_gauss=1e-2)
     assert level_facts(run_filter(lost, model), spec_given=True) == []
 
 
-def test_a_slow_field_is_no_noise() -> None:
+def test_slow_field_is_not_noise() -> None:
     t = np.arange(4000) * 0.04
     bump = 0.02 * np.exp(-(((t - 80) / 6) ** 2))[:, None] * np.array([1.0, 0.5, -1.0])
     done = _filtered(3, bump)
@@ -183,13 +183,13 @@ def test_a_slow_field_is_no_noise() -> None:
     assert variance.max() < 2
 
 
-def test_the_colour_before_a_filter_is_told_from_what_the_filter_made_of_it():
+def test_colour_before_a_filter_is_recovered_from_the_filtered_colour():
     wanted = Colour(np.array([0.6]), 1.0)
     found = Colour(np.array([0.3]), 0.9)
     colour, louder = colour_before_filter(wanted, found)
     expected = wanted.power**2 / found.power
     np.testing.assert_allclose(colour.power, expected, rtol=0.02)
-    # variances are the means of the densities
+    # variances are means of the spectral densities
     assert louder**2 == pytest.approx(expected.mean() / wanted.power.mean(), rel=0.01)
     same, factor = colour_before_filter(wanted, wanted)
     np.testing.assert_allclose(same.power, wanted.power, rtol=1e-4)

@@ -1,4 +1,4 @@
-"""Blocks of rows that advance together, and the small inverse of their gains."""
+"""Blocks of rows that advance together, and the 3x3 inverse of their gains."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def test_layout_covers_every_row_once() -> None:
     assert layout.starts[layout.opens].tolist() == [0, 7, 8]
 
 
-def test_the_inverse_is_one() -> None:
+def test_inverse_3x3_equals_the_general_inverse() -> None:
     rng = np.random.default_rng(1)
     root = rng.normal(size=(200, 3, 3)) + 3.0 * np.eye(3)
     S = root @ np.swapaxes(root, 1, 2)

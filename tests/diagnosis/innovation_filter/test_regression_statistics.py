@@ -1,4 +1,6 @@
-"""What a regression says of a group of columns: what it shows, what it is worth, what not."""
+"""Statistics of a group of columns in a regression: score, evidence, and uninformative
+directions.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ from ahrsd.diagnosis.innovation_filter.regression_statistics import (
 VALUES = np.random.default_rng(0).standard_normal((500, 3))
 
 
-def test_a_direction_counts_where_one_prior_deviation_would_show():
+def test_direction_counts_if_one_prior_deviation_is_detectable():
     effect = EFFECTS["mag_bias_temperature"]
     assert effect.least_information == pytest.approx((3 / 50) ** 2)
     scale = np.array([one.scale for one in effect.parameters])
@@ -32,14 +34,14 @@ def test_a_direction_counts_where_one_prior_deviation_would_show():
     np.testing.assert_allclose(what.value, [30 * scale[0], 0.0, 0.0], atol=1e-12)
 
 
-def test_posterior_sums_to_one_and_follows_the_odds():
+def test_posterior_probabilities_sum_to_one_and_follow_the_odds():
     found = posterior_probabilities({"a": 3.0, "b": 0.0, "c": 0.0}, {"c": -1.0})
     assert sum(found.values()) == pytest.approx(1.0, abs=1e-12)
     assert found["a"] / found["b"] == pytest.approx(np.exp(3.0))
     assert found["b"] / found["c"] == pytest.approx(np.e)
 
 
-def test_a_direction_without_information_is_left_at_zero():
+def test_direction_without_information_is_zero():
     G = np.diag([4.0, 1.0, 0.0]) + 0.0
     np.testing.assert_allclose(
         solve_semidefinite(G, np.array([[8.0], [3.0], [0.0]]))[:, 0], [2.0, 3.0, 0.0]
@@ -56,7 +58,7 @@ def slow(rng, width):
     return lfilter([1.0], [1.0, -0.98], rng.standard_normal((4800, width)), axis=0)
 
 
-def test_evidence_is_the_closed_form_of_one_size():
+def test_log_bayes_factor_equals_the_closed_form_for_one_column():
     rng = np.random.default_rng(6)
     X = slow(rng, 1)
     what = scored(X, 0.02 * X[:, 0] + rng.standard_normal(4800), [1.0])
@@ -69,7 +71,7 @@ def test_evidence_is_the_closed_form_of_one_size():
     assert log_bayes_factor(what) == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_smaller_family_wins_over_one_that_contains_it():
+def test_smaller_model_has_more_evidence_than_one_that_contains_it():
     rng = np.random.default_rng(7)
     X = slow(rng, 4)
     e = 0.05 * X[:, 0] + rng.standard_normal(4800)
@@ -78,18 +80,18 @@ def test_a_smaller_family_wins_over_one_that_contains_it():
     assert one > four + 3 > 20
 
 
-def test_a_coefficient_pays_nothing_for_its_unit():
+def test_evidence_hardly_depends_on_the_scale_of_a_coefficient():
     """A field per ampere of a motor that draws fifty, and one per thousand turns of its shaft."""
     rng = np.random.default_rng(9)
     X = slow(rng, 3)
     e = X @ np.full(3, 0.03) + rng.standard_normal(4800)
-    small = scored(X, e, np.full(3, 1.0))  # a value of 3 % of the usual one
+    small = scored(X, e, np.full(3, 1.0))  # a value of 3 % of the usual scale
     usual = scored(X, e, np.full(3, 0.1))
     assert small.value == pytest.approx(usual.value)
     assert log_bayes_factor(small) == pytest.approx(log_bayes_factor(usual), abs=0.6)
 
 
-def test_probabilities_are_those_of_the_distributions():
+def test_tail_probabilities_equal_those_of_scipy():
     assert regression_statistics.chi2_above(7.3, 4) == pytest.approx(
         stats.chi2.sf(7.3, 4), rel=1e-12
     )
@@ -102,7 +104,7 @@ def test_probabilities_are_those_of_the_distributions():
     assert regression_statistics.student_quantile(0.9995, 15) == pytest.approx(quantile, rel=1e-9)
 
 
-def test_student_of_variance_one():
+def test_student_density_of_unit_variance_equals_that_of_scipy():
     for freedom in (2.2, 5.0, 60.0):
         scale = np.sqrt((freedom - 2) / freedom)
         expected = stats.t.logpdf(VALUES, freedom, scale=scale)

@@ -1,4 +1,4 @@
-"""`ahrsd emulate --effect`: the emulated device reads what the effect adds along its motion."""
+"""`ahrsd emulate --effect`: the emulated device's readings contain the effect along its motion."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def sensors(device, seconds):
     return values[:, 0], values[:, 1:4], values[:, 4:]
 
 
-def test_a_misaligned_device_reads_the_turned_field():
+def test_misaligned_device_reads_the_rotated_field():
     wanted = ["mag_gyro_misalignment=angle_x=0.1,angle_z=-0.05"]
     _, mag, gyro = sensors(build(SETUP, EmulatedEffects(SETUP, wanted)), 20.0)
     plain = build(SETUP)
@@ -36,14 +36,14 @@ def test_a_misaligned_device_reads_the_turned_field():
     truth = plain.truth
     field = np.linalg.solve(truth.soft_iron, (before - truth.hard_iron_gauss).T)
     turned = (truth.soft_iron @ so3.exp(np.array([0.1, 0.0, -0.05])) @ field).T
-    # the noise of 2 mG is the same in both; turned, it differs by a tenth
+    # the noise of 2 mG is the same in both; rotated, it differs by a tenth
     assert mag == pytest.approx(turned + truth.hard_iron_gauss, abs=2e-3)
     assert np.abs(mag - before).max() > 0.02
     assert np.array_equal(gyro, gyro_before)
 
 
 @pytest.mark.slow
-def test_the_gyro_follows_the_device_s_own_temperature():
+def test_gyro_bias_follows_the_temperature_of_the_emulated_device():
     wanted = ["gyro_bias_temperature=bias_per_degree_y=0.001"]
     device = build(SETUP, EmulatedEffects(SETUP, wanted))
     temperature = columns(device, 400.0, "temperature_c")[:, 0]
@@ -55,7 +55,7 @@ def test_the_gyro_follows_the_device_s_own_temperature():
     assert slope == pytest.approx(1e-3, rel=0.02)
 
 
-def test_the_same_instants_get_the_same_answer_however_they_are_asked():
+def test_effect_at_an_instant_does_not_depend_on_how_instants_are_grouped():
     wanted = ["viscous_magnetisation", "hysteresis", "motor_current_field=2"]
     time_s = np.arange(PIECE_S - 5, PIECE_S + 5, 1 / 800)
     at_once = EmulatedEffects(SETUP, wanted).at(time_s)
@@ -63,28 +63,28 @@ def test_the_same_instants_get_the_same_answer_however_they_are_asked():
     parts = [bit_by_bit.at(part) for part in np.split(time_s, 40)]
     for side in (0, 1):
         assert np.array_equal(at_once[side], np.vstack([part[side] for part in parts]))
-    # pieces meet: a memory of two minutes is enough for these
+    # pieces are continuous: a memory of two minutes is enough for these effects
     step = np.abs(np.diff(at_once[0], axis=0)).max(axis=1)
     border = np.searchsorted(time_s, PIECE_S)
     assert step[border - 2 : border + 2].max() < 3e-4
 
 
-def test_before_the_start_it_is_as_at_the_start():
+def test_effect_before_the_start_equals_that_at_the_start():
     effects = EmulatedEffects(SETUP, ["motor_current_field"])
     past, start = effects.at(np.array([-1.0, -0.5])), effects.at(np.zeros(2))
     assert np.array_equal(past[0], start[0])
 
 
 @pytest.mark.parametrize(
-    ("wanted", "said"),
+    ("wanted", "message"),
     [
         ("mag_saturation", "mag_saturation cannot be emulated; there are hard_iron_step"),
         ("noise_burst", "noise_burst cannot be emulated"),
         ("magic", "no effect 'magic'"),
     ],
 )
-def test_what_cannot_be_emulated_is_one_line(run, capsys, wanted, said):
+def test_effect_that_cannot_be_emulated_is_refused_in_one_line(run, capsys, wanted, message):
     assert run("emulate", "--effect", wanted) == 2
     error = capsys.readouterr().err
-    assert said in error
+    assert message in error
     assert error.count("\n") == 1

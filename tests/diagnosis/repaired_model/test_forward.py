@@ -1,4 +1,4 @@
-"""The forward model: consistent truth, noise as asked for, the same seed the same readings."""
+"""The forward model: consistent truth, noise as requested, equal readings for equal seeds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def terms(readings, *names):
     return tuple(found)
 
 
-def test_the_truth_turns_exactly_as_its_rate_says():
+def test_noise_free_field_turns_exactly_by_its_rates():
     context, readings = moving(1, rows=900, gap_at=400)
     rng = np.random.default_rng(0)
     drift = so3.exp(2e-3 * (readings.time_s - readings.time_s[0])[:, None] * np.ones(3))
@@ -41,7 +41,7 @@ def test_the_truth_turns_exactly_as_its_rate_says():
     assert np.einsum("nij,nj->ni", turn, before) == pytest.approx(truth.field_b[within], abs=1e-12)
     size = np.linalg.norm(truth.field_b, axis=1)
     assert size == pytest.approx(np.full(900, size[0]))
-    # the attitude drifts by 0.17 rad in all; the field holds it but for the turn about itself
+    # the attitude drifts by 0.17 rad in total; the field fixes it but for the turn about itself
     assert np.abs(truth.field_b - readings.field_b).max() < 0.02
     assert truth.R_nb @ np.swapaxes(truth.R_nb, 1, 2) == pytest.approx(
         np.tile(np.eye(3), (900, 1, 1))
@@ -50,7 +50,7 @@ def test_the_truth_turns_exactly_as_its_rate_says():
     assert np.linalg.norm(angle, axis=1).max() < 0.2
 
 
-def test_a_perfect_context_is_its_own_truth():
+def test_perfect_context_is_returned_unchanged():
     context, readings = moving(2)
     truth = forward.noise_free_readings(context)
     assert truth.field_b == pytest.approx(readings.field_b, abs=1e-10)
@@ -58,7 +58,7 @@ def test_a_perfect_context_is_its_own_truth():
     assert truth.R_nb == pytest.approx(readings.R_nb, abs=1e-9)
 
 
-def test_simulated_noise_is_what_the_filter_expects():
+def test_simulated_noise_has_the_level_that_the_filter_expects():
     context, _ = moving(3, rows=4000)
     truth = forward.noise_free_readings(context)
     noise = forward.model_noise(context.model)
@@ -73,7 +73,7 @@ def test_simulated_noise_is_what_the_filter_expects():
     assert not np.array_equal(other.mag_b_gauss, made.mag_b_gauss)
 
 
-def test_coloured_noise_is_made_and_found_again():
+def test_simulated_coloured_noise_is_recovered_by_the_filter():
     context, _ = moving(4, rows=6000)
     model = context.model
     noise = Noise(model.sigma_mag_gauss, model.sigma_gyro_rad_s, 0.0, (0.5, 0.2))
@@ -86,15 +86,15 @@ def test_coloured_noise_is_made_and_found_again():
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "message"),
     [((-1e-3, 1e-3), "negative"), ((1e-3, 1e-3, 0.0, (1.0,)), "not stable")],
 )
-def test_noise_that_cannot_be(values, said):
-    with pytest.raises(ValueError, match=said):
+def test_invalid_noise_is_refused(values, message):
+    with pytest.raises(ValueError, match=message):
         Noise(*values)
 
 
-def test_terms_come_before_the_noise_and_clipping_behind_it():
+def test_terms_are_added_before_the_noise_and_clipping_after_it():
     context, _ = moving(5)
     truth = forward.noise_free_readings(context)
     noise = Noise(1e-3, 1e-3)
@@ -109,7 +109,7 @@ def test_terms_come_before_the_noise_and_clipping_behind_it():
     assert free.mag_b_gauss - plain.mag_b_gauss == pytest.approx(current * wanted[1].value)
 
 
-def test_a_model_file_reads_back_as_it_was_written():
+def test_model_file_round_trip():
     context, readings = moving(6)
     named = terms(readings, *(name for name, e in EFFECTS.items() if e.kind == "mean"))
     noise = Noise(1e-3, 5e-4, 1e-6, (0.3, -0.1), 3.5)
@@ -129,7 +129,7 @@ def test_a_model_file_reads_back_as_it_was_written():
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda body: body.update(schema="ahrsd.calibration/1"), "schema must be 'ahrsd.model/1'"),
         (lambda body: body.pop("noise"), "noise is missing"),
@@ -149,17 +149,17 @@ def test_a_model_file_reads_back_as_it_was_written():
         (lambda body: body.update(terms=None), "terms must be a list"),
     ],
 )
-def test_a_bad_model_file_is_one_line(change, said):
+def test_bad_model_file_is_refused_in_one_line(change, message):
     context, readings = moving(6)
     named = terms(readings, "motor_current_field")
     body = json.loads(to_text(RepairedModel(context.model, Noise(1e-3, 5e-4), named)))
     change(body)
     with pytest.raises(ValueError) as caught:
         from_text(json.dumps(body))
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_text_that_is_no_json():
+def test_text_that_is_not_json_is_refused():
     with pytest.raises(ValueError, match="is no JSON"):
         from_text("{")

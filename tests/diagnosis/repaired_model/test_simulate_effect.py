@@ -26,13 +26,13 @@ def plain():
 
 
 @pytest.mark.parametrize("name", list(EFFECTS))
-def test_every_effect_reaches_the_file_and_its_truth(run, tmp_path, name):
+def test_every_effect_is_in_the_file_and_in_its_truth(run, tmp_path, name):
     path = tmp_path / "x.parquet"
     assert run("simulate", "mam", "-o", path, *SHORT, "--effect", name) == 0
     rows, before = read_table(path).rows, plain().samples
-    (said,) = truth_of(path)["effects"]
-    assert said["effect"] == name
-    assert [p["unit"] for p in said["parameters"]] == [p.unit for p in EFFECTS[name].parameters]
+    (message,) = truth_of(path)["effects"]
+    assert message["effect"] == name
+    assert [p["unit"] for p in message["parameters"]] == [p.unit for p in EFFECTS[name].parameters]
     same_rows = len(rows) == len(before)
     assert same_rows == (name != "dropped_samples")
     changed = not same_rows or not (
@@ -43,7 +43,7 @@ def test_every_effect_reaches_the_file_and_its_truth(run, tmp_path, name):
     assert changed
 
 
-def test_the_effect_is_as_large_as_was_asked_for(run, tmp_path):
+def test_effect_has_the_requested_size(run, tmp_path):
     path = tmp_path / "x.csv"
     wanted = "motor_current_field=field_per_ampere_x=0.002,field_per_ampere_z=-0.001"
     assert run("simulate", "mam", "-o", path, *SHORT, "--effect", wanted) == 0
@@ -56,7 +56,7 @@ def test_the_effect_is_as_large_as_was_asked_for(run, tmp_path):
     assert added[:, 2] == pytest.approx(-0.001 * current, abs=1e-12)
 
 
-def test_strength_onset_and_several_effects(run, tmp_path):
+def test_strength_and_onset_of_several_effects_are_applied(run, tmp_path):
     path = tmp_path / "x.csv"
     wanted = ("--effect", "hard_iron_step=3,onset_s=25", "--effect", "gyro_scale=2")
     assert run("simulate", "mam", "-o", path, *SHORT, *wanted) == 0
@@ -74,19 +74,19 @@ def test_strength_onset_and_several_effects(run, tmp_path):
     ]
 
 
-def test_a_lag_is_the_field_of_a_moment_ago(run, tmp_path):
+def test_simulated_delay_of_one_sample_gives_the_previous_field(run, tmp_path):
     path = tmp_path / "x.csv"
     assert run("simulate", "mam", "-o", path, *SHORT, "--effect", "mag_time_lag=lag=0.04") == 0
     rows, before = read_table(path).rows, plain()
     A, b = before.truth.soft_iron, before.truth.hard_iron_gauss
     noise = before.samples.raw_b_gauss - (before.field_b @ A.T + b)
     seen = rows.raw_b_gauss - noise
-    # one sample of 25 Hz ago; seconds of coning within a step are all that differs
+    # one sample at 25 Hz; only coning within a step differs
     assert seen[1:] == pytest.approx(before.field_b[:-1] @ A.T + b, abs=2e-6)
 
 
 @pytest.mark.parametrize(
-    ("wanted", "said"),
+    ("wanted", "message"),
     [
         ("motor_curent_field", "no effect 'motor_curent_field'; is motor_current_field meant?"),
         ("xyz", "no effect 'xyz'; docs/reference/effects.md lists them"),
@@ -97,15 +97,15 @@ def test_a_lag_is_the_field_of_a_moment_ago(run, tmp_path):
         ("hard_iron_step=onset_s=soon", "onset_s is 'soon'"),
     ],
 )
-def test_a_bad_effect_is_one_line(run, tmp_path, capsys, wanted, said):
+def test_bad_effect_is_refused_in_one_line(run, tmp_path, capsys, wanted, message):
     assert run("simulate", "mam", "-o", tmp_path / "x.csv", "--effect", wanted) == 2
     error = capsys.readouterr().err
-    assert said in error
+    assert message in error
     assert error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_byte_stream_has_no_place_for_a_current(run, tmp_path, capsys):
+def test_byte_stream_cannot_have_a_current(run, tmp_path, capsys):
     path = tmp_path / "x.vnraw"
     arguments = ("simulate", "mam", "-o", path, *SHORT, "--effect")
     assert run(*arguments, "motor_current_field") == 2
@@ -127,7 +127,7 @@ def repaired(tmp_path, source):
     return path, value
 
 
-def test_a_repaired_model_along_a_recording(run, tmp_path):
+def test_simulation_of_a_repaired_model_along_a_recording(run, tmp_path):
     source, made = tmp_path / "s.csv", tmp_path / "y.csv.gz"
     effect = "motor_current_field=field_per_ampere_x=0.002"
     assert run("simulate", "mam", "-o", source, *SHORT, "--effect", effect, "--gap", 20) == 0
@@ -138,7 +138,7 @@ def test_a_repaired_model_along_a_recording(run, tmp_path):
     assert np.array_equal(rows.time_s, given.time_s)
     assert read_table(made).starts == read_table(source).starts
     assert rows.covariates["motor_current_a"] == pytest.approx(given.covariates["motor_current_a"])
-    # the same field along the same headings with the same current: they differ by their noise
+    # same field, headings and current: the two differ by their noise only
     left = rows.raw_b_gauss - given.raw_b_gauss
     assert left.std() == pytest.approx(np.sqrt(2) * 1e-3, rel=0.3)
     slope = np.polyfit(given.covariates["motor_current_a"], left[:, 0], 1)[0]
@@ -150,7 +150,7 @@ def test_a_repaired_model_along_a_recording(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("--model", "m.json"), "--model and --along need each other"),
         (("wam", "--model", "m.json", "--along", "s.csv"), "take neither a scenario"),
@@ -161,7 +161,7 @@ def test_a_repaired_model_along_a_recording(run, tmp_path):
         ((), "name a scenario"),
     ],
 )
-def test_bad_use_is_one_line(run, tmp_path, monkeypatch, capsys, arguments, said):
+def test_bad_use_is_refused_in_one_line(run, tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     effect = ("--effect", "motor_current_field")
     assert run("simulate", "mam", "-o", tmp_path / "s.csv", *SHORT, *effect) == 0
@@ -169,5 +169,5 @@ def test_bad_use_is_one_line(run, tmp_path, monkeypatch, capsys, arguments, said
     repaired(tmp_path, tmp_path / "s.csv")[0].rename(tmp_path / "m.json")
     capsys.readouterr()
     assert run("simulate", "-o", "y.csv", *arguments) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not (tmp_path / "y.csv").exists()

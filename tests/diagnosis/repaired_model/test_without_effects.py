@@ -1,4 +1,6 @@
-"""What a repaired model names is taken out of a recording: its calibration comes out straight."""
+"""The effects of a repaired model are removed from a recording, so that its calibration is
+correct.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,7 @@ from ahrsd.diagnosis.repaired_model.forward import track_from_readings as track_
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, to_text
 
 LEFT = ("mag_quantisation", "dropped_samples", "noise_level")
-UNDONE = (  # share of the effect that may stay: its contribution is taken along the measured motion
+UNDONE = (  # share of the effect that may remain: its contribution follows the measured motion
     ("motor_current_field", 0.0),
     ("gyro_bias_temperature", 0.0),
     ("hard_iron_step", 0.0),
@@ -47,7 +49,7 @@ def term_of(name, readings, strength=1.0):
 
 
 @pytest.mark.parametrize(("name", "share"), UNDONE)
-def test_what_an_effect_added_is_gone(name, share):
+def test_contribution_of_an_effect_is_removed(name, share):
     made = experiment("wam", samples=1500)
     model, track = true_model(made), with_columns(track_of(made), [name])
     clean = noise_free_readings(context_along(track, model))
@@ -63,7 +65,7 @@ def test_what_an_effect_added_is_gone(name, share):
         assert np.sqrt(np.mean((after - true) ** 2)) <= share * added + 1e-12
 
 
-def test_what_no_number_takes_out_comes_back_by_name():
+def test_effects_that_cannot_be_removed_are_returned():
     made = experiment("wam", samples=500)
     track, model = track_of(made), true_model(made)
     terms = [Term(name, np.zeros(1), np.zeros(1), {}) for name in LEFT]
@@ -72,7 +74,7 @@ def test_what_no_number_takes_out_comes_back_by_name():
     assert left == LEFT
 
 
-def test_a_column_that_is_missing_is_named():
+def test_missing_column_is_named_in_the_error():
     made = experiment("wam", samples=500)
     term = Term("motor_current_field", np.ones(3), np.zeros(3), {"covariate": "motor_current_a"})
     with pytest.raises(ValueError, match="motor_current_field needs the column motor_current_a"):
@@ -80,7 +82,7 @@ def test_a_column_that_is_missing_is_named():
 
 
 @pytest.mark.slow
-def test_calibrate_with_the_model_gives_the_calibration_without_the_effect(run, tmp_path, capsys):
+def test_calibrate_with_a_model_removes_the_effect(run, tmp_path, capsys):
     path, model_path = tmp_path / "x.csv", tmp_path / "model.json"
     wanted = ("--motion", "rov", "--seconds", 200, "--seed", 4)
     assert run("simulate", "mam", "-o", path, *wanted, "--effect", "motor_current_field=6") == 0

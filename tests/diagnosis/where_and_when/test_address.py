@@ -1,4 +1,4 @@
-"""When a course is away from its usual level."""
+"""Intervals in which a time course departs from its usual level."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from ahrsd.diagnosis.where_and_when.address import departure_intervals
 
 
-def test_departures_are_from_the_level_that_holds_for_longest():
+def test_departures_are_measured_from_the_most_frequent_level():
     edges = np.linspace(0.0, 400.0, 41)
     course = np.zeros((40, 3))
     course[12:20] = 2.0

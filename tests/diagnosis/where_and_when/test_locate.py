@@ -1,4 +1,4 @@
-"""Segments of a recording, and departures of a course in them."""
+"""Segments of a recording, and departures of a time course in them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ahrsd.diagnosis.where_and_when.address import extend_departures, joined_int
 from ahrsd.diagnosis.where_and_when.locate import equal_segments
 
 
-def test_neighbouring_segments_join():
+def test_neighbouring_segments_are_joined():
     edges = np.arange(6.0)
     assert joined_intervals(edges, np.array([True, True, False, False, True])) == [
         (0.0, 2.0),
@@ -26,8 +26,8 @@ def test_segments_cover_every_sample_once():
     assert cut.middle_s[0] == pytest.approx(3.0 + 100 / 14)
 
 
-def test_what_comes_and_goes_slowly_is_told_as_long_as_it_shows():
-    """Its levels miss the slopes; beyond them there is noise."""
+def test_slow_departure_is_extended_to_its_significant_slopes():
+    """The levels alone miss the slopes; beyond them there is only noise."""
     rng = np.random.default_rng(2)
     course = 0.1 * rng.standard_normal((40, 3))
     course[10:18, 0] += 1.5 * np.sin(np.pi * (np.arange(8) + 0.5) / 8) ** 2 + 0.15

@@ -1,4 +1,4 @@
-"""Waves by heading, which no column and no name has."""
+"""Harmonics of the heading, which no column and no effect describes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.where_and_when.regime import HARMONICS, heading_columns
 
 
-def test_waves_by_hand() -> None:
+def test_heading_columns_are_the_harmonics_of_the_heading() -> None:
     context = fit_null(track_of(experiment("wam", samples=1500)), walk=False).context()
     columns = heading_columns(context).mag
     assert columns.shape == (len(context.track), 3, 6 * HARMONICS)

@@ -89,7 +89,7 @@ def test_filter_bias_converges_and_is_subtracted_from_angular_rate_only():
         state = out.end_state()
 
 
-def test_register_85_window_smooths_what_it_is_told_to():
+def test_register_85_window_smooths_the_selected_quantities():
     made = block(number=5)
     out = SensorOutputs(made, replace(PLAIN, windows=(0, 8)), FilterState())
     field = made.field()
@@ -152,7 +152,7 @@ def test_on_board_hsi_finds_the_iron():
     np.testing.assert_array_equal(hsi.matrix, np.eye(3))
 
 
-def test_on_board_hsi_keeps_still_at_rest():
+def test_on_board_hsi_does_not_change_at_rest():
     world = EmulatedWorld(
         EmulatedTruth(hard_iron_gauss=np.array([0.1, 0, 0])), make_motion("static", 1), 1
     )

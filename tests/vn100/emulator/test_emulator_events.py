@@ -112,7 +112,7 @@ def test_replies_late_lost_wrong_and_altered():
         assert say(made, read, 5.0) == reply
 
 
-def test_writes_refused_loudly_and_silently():
+def test_writes_can_be_refused_with_or_without_an_error():
     write, read = b"$VNWRG,07,50*58\r\n", b"$VNRRG,07*74\r\n"
     loud = device("refused_write=9@1")
     assert say(loud, write, 2.0) == b"$VNERR,09*78\r\n"
@@ -160,7 +160,7 @@ def test_bursts_arrive_every_16_ms_and_lose_nothing():
     assert total[: 18 * 190] == calm.advance(2.1)[: 18 * 190]
 
 
-def test_third_parties_write_with_and_without_a_trace():
+def test_foreign_writes_can_be_visible_or_invisible():
     aloud, silently = device("third_party_write@2"), device("third_party_change@2")
     assert aloud.advance(3.0).startswith(b"$VNWRG,23,1,0,0,0,1,0,0,0,1,0,0,0.01*")
     assert silently.advance(3.0) == b""
@@ -208,7 +208,7 @@ def test_calibrated_scenario_needs_no_correction():
     assert spread(build(Setup("rov", seed=4, output="imu")).advance(60.0)) > 0.03
 
 
-def test_setups_that_cannot_be_are_explained():
+def test_impossible_setups_are_refused_with_a_reason():
     with pytest.raises(ValueError, match="no scenario 'moon'; there are rov, "):
         build(Setup("moon"))
     with pytest.raises(ValueError, match="must divide 800"):

@@ -60,7 +60,7 @@ def test_commands_are_answered_and_output_streams():
         assert all(abs(b - a - 10e6) < 30e3 for a, b in pairwise(times))
 
 
-def test_nothing_is_echoed_and_nothing_waits_from_before_the_host_came():
+def test_new_host_gets_no_echo_and_no_old_bytes():
     with PtyEmulator(emulator(presets=STREAM)) as served:
         time.sleep(0.3)
         with opened(served.path, 921600) as host:
@@ -87,7 +87,7 @@ def test_wrong_rate_garbles_both_directions_until_it_is_right():
         assert host.read_until(REPLY_07).endswith(REPLY_07)
 
 
-def test_rates_do_not_matter_where_told_so():
+def test_baud_rate_can_be_ignored():
     with PtyEmulator(emulator(), check_baud=False) as served, opened(served.path, 9600) as host:
         host.write(READ_07)
         assert host.read_until(b"\n") == REPLY_07
@@ -204,7 +204,7 @@ def test_speed_must_be_positive(speed):
         PtyEmulator(emulator(), speed=speed)
 
 
-def test_a_process_of_its_own_starts_serves_and_ends():
+def test_emulator_process_starts_serves_and_ends():
     with EmulatorProcess(Setup("calibrated", output="imu"), speed=20.0, lossless=True) as device:
         with opened(device.path) as host:
             lines = [host.read_until(b"\n") for _ in range(400)]
@@ -271,7 +271,7 @@ def test_bad_usage_is_one_line_and_exit_2(arguments, complaint):
     assert complaint in said and said.count("\n") == 1
 
 
-def test_list_names_scenarios_and_faults():
+def test_list_shows_scenarios_and_faults():
     process = command_line("--list")
     out, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0

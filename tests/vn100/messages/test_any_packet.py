@@ -96,7 +96,7 @@ def test_every_packet_is_framed_whatever_its_groups(
             assert isinstance(decode(frame), Unused) == (not columns)
 
 
-def test_what_a_vn100_has_is_decoded_among_fields_that_it_has_not() -> None:
+def test_known_fields_are_decoded_among_unknown_ones() -> None:
     layout = binary_layout(*DRIVER)
     assert (layout.name, layout.size) == ("FA 29 7FFF 0210 000C", 8 + 198 + 13 + 36 + 2)
     values = [0.25 * k for k in range(len(layout.columns))]
@@ -125,7 +125,7 @@ def test_columns_behind_entries_that_repeat_are_found() -> None:
         assert frame.layout is layout
 
 
-def test_a_header_of_another_model_inside_a_damaged_packet_is_no_damage_of_its_own() -> None:
+def test_foreign_header_within_a_damaged_packet_is_not_counted_as_damage() -> None:
     layout = binary_layout(0x06, (0x0001, 0x000E))
     good = encode_packet(layout, [1.0] * len(layout.columns))
     bad = bytearray(good)
@@ -138,7 +138,7 @@ def test_a_header_of_another_model_inside_a_damaged_packet_is_no_damage_of_its_o
 
 @pytest.mark.parametrize("end", [b"\r\n", b"\n", b"\r\r\n", b"\r", b"\r\r"])
 @pytest.mark.parametrize("size", [1, 1000])
-def test_the_ends_that_adapters_make_of_a_line_end(end: bytes, size: int) -> None:
+def test_altered_line_ends_are_accepted(end: bytes, size: int) -> None:
     line = encode("VNYPR,+010.071,+000.278,-002.026")[:-2] + end
     layout = binary_layout(0x01, (0x0009,))
     packet = encode_packet(layout, [1.0, 0.1, 0.2, 0.3])
@@ -161,7 +161,7 @@ def test_lines_without_a_checksum_are_counted_and_not_used(end: bytes) -> None:
 
 
 @pytest.mark.parametrize("body", ["VNINS,1,2", "VNGPS,340,1", "VNISL,0", "VNSTV,1", "VNQTM,0"])
-def test_messages_of_other_models_are_named_and_no_damage(body: str) -> None:
+def test_messages_of_other_models_are_unused_and_no_damage(body: str) -> None:
     assert decode(Sentence(body, 7, 0)) == Unused(body[:5], 7)
 
 

@@ -123,7 +123,7 @@ def packet(values: list[float], offset: int = 0) -> Packet:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_is_undecodable(bad: float) -> None:
+def test_non_finite_values_are_undecodable(bad: float) -> None:
     values = [float(number) for number in range(20)]
     values[2] = bad
     broken = packet(values, offset=77)
@@ -154,7 +154,7 @@ def test_the_error_table() -> None:
     }
 
 
-def test_a_refusal_says_what_and_why() -> None:
+def test_refusal_has_command_and_reason() -> None:
     error = DeviceRefused(0x0C)
     assert isinstance(error, DriverError)
     assert (error.code, error.error.outcome) == (12, Remedy.BANDWIDTH)
@@ -168,7 +168,7 @@ def test_a_refusal_says_what_and_why() -> None:
 # ── speed ────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_parsing_asks_little_of_the_interpreter() -> None:
+def test_parsing_needs_few_interpreter_calls() -> None:
     """Measured: 26 calls a sentence and 16 a packet, by Python 3.11.
 
     Messages per second: `benchmarks/daemon/bench_parse.py`.

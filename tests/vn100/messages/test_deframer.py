@@ -1,4 +1,4 @@
-"""The deframer's laws: chunks do not matter, undamaged messages come out, bytes add up."""
+"""Laws of the deframer: independent of chunks, undamaged messages are found, and bytes add up."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ mixtures = st.lists(st.tuples(noise, messages | nested), max_size=6)
 
 @given(mixtures, st.randoms(use_true_random=False))
 @settings(max_examples=300, deadline=None)
-def test_what_a_chunk_completes_is_all_that_it_gives(
+def test_completed_message_is_predicted_correctly(
     stream: list[tuple[bytes, bytes]], rng: random.Random
 ) -> None:
     """Cut behind each message, or anywhere: what is told before is what comes."""
@@ -142,7 +142,7 @@ def test_what_a_chunk_completes_is_all_that_it_gives(
             assert told is None or bodies_told == [told]
 
 
-def test_what_a_chunk_completes_is_told_once_the_wire_is_in_sync() -> None:
+def test_completed_message_is_predicted_only_in_sync() -> None:
     deframer = Deframer()
     for message in (PACKET, LINE):
         deframer.feed(message)
@@ -161,7 +161,7 @@ def test_what_a_chunk_completes_is_told_once_the_wire_is_in_sync() -> None:
 
 @given(mixtures, noise, st.randoms(use_true_random=False))
 @settings(max_examples=300, deadline=None)
-def test_how_the_stream_is_cut_changes_nothing(
+def test_messages_do_not_depend_on_the_chunks(
     stream: list[tuple[bytes, bytes]], tail: bytes, rng: random.Random
 ) -> None:
     data = b"".join(dirt + message for dirt, message in stream) + tail
@@ -197,7 +197,7 @@ def check_record(data: bytes, frames: list[Sentence | Packet], skipped: list[Ski
     st.sampled_from(["drop", "flip", "insert"]),
 )
 @settings(max_examples=300, deadline=None)
-def test_damage_costs_one_message_at_most(
+def test_damage_loses_at_most_one_message(
     stream: list[bytes], data: st.DataObject, kind: str
 ) -> None:
     victim = data.draw(st.integers(0, len(stream) - 1))
@@ -248,7 +248,7 @@ def test_messages_follow_each_other() -> None:
     assert frames[1] == Packet(CALIBRATION, PACKET, len(LINE))
 
 
-def test_a_lone_line_feed_ends_a_line() -> None:
+def test_single_line_feed_ends_a_line() -> None:
     (frame,) = Deframer().feed(LINE.replace(b"\r", b""))
     assert (bodies([frame]), frame.length) == ([body_of(LINE)], len(LINE) - 1)
 
@@ -287,7 +287,7 @@ def test_other_devices_sentences_are_noise() -> None:
     assert [part.cause for part in deframer.take_skipped()] == [Cause.NOISE, Cause.NOISE]
 
 
-def test_two_lines_that_became_one_are_one_rejection() -> None:
+def test_two_merged_lines_are_one_rejection() -> None:
     deframer = Deframer()
     merged = LINE[:20] + LINE[12:]
     assert bodies(deframer.feed(LINE + merged + LINE)) == [body_of(LINE)] * 2
@@ -302,7 +302,7 @@ def test_a_line_broken_off_by_another_is_one_rejection() -> None:
     assert deframer.take_skipped() == [Skipped(0, LINE[:9], Cause.BROKEN)]
 
 
-def test_a_false_long_header_does_not_hold_packets_up() -> None:
+def test_false_long_header_does_not_delay_packets() -> None:
     """Each packet comes out with its last byte although the false one still waits."""
     long_header = LAYOUTS[3].header
     deframer = Deframer()
@@ -319,7 +319,7 @@ SHORT = encode_packet(LAYOUTS[2], (12.5,))
 FIRST = encode_packet(LAYOUTS[1], [1] * len(LAYOUTS[1].columns))
 
 
-def test_a_known_header_is_waited_for() -> None:
+def test_packet_with_a_known_header_is_awaited() -> None:
     """Behind a message, a whole packet that another one has as content is not taken for one."""
     assert bodies(Deframer().feed(FIRST + nest(SHORT))) == [FIRST, nest(SHORT)]
 
@@ -359,7 +359,7 @@ def test_a_refused_packet_that_ends_in_a_sync_byte_is_one_piece(size: int) -> No
     assert deframer.take_skipped() == [Skipped(len(PACKET), refused, Cause.CRC)]
 
 
-def test_silence_voids_what_waits() -> None:
+def test_silence_discards_a_partial_message() -> None:
     deframer = Deframer()
     assert len(deframer.feed(PACKET + PACKET[:40])) == 1
     assert deframer.pending == 40
@@ -369,7 +369,7 @@ def test_silence_voids_what_waits() -> None:
     assert bodies(deframer.feed(PACKET[40:] + PACKET)) == [PACKET]
 
 
-def test_silence_delivers_what_was_hidden_in_a_cut_packet() -> None:
+def test_silence_delivers_messages_hidden_in_a_truncated_packet() -> None:
     deframer = Deframer()
     assert bodies(deframer.feed(PACKET + PACKET[:10] + LINE)) == [PACKET]
     assert bodies(finish(deframer)) == [body_of(LINE)]
@@ -395,7 +395,7 @@ def test_skipped_bytes_are_kept_within_bounds() -> None:
     assert deframer.take_skipped() == []
 
 
-def test_a_line_may_be_as_long_as_the_manual_knows_any() -> None:
+def test_longest_line_of_the_manual_is_accepted() -> None:
     body = "VNRRG,23," + ",".join(["-1.234567E-05"] * 12)
     assert len(encode(body)) < LONGEST_LINE
     assert bodies(Deframer().feed(encode(body))) == [body]

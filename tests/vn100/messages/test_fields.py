@@ -48,7 +48,9 @@ ALL = {
         ("sync_out_count", "", "", ""),
     ],
 )
-def test_names_units_and_frames(name: str, unit: str, frame: str, compensation: str) -> None:
+def test_columns_have_names_units_and_frames(
+    name: str, unit: str, frame: str, compensation: str
+) -> None:
     column = ALL[name]
     assert (column.unit, column.frame, column.compensation) == (unit, frame, compensation)
 
@@ -62,7 +64,7 @@ def test_only_angles_and_times_are_scaled() -> None:
     assert sorted(name for name in ALL if name.endswith("_rad")) == sorted(angles)
 
 
-def test_one_name_is_one_row() -> None:
+def test_each_name_is_one_column() -> None:
     seen: dict[str, Column] = {}
     for group in GROUPS.values():
         for row in group.values():

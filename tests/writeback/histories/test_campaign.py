@@ -13,7 +13,7 @@ import pytest
 RESULT = Path(__file__).parents[3] / "docs" / "validation" / "campaign" / "campaign.json"
 
 
-def test_power_cuts_leave_no_device_that_disagrees_without_an_alarm():
+def test_power_cut_never_leaves_an_unreported_disagreement():
     tally = campaign_cuts.CutTally()
     for step in campaign_cuts.STEPS:
         for number in range(6):
@@ -26,13 +26,13 @@ def test_power_cuts_leave_no_device_that_disagrees_without_an_alarm():
     assert tally.flash_after == 0
 
 
-def test_every_step_has_points_to_cut():
+def test_every_step_has_points_for_power_cuts():
     places = campaign_cuts.places()
     assert len(campaign_cuts.STEPS) == 12
     assert all(places[step] for step in campaign_cuts.STEPS)
 
 
-def test_a_disagreement_and_a_lost_journal_would_be_noticed():
+def test_check_detects_a_disagreement_and_a_lost_journal():
     rig = campaign_cuts.make()
     old = rig.device.held()
     rig.whole_way()
@@ -45,7 +45,7 @@ def test_a_disagreement_and_a_lost_journal_would_be_noticed():
     assert "knows of nothing" in campaign_cuts.unrecoverable(rig, old)
 
 
-def test_with_a_red_gate_nothing_is_written():
+def test_nothing_is_written_when_a_gate_is_closed():
     tally = campaign_histories.HistoryTally()
     with campaign_histories.remembered():
         for number in range(300):
@@ -53,11 +53,11 @@ def test_with_a_red_gate_nothing_is_written():
     assert tally.wrong == []
     assert tally.writes.keys() | tally.saves.keys() <= {"flash gate red", "mixed"}
     assert tally.saves["flash gate red"] == 0
-    assert tally.writes["flash gate red"] > 50  # it would write: only the flash is forbidden
+    assert tally.writes["flash gate red"] > 50  # RAM is written: only the flash is forbidden
     assert tally.saves["mixed"] > 0
 
 
-def test_random_faults_end_in_samples_and_in_a_stop():
+def test_run_recovers_from_random_faults_and_stops_cleanly():
     tally = campaign_faults.FaultTally()
     for number in range(3):
         campaign_faults.run_one(number, 7, tally)
@@ -72,8 +72,10 @@ def test_random_faults_end_in_samples_and_in_a_stop():
 @pytest.mark.parametrize(
     "number", [506, 1079, *(pytest.param(n, marks=pytest.mark.slow) for n in (1499, 2375))]
 )
-def test_schedules_that_once_ended_badly_end_well(number):
-    """Two went on without a sample, two with outputs in the device that nobody had kept."""
+def test_fault_schedules_that_once_failed_now_pass(number):
+    """Two once continued without samples, two left output settings in the device that nobody had
+    kept.
+    """
     tally = campaign_faults.FaultTally()
     campaign_faults.run_one(number, 1, tally)
     assert tally.hangs + tally.outputs_changed + tally.exceptions + tally.differs == []
@@ -81,7 +83,7 @@ def test_schedules_that_once_ended_badly_end_well(number):
 
 
 @pytest.mark.parametrize("part", ["cuts", "histories", "cycles"])
-def test_the_published_result_is_of_this_campaign(part):
+def test_published_result_is_that_of_this_campaign(part):
     found = json.loads(RESULT.read_text())["parts"][part]
     assert found["runs"] > 0
     assert found["tally"]

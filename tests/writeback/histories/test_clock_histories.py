@@ -1,7 +1,7 @@
-"""Random histories of clocks, restarts and kills: what is concluded, against what was true.
+"""Random histories of clocks, restarts and kills: conclusions compared with what was true.
 
-The observer sits in the world: it knows when the device really restarted, what its flash holds, and
-which times the program was told. It asks nothing of the program but its journal.
+The observer knows when the device really restarted, what its flash holds, and which times the
+program received. From the program it uses only the journal.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ BUDGET_HISTORIES, BUDGET_STEPS = 24, 24
 
 
 class ForgetfulDevice(Device):
-    """Acknowledges VNWNV; whether it is carried out is another matter."""
+    """Acknowledges VNWNV, whether or not it carries it out."""
 
     keeps = True
 
@@ -38,7 +38,7 @@ class ForgetfulDevice(Device):
 
 @dataclass(frozen=True)
 class Moment:
-    """What was true: the time, the computer's boot, when the device had started."""
+    """The true state: time, the computer's boot, and the start of the device."""
 
     at_s: float
     boots: int
@@ -50,12 +50,12 @@ class Moment:
 
 
 class Observed(Rig):
-    """A rig whose clocks go wrong, and somebody who notes what was true at each record."""
+    """A rig with faulty clocks that notes the true state at each record."""
 
     def __init__(self, policy: WriteBackPolicy, draw: np.random.Generator) -> None:
         self.draw = draw
-        self.written: list[Moment] = []  # one for each record of the journal
-        self.fallen: list[Moment] = []  # the program saw the device's time fall
+        self.written: list[Moment] = []  # one per record of the journal
+        self.fallen: list[Moment] = []  # the program saw the device's time decrease
         self.reported: list[Moment] = []  # the device reported a restart
         self.heard: Moment | None = None  # by this process
         super().__init__(policy, ForgetfulDevice())
@@ -91,7 +91,7 @@ class Observed(Rig):
         self.tell_clocks()
 
     def settle(self) -> None:
-        """Seconds of messages; what the program asks for is done."""
+        """Seconds of messages; requests of the program are carried out."""
         for _ in range(3):
             asked = self.asked_again
             for _ in range(4):
@@ -111,9 +111,9 @@ def wait_s(draw) -> float:
 
 
 def act(rig: Observed) -> str:
-    """One thing that the world does."""
+    """One random event in the world."""
     draw = rig.draw
-    rig.do(rig.wb.tick(rig.now_s))  # as the core does with every input
+    rig.do(rig.wb.tick(rig.now_s))  # as the core does for every input
     what = str(draw.choice(["set", "device", "program", "computer", "link", "time"]))
     if what == "set":
         rig.set_wall()
@@ -145,20 +145,20 @@ def act(rig: Observed) -> str:
 
 
 class Observer:
-    """What the device itself shows of a restart since the record that left a save open."""
+    """What the device shows of a restart since the record that left a save open."""
 
     def __init__(self, rig: Observed) -> None:
         self.rig = rig
         self.record = rig.written[-1]
 
     def restarted(self) -> bool:
-        """Whether it did, seen or not."""
+        """Whether it restarted, observed or not."""
         return self.rig.started_s >= self.record.at_s
 
     def provable(self, slack: float) -> bool:
-        """By what the device has shown: its time, or a report where it tells no time.
+        """Whether what the device showed proves it: its time, or a report if it sends no time.
 
-        slack: 1 counts what is clear beyond doubt, -1 also what is just so
+        slack: 1 counts only clear cases, -1 also borderline cases.
         """
         rig, record = self.rig, self.record
         if not self.restarted():
@@ -175,7 +175,7 @@ class Observer:
 
 
 def save(rig: Observed) -> bool:
-    """A save that is acknowledged or not, and carried out or not; whether it was sent."""
+    """A save that may be acknowledged and carried out or not; returns whether it was sent."""
     draw = rig.draw
     rig.device.keeps = bool(draw.random() < 0.6)
     if draw.random() < 0.5:
@@ -186,8 +186,8 @@ def save(rig: Observed) -> bool:
 
 
 @pytest.fixture(scope="module")
-def told():
-    """All histories, each with the kinds of its journal and what the observer has against them."""
+def all_histories():
+    """All histories, each with the kinds of its journal records and the observer's objections."""
     ends: list[tuple[str, bool, bool]] = []
     wrong: list[str] = []
     for seed in range(HISTORIES):
@@ -215,23 +215,23 @@ def told():
     return ends, wrong
 
 
-def test_confirmed_if_and_only_if_a_restart_is_shown_and_the_new_values_are_read(told):
-    assert told[1] == []
+def test_save_is_confirmed_exactly_if_a_restart_is_shown_and_new_values_are_read(all_histories):
+    assert all_histories[1] == []
 
 
-def test_the_histories_end_in_every_way(told):
-    kinds = [kind for kind, _, _ in told[0]]
+def test_histories_cover_all_outcomes(all_histories):
+    kinds = [kind for kind, _, _ in all_histories[0]]
     assert len(kinds) == HISTORIES
     assert kinds.count("CONFIRMED") > 30
     assert kinds.count("NOT_SAVED") > 4
     assert kinds.count("REVERTED") > 5
     assert {"FLASH_SENT", "FLASH_ACKED"} & set(kinds)
-    assert ("CONFIRMED", True, False) in told[0]
-    assert not [end for end in told[0] if end[0] == "CONFIRMED" and not end[1]]
+    assert ("CONFIRMED", True, False) in all_histories[0]
+    assert not [end for end in all_histories[0] if end[0] == "CONFIRMED" and not end[1]]
 
 
-def test_the_observer_would_notice(monkeypatch):
-    """With a program that believes the wall clock, as it once did, the same histories are wrong."""
+def test_observer_detects_a_program_that_trusts_the_wall_clock(monkeypatch):
+    """With a program that trusts the wall clock, as it once did, the same histories are wrong."""
     from ahrsd.writeback import device_watch
 
     def by_the_wall(record, now, uptime_s):
@@ -257,7 +257,7 @@ def test_the_observer_would_notice(monkeypatch):
 
 
 class Meter:
-    """Sits in the device: when registers were written by a transaction, and saved."""
+    """Records in the device when a transaction wrote registers, and when it saved."""
 
     def __init__(self, rig: Observed) -> None:
         self.rig = rig
@@ -276,7 +276,7 @@ class Meter:
 
 
 def write_and_save(rig: Observed) -> None:
-    """As far as the budgets let it."""
+    """Writes and saves as far as the budgets allow."""
     draw = rig.draw
     rig.settle()
     rig.verdict(hard_iron_gauss=np.array([0.03 + 0.02 * draw.integers(9), 0.04, -0.02]))
@@ -286,13 +286,13 @@ def write_and_save(rig: Observed) -> None:
         rig.live(field_spread=float(draw.choice([0.005, 0.005, 0.005, 0.5])))
     if rig.wb.state is State.PROVEN:
         rig.stand_still()
-    if rig.wb.state is State.PROVEN:  # the budget of the day: not for ever
+    if rig.wb.state is State.PROVEN:  # the budget of the day, not a permanent one
         rig.do(rig.wb.on_operator("rollback", "", rig.now_s))
     if rig.wb.state is State.LOCKED:
         rig.do(rig.wb.on_operator("unlock", "seen", rig.now_s))
 
 
-def test_no_clock_that_is_wrong_or_set_grants_a_write_early_or_a_second_save_on_a_day():
+def test_wrong_or_set_clock_allows_no_early_write_and_no_second_save_in_a_day():
     saves = writes = 0
     for seed in range(BUDGET_HISTORIES):
         draw = np.random.default_rng([79, seed])
@@ -311,7 +311,7 @@ def test_no_clock_that_is_wrong_or_set_grants_a_write_early_or_a_second_save_on_
                 rig.connect()
             elif what == 1:
                 rig.set_wall(errors)
-            elif what == 2:  # far ahead, and back before the next boot
+            elif what == 2:  # set far ahead, and back before the next boot
                 rig.set_wall((40 * DAY_S,))
                 write_and_save(rig)
                 rig.set_wall(errors)

@@ -1,8 +1,7 @@
-"""The power goes at every point of the whole way: before and after each command and each record.
+"""Power cuts at every point of a write: before and after each command and each record.
 
-After each cut, whatever is lost, the journal and the device agree or there is an alarm; the old
-values are in the journal as long as the device does not hold them; and flash is never written by
-what follows the cut.
+After each cut, whatever is lost, journal and device agree or there is an alarm. The old values are
+in the journal as long as the device does not hold them, and recovery never writes the flash.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ HOLDS_OLD = {
     State.ROLLED_BACK,
 }
 HOLDS_NEW = {State.STAGED, State.TRIAL, State.PROVEN, State.COMMITTED, State.CONFIRMED}
-POINTS = 260  # more than the whole way has, which the first test checks
+POINTS = 260  # more points than a whole write has, which the first test checks
 
 
 def same_registers(one, two):
@@ -30,10 +29,10 @@ def same_registers(one, two):
 
 
 def assert_agreed(rig, old, new):
-    """What the machine believes is what the device holds, or it cries."""
+    """The machine's state agrees with what the device holds, or there is an alarm."""
     device, state = rig.device.held(), rig.wb.state
     if state in HOLDS_OLD:
-        left = rig.wb.history.holds  # what the last transaction left, by the journal
+        left = rig.wb.history.holds  # the result of the last transaction according to the journal
         assert same_registers(device, old if left is None else left)
     elif state in HOLDS_NEW:
         assert same_registers(device, new)
@@ -48,7 +47,7 @@ def assert_agreed(rig, old, new):
 
 @pytest.fixture
 def reference(make_rig):
-    """Old values, new values, and how many points the whole way has."""
+    """Old values, new values, and the number of points of a whole write."""
     rig = make_rig()
     old = rig.device.held()
     rig.whole_way()
@@ -56,7 +55,7 @@ def reference(make_rig):
     return old, rig.device.held(), rig.points
 
 
-def test_the_way_has_many_points(reference):
+def test_whole_write_has_between_100_and_the_maximum_of_points(reference):
     assert 100 < reference[2] < POINTS
 
 
@@ -68,7 +67,7 @@ def test_the_way_has_many_points(reference):
         *(pytest.param(Mode.STAGE, lost, marks=pytest.mark.slow) for lost in ("device", "program")),
     ],
 )
-def test_every_cut_ends_in_agreement(make_rig, reference, lost, mode):
+def test_power_cut_at_any_point_ends_in_agreement(make_rig, reference, lost, mode):
     old, new, _ = reference
     ends = set()
     for at in range(1, POINTS):
@@ -94,8 +93,8 @@ def test_every_cut_ends_in_agreement(make_rig, reference, lost, mode):
         assert State.FAULT not in ends
 
 
-def bad_way(rig):
-    """The whole way with a calibration that the trial throws out."""
+def rejected_write(rig):
+    """A whole write with a calibration that the trial rejects."""
     rig.connect()
     rig.pass_time(0.1)
     rig.verdict()
@@ -104,11 +103,11 @@ def bad_way(rig):
 
 
 @pytest.mark.parametrize("lost", ["all", "device", "program"])
-def test_every_cut_of_a_rollback_ends_with_the_old_values(make_rig, reference, lost):
+def test_power_cut_in_a_rollback_ends_with_the_old_values(make_rig, reference, lost):
     old, new, _ = reference
     for at in range(1, POINTS):
         rig = make_rig(Mode.STAGE)
-        if not rig.cut(at, lambda rig=rig: bad_way(rig)):
+        if not rig.cut(at, lambda rig=rig: rejected_write(rig)):
             assert at > 80
             break
         rolling = "ROLLBACK" in rig.kinds
@@ -122,13 +121,13 @@ def test_every_cut_of_a_rollback_ends_with_the_old_values(make_rig, reference, l
 
 
 @pytest.mark.parametrize("way", ["whole", "bad"])
-def test_a_second_cut_in_the_recovery_changes_nothing(make_rig, reference, way):
+def test_second_power_cut_during_recovery_ends_in_agreement(make_rig, reference, way):
     old, new, _ = reference
     recoveries = 0
     for at in range(1, POINTS, 2):
         for again in range(1, 12):
             rig = make_rig()
-            act = rig.whole_way if way == "whole" else lambda rig=rig: bad_way(rig)
+            act = rig.whole_way if way == "whole" else lambda rig=rig: rejected_write(rig)
             if not rig.cut(at, act):
                 assert recoveries > 50
                 return
@@ -140,7 +139,7 @@ def test_a_second_cut_in_the_recovery_changes_nothing(make_rig, reference, way):
 
 
 @pytest.mark.parametrize("half", ["one of two", "garbage"])
-def test_a_cut_inside_vnwnv_that_tears_the_flash_is_an_alarm(make_rig, reference, half):
+def test_flash_torn_by_a_cut_during_vnwnv_is_an_alarm(make_rig, reference, half):
     rig = make_rig()
     old, _, points = reference
 
@@ -159,7 +158,7 @@ def test_a_cut_inside_vnwnv_that_tears_the_flash_is_an_alarm(make_rig, reference
     assert rig.wb.state is State.FLASH_TORN
     assert "FLASH TORN" in rig.notes("error")[-1]
     assert rig.sent[-1] == "VNWNV"
-    rig.back("all")  # it stays torn until a person says otherwise
+    rig.back("all")  # it stays torn until a person intervenes
     assert rig.wb.state is State.FLASH_TORN
     rig.verdict()
     assert rig.wb.state is State.FLASH_TORN
@@ -169,7 +168,7 @@ def test_a_cut_inside_vnwnv_that_tears_the_flash_is_an_alarm(make_rig, reference
 
 
 @pytest.mark.parametrize("number", [23, 84])
-def test_a_program_killed_between_the_registers_puts_the_first_back(make_rig, reference, number):
+def test_first_register_is_restored_when_killed_between_two_registers(make_rig, reference, number):
     old, _, _ = reference
     for at in range(1, POINTS):
         rig = make_rig(Mode.STAGE)
@@ -186,7 +185,7 @@ def test_a_program_killed_between_the_registers_puts_the_first_back(make_rig, re
     pytest.fail("no cut fell between the two writes")
 
 
-def test_in_observe_an_interrupted_write_is_an_alarm_and_nothing_is_sent(make_rig, reference):
+def test_interrupted_write_is_only_an_alarm_in_mode_observe(make_rig, reference):
     old, _, _ = reference
     alarms = 0
     for at in range(1, POINTS):
@@ -205,7 +204,7 @@ def test_in_observe_an_interrupted_write_is_an_alarm_and_nothing_is_sent(make_ri
 
 
 @pytest.mark.parametrize("acknowledged", [True, False])
-def test_a_restart_that_only_the_streams_time_tells_confirms_a_save(make_rig, acknowledged):
+def test_restart_seen_only_by_device_time_confirms_a_save(make_rig, acknowledged):
     rig = make_rig()
     if not acknowledged:
         rig.device.mute = lambda command: command == Word("VNWNV")
@@ -229,7 +228,7 @@ def test_a_restart_that_only_the_streams_time_tells_confirms_a_save(make_rig, ac
 # -- the table -------------------------------------------------------------------------------------
 
 
-def test_the_table_is_total_and_its_signals_are_taken():
+def test_reconciliation_table_is_total_and_its_signals_are_handled():
     from ahrsd.writeback.journal_history import OPEN
 
     assert set(TABLE) == set(OPEN)
@@ -245,7 +244,7 @@ def test_the_table_is_total_and_its_signals_are_taken():
                 assert resolution.record not in OPEN
 
 
-def test_contradictions_are_alarms_and_old_values_never_are_before_a_save():
+def test_contradictions_are_alarms_and_old_values_before_a_save_are_not():
     for last, row in TABLE.items():
         assert row[DeviceContents.NEITHER].level in ("error", "warning")
         assert row[DeviceContents.NEITHER].signal not in (
@@ -288,11 +287,11 @@ OTHER = (2.0,) * 12
         ({23: (float("nan"),) * 12, 84: NEW}, False, DeviceContents.NEITHER),
     ],
 )
-def test_found(device, restarted, expected):
+def test_device_contents_are_classified(device, restarted, expected):
     assert compare_contents({23: OLD, 84: OLD}, {23: NEW, 84: NEW}, device, restarted) is expected
 
 
-def test_foreign_values_lock_until_a_person_looked(make_rig):
+def test_foreign_values_lock_until_unlocked(make_rig):
     rig = make_rig(Mode.STAGE)
     rig.connect()
     rig.pass_time(0.1)
@@ -309,7 +308,7 @@ def test_foreign_values_lock_until_a_person_looked(make_rig):
     assert rig.wb.state is State.OBSERVING
 
 
-def test_a_change_behind_our_back_is_noticed_at_the_next_start(make_rig):
+def test_change_by_another_program_is_noticed_at_the_next_start(make_rig):
     rig = make_rig()
     rig.whole_way()
     rig.back("all")

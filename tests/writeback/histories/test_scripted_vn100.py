@@ -1,6 +1,8 @@
-"""The scripted device against the protocol's vectors, and the project's driver against it.
+"""The scripted device compared with the protocol's vectors, and the project's driver with the
+device.
 
-It must be right by the reference alone; that the driver understands it is a second opinion on both.
+The device must be correct by the reference alone. That the driver understands it is an independent
+check of both.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ def ask(device: Unit, body: str) -> str:
 
 
 @pytest.mark.parametrize("name", ["devices/scripted_vn100", "histories/write_observer.py"])
-def test_device_and_observer_import_nothing_of_the_project(name):
+def test_scripted_device_and_observer_import_nothing_from_the_project(name):
     place = Path(write_observer.__file__).parents[1] / name
     files = sorted(place.glob("*.py")) if place.is_dir() else [place]
     assert files
@@ -54,7 +56,7 @@ def test_device_and_observer_import_nothing_of_the_project(name):
             assert not [n for n in names if n.split(".")[0] in ("ahrsd", "drivers")], file
 
 
-def test_sums_are_those_of_the_protocols_vectors():
+def test_checksums_equal_those_of_the_protocol_vectors():
     checked = 0
     for case in json.loads(VECTORS.read_text()):
         raw = bytes.fromhex(case["hex"])
@@ -78,19 +80,19 @@ def test_sums_are_those_of_the_protocols_vectors():
         (b"$VNRRG," + b"8" * 300 + b"*00", 0x02),
     ],
 )  # fmt: skip
-def test_wrong_lines_are_refused_as_the_device_does(line, code):
+def test_wrong_lines_are_refused_with_the_error_code_of_the_device(line, code):
     with pytest.raises(BadLine) as caught:
         parse_command(line)
     assert caught.value.code == code
 
 
-def test_sums_of_both_kinds_and_the_bypass_are_taken():
+def test_both_kinds_of_checksum_and_the_bypass_are_accepted():
     assert parse_command(b"$VNRRG,8*4B") == ["VNRRG", "8"]
     assert parse_command(b"$VNRRG,8*040E") == ["VNRRG", "8"]
     assert parse_command(b"$VNRRG,23*XX") == ["VNRRG", "23"]
 
 
-def test_registers_are_printed_and_refused_as_on_hardware():
+def test_registers_are_printed_and_refused_as_by_the_hardware():
     device = unit()
     assert ask(device, "VNRRG,4") == "VNRRG,04,3.1.0.0"
     assert ask(device, "VNRRG,07") == "VNRRG,07,40"
@@ -110,7 +112,7 @@ def test_registers_are_printed_and_refused_as_on_hardware():
     assert all(stored(n, text.split(",")) == text for n, (k, a, text) in TABLE.items() if a == "w")
 
 
-def test_ram_and_flash_and_who_did_it():
+def test_log_of_ram_and_flash_changes_names_the_writer():
     device, cable = unit(), None
     cable = Cable(device)
     cable.receive(sentence("VNWRG,84,1,0,0,0,1,0,0,0,1,0.01,0,0"), 1.0)
@@ -126,7 +128,7 @@ def test_ram_and_flash_and_who_did_it():
     ]  # fmt: skip
 
 
-def test_lies_are_told():
+def test_device_can_be_scripted_to_report_false_values():
     device = unit()
     device.lies.not_held, device.lies.reads_told = {84}, True
     value = "1,0,0,0,1,0,0,0,1,0.01,0,0"
@@ -140,7 +142,7 @@ def test_lies_are_told():
     assert (device.memory.floats(23)[9], device.memory.floats(84)[9]) == (0.01, 0.0)
 
 
-def test_the_physics_is_a_rotation_and_the_gyroscope_turns_the_field():
+def test_simulated_field_is_rotated_by_the_gyro_rates():
     period_s = 0.02
     h, w, f = table(Motion(1.0, 4.0), period_s, 300)
     assert np.allclose(np.linalg.norm(h, axis=1), np.linalg.norm(FIELD_N_GAUSS))
@@ -151,7 +153,7 @@ def test_the_physics_is_a_rotation_and_the_gyroscope_turns_the_field():
     assert np.linalg.eigvalsh(np.cov(h.T))[0] > 0.01
 
 
-def test_registers_23_and_84_act_on_what_is_sent_and_the_drivers_decoder_reads_it():
+def test_registers_23_and_84_correct_the_output_that_the_driver_decodes():
     right = IRON.correction()
     presets = {
         6: "0", 75: "1,40,06,0001,083F",
@@ -170,14 +172,14 @@ def test_registers_23_and_84_act_on_what_is_sent_and_the_drivers_decoder_reads_i
     data = np.array(rows)
     columns = [layout.index(f"uncomp_mag_{axis}_gauss") for axis in "xyz"]
     length = np.linalg.norm(data[:, columns], axis=1)
-    assert length.std() / length.mean() < 0.006  # noise alone: the iron is gone
+    assert length.std() / length.mean() < 0.006  # only noise: the iron is corrected
     time_s = data[:, layout.index("time_startup_s")]
     assert np.allclose(np.diff(time_s), 0.05, atol=1e-6)
     rest = data[time_s < 1.9][:, [layout.index(f"uncomp_gyro_{axis}_rad_s") for axis in "xyz"]]
     assert np.abs(rest.mean(axis=0)).max() < 3e-4
 
 
-def test_packets_are_laid_out_as_the_vector_of_the_calibration_set():
+def test_packet_layout_equals_the_protocol_vector():
     names, form = layout_of(0x06, [0x0001, 0x083F])
     assert names == [
         "time_ns", "imu_status", "uncomp_mag", "uncomp_accel", "uncomp_gyro", "temp", "pres",
@@ -192,7 +194,7 @@ def test_packets_are_laid_out_as_the_vector_of_the_calibration_set():
     assert struct.unpack("<H", made[4:6]) == (0x083F,)
 
 
-def test_another_unit_takes_over_with_its_own_number_time_and_iron():
+def test_replacement_unit_has_its_own_serial_number_time_and_iron():
     first = unit({6: "0", 75: "1,80,01,0001"})
     cable = Cable(first)
     before = len(cable.advance(1.0))
@@ -206,7 +208,7 @@ def test_another_unit_takes_over_with_its_own_number_time_and_iron():
     assert b"VNRRG,03,0000000555" in cable.advance(4.1)
 
 
-def test_replies_are_lost_doubled_and_late():
+def test_replies_can_be_lost_doubled_and_delayed():
     cable = Cable(unit())
     cable.faults.lost = 1.0
     cable.receive(sentence("VNRRG,1"), 1.0)
@@ -217,7 +219,7 @@ def test_replies_are_lost_doubled_and_late():
     assert cable.advance(3.3).count(b"VNRRG,01") == 2
 
 
-def test_it_is_served_on_a_pty_in_real_time():
+def test_device_is_served_on_a_pty_in_real_time():
     with Served(Cable(unit({6: "19", 7: "40"}))) as served:
         port = os.open(served.path, os.O_RDWR | os.O_NOCTTY)
         try:

@@ -1,4 +1,4 @@
-"""Somebody else writes through the device's other port, or it restarts unseen.
+"""Another program writes through the device's second port, or the device restarts unseen.
 
 Judged by what the unit holds and what it was sent (`cabled_units`).
 """
@@ -20,13 +20,16 @@ NEW = ("1,0,0,0,1,0,0,0,1,0.05,-0.03,0.04", "1,0,0,0,1,0,0,0,1,0.01,-0.02,0.005"
 QUICK_SAVE = ((1, False), (21, True))
 
 
-def theirs_stays(run: CabledRun) -> None:
-    """What somebody wrote is in RAM, nothing is in flash, and it was told."""
+def foreign_value_stays(run: CabledRun) -> None:
+    """The foreign value stays in RAM, nothing is in flash, and it was reported."""
     unit = run.cable.units[FIRST]
     assert unit.held()[0] == THEIRS
     assert unit.held("flash") == OLD
     assert unit.saves == []
-    assert [n for n, _ in unit.writes] == [23, 84]  # ours, once; nothing over theirs
+    assert [n for n, _ in unit.writes] == [
+        23,
+        84,
+    ]  # ours, once; the foreign value is not overwritten
     assert run.state == "LOCKED"
     assert run.kinds()[-1] == "FOREIGN"
     assert run.told("values that nobody here wrote")
@@ -41,7 +44,7 @@ def theirs_stays(run: CabledRun) -> None:
         pytest.param("proven", False, marks=pytest.mark.slow),
     ],
 )
-def test_their_value_is_found_within_the_interval_and_stays(binary, when):
+def test_foreign_value_is_found_within_the_check_interval_and_stays(binary, when):
     run = CabledRun(two_units(binary=binary))
     if when == "trial":
         run.approve()
@@ -51,7 +54,7 @@ def test_their_value_is_found_within_the_interval_and_stays(binary, when):
     run.cable.unit.ram[23] = THEIRS
     assert run.until("LOCKED", 40.0), run.notes
     run.park()
-    theirs_stays(run)
+    foreign_value_stays(run)
 
 
 @pytest.mark.parametrize(
@@ -62,7 +65,7 @@ def test_their_value_is_found_within_the_interval_and_stays(binary, when):
         for how in (False, True)
     ],
 )
-def test_just_before_the_save(binary, at):
+def test_foreign_value_written_just_before_the_save_is_not_saved(binary, at):
     run, heard = CabledRun(two_units(binary=binary)), []
     run.proven()
 
@@ -75,17 +78,17 @@ def test_just_before_the_save(binary, at):
     run.cable.unit.before = write
     run.park(30.0)
     assert len(heard) >= at
-    theirs_stays(run)
+    foreign_value_stays(run)
 
 
-def test_a_rollback_does_not_write_over_it():
+def test_rollback_does_not_overwrite_a_foreign_value():
     run = CabledRun(two_units())
     run.approve()
     assert run.until("TRIAL")
     run.cable.unit.ram[23] = THEIRS
     run.feed(Operator(run.now_ns, "rollback"))
     run.run(10.0)
-    theirs_stays(run)
+    foreign_value_stays(run)
 
 
 @pytest.mark.parametrize(
@@ -96,8 +99,8 @@ def test_a_rollback_does_not_write_over_it():
         for nth in (1, 3, 5, 7, 9)
     ],
 )
-def test_a_restart_between_the_two_registers_leaves_no_half_a_calibration(binary, nth):
-    """After 23 was written; its time goes on in a text stream, which carries none."""
+def test_restart_between_two_registers_leaves_no_partial_calibration(binary, nth):
+    """After register 23 was written. A text stream carries no device time, so none decreases."""
     run = CabledRun(two_units(binary=binary))
     unit, after = run.cable.unit, []
     assert run.until("QUALIFIED")
@@ -107,7 +110,7 @@ def test_a_restart_between_the_two_registers_leaves_no_half_a_calibration(binary
             after.append(line)
         if len(after) == nth + 1:
             unit.restart()
-            unit.paused = True  # as if it came up so quickly that nobody missed a sample
+            unit.paused = True  # as if it restarted so quickly that no sample is missing
 
     unit.before = restart
     run.approve()
@@ -119,10 +122,10 @@ def test_a_restart_between_the_two_registers_leaves_no_half_a_calibration(binary
     assert unit.held("flash") in (OLD, NEW)
 
 
-def test_a_restart_that_no_time_tells_does_not_double_the_hard_iron():
-    """RAM had another calibration than flash; un-mapped through it, the iron would come out wrong.
-
-    No silence either: the unit is back before the next sample. Only the readings jump.
+def test_restart_without_device_time_does_not_double_the_hard_iron():
+    """RAM held another calibration than flash, so un-mapping through it would give a wrong iron.
+    There is no silence either, because the unit is back before the next sample. Only the
+    readings jump.
     """
     unit = Unit(FIRST, IRON, BIAS)
     unit.ram[23] = f"1,0,0,0,1,0,0,0,1,{IRON[0]},{IRON[1]},{IRON[2]}"
@@ -141,36 +144,36 @@ def test_a_restart_that_no_time_tells_does_not_double_the_hard_iron():
     assert np.allclose(found.hard_iron_gauss, IRON, atol=0.01)
 
 
-def test_a_change_too_small_to_jump_is_found_at_the_interval():
+def test_small_register_change_is_found_at_the_check_interval():
     unit = Unit(FIRST, IRON, BIAS)
     unit.ram[23] = "1,0,0,0,1,0,0,0,1,0.01,0,0"
     run = CabledRun(Cable(unit, Unit(SPARE, IRON, BIAS)), planted=False, mode=Mode.OBSERVE)
     run.run(10.0)
     unit.restart()
     assert run.until(lambda: run.core.registers[23][9] == 0.0, 40.0)
-    assert all(line.split(",")[0] == "VNRRG" for line in unit.log)  # reads only, no pause
+    assert all(line.split(",")[0] == "VNRRG" for line in unit.log)  # only reads, no pause
 
 
-def test_passive_asks_nothing():
+def test_passive_sends_no_checks():
     run = CabledRun(two_units(), planted=False, mode=Mode.PASSIVE)
     run.run(100.0)
     assert run.cable.unit.log == []
 
 
-def test_the_reads_are_rare_and_the_stream_goes_on():
+def test_checks_are_rare_and_do_not_interrupt_the_stream():
     run = CabledRun(two_units(binary=True), planted=False, mode=Mode.OBSERVE)
     heard, samples = len(run.cable.unit.log), run.core.stream.facts.samples
     run.run(100.0)
     reads = run.cable.unit.log[heard:]
-    assert 9 * 9 <= len(reads) <= 11 * 9  # who, what it holds, and again who; every 10 s
+    assert 9 * 9 <= len(reads) <= 11 * 9  # identity, registers, and identity again; every 10 s
     assert {line.split(",")[0] for line in reads} == {"VNRRG"}
     assert run.core.stream.facts.samples - samples >= 100.0 * 20 - 20
     assert run.core.stream.gaps == []
 
 
 @pytest.mark.parametrize("binary", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_a_capture_replays_to_the_same_decisions(binary):
-    """Every doubt and every look is of the inputs."""
+def test_replay_of_the_capture_decides_the_same(binary):
+    """Every doubt and every check follows from the inputs."""
     from ahrsd.core.core import Core
 
     run = CabledRun(two_units(binary=binary), planted=False)
@@ -185,8 +188,10 @@ def test_a_capture_replays_to_the_same_decisions(binary):
     assert again.device_session.identity.serial == SPARE
 
 
-def test_what_they_changed_in_ram_is_not_saved_along():
-    """Register 25 is none of ours and what is proven stays right, but VNWNV would save it, too."""
+def test_foreign_change_in_ram_is_not_saved():
+    """Register 25 is not one of ours and the proven values stay valid, but VNWNV would save it
+    as well.
+    """
     run = CabledRun(two_units(binary=True))
     run.proven()
     unit = run.cable.units[FIRST]

@@ -10,7 +10,7 @@ REAL = 1
 
 
 @pytest.mark.parametrize("histories", [30, pytest.param(200, marks=pytest.mark.slow)])
-def test_random_histories_write_nothing_wrong(histories):
+def test_random_histories_have_no_wrong_write(histories):
     tally = write_histories.HistoriesTally()
     with fitted():
         for number in range(histories):
@@ -22,7 +22,7 @@ def test_random_histories_write_nothing_wrong(histories):
 
 
 @pytest.mark.parametrize("histories", [12, pytest.param(80, marks=pytest.mark.slow)])
-def test_histories_with_a_driver_that_saves_and_writes_are_as_right(histories):
+def test_histories_with_a_client_that_writes_and_saves_have_no_wrong_write(histories):
     tally = write_histories.HistoriesTally()
     with fitted():
         for number in range(histories):
@@ -33,7 +33,7 @@ def test_histories_with_a_driver_that_saves_and_writes_are_as_right(histories):
     assert tally.seen["CONFIRMED"] > 0
 
 
-def test_a_history_with_the_estimator_itself_writes_nothing_wrong():
+def test_history_with_the_real_estimator_has_no_wrong_write():
     tally = write_histories.HistoriesTally()
     for number in range(3, 3 + REAL):
         write_histories.run_real(number, 1, tally)

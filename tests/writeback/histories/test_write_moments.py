@@ -1,4 +1,4 @@
-"""Every event at every moment of a write, each judged by the observer outside.
+"""Every event at every moment of a write, judged by an independent observer.
 
 A moment is before or after a command that the device carries out, or a record of the journal.
 """
@@ -26,12 +26,12 @@ def _cheap_estimator():
 
 
 def wrong(event: str, places: list[str], **options: object) -> list[str]:
-    """Violations of this event at these moments, on one stream and another by turns."""
+    """Violations after this event at these moments, alternately on two kinds of stream."""
     tally = write_histories.HistoriesTally()
     streams = options.pop("streams", ("binary", "imu"))
     for number, place in enumerate(places):
         stream = streams[number % len(streams)]
-        seed = number // len(streams)  # a factory's unit and a user's by turns
+        seed = number // len(streams)  # alternately a unit in factory state and a user's unit
         write_histories.run_at(event, place, tally, stream=stream, seed=seed, **options)
     assert tally.histories == len(places)
     assert tally.seen["PREPARED"] > 0
@@ -39,7 +39,9 @@ def wrong(event: str, places: list[str], **options: object) -> list[str]:
 
 
 def moments(events: list[str]) -> pytest.MarkDecorator:
-    """Each event at a third of the moments, another third for the next; in the slow form at all."""
+    """Each event at a third of the moments, another third for the next event; the slow form has
+    all.
+    """
     thirds = [pytest.param(event, PLACES[k % 3 :: 3], id=event) for k, event in enumerate(events)]
     whole = [
         pytest.param(event, PLACES, id=f"{event}, all", marks=pytest.mark.slow) for event in events
@@ -47,7 +49,7 @@ def moments(events: list[str]) -> pytest.MarkDecorator:
     return pytest.mark.parametrize(("event", "places"), [*thirds, *whole])
 
 
-#: of what follows from a client's save in a trial: 5 or 10 moments of the 240 that there are
+#: after a client's save in a trial: 5 or 10 of the 240 moments
 BEHIND_A_SAVE = {5: range(0, 240, 48), 10: range(0, 240, 24)}
 
 
@@ -60,7 +62,7 @@ OTHERS = ("kill", "host reboots", "restart", "other writes", "unsafe for a while
 @pytest.mark.parametrize(
     "event", [*QUICK, *(pytest.param(event, marks=pytest.mark.slow) for event in OTHERS)]
 )
-def test_anything_at_every_moment_behind_a_clients_save_or_reset_in_a_trial(event, count):
+def test_no_wrong_write_for_events_after_a_client_saves_or_resets_in_a_trial(event, count):
     names = [*write_histories.NAMES, *write_histories.CLIENT_EVENTS]
     tally, does = write_histories.HistoriesTally(), write_histories.ASIDE_FOR
     for k, turn in enumerate(BEHIND_A_SAVE[count]):
@@ -74,22 +76,22 @@ def test_anything_at_every_moment_behind_a_clients_save_or_reset_in_a_trial(even
 
 @pytest.mark.parametrize("stream", ["binary", "imu"])
 @moments(["swap", "swap and back"])
-def test_another_unit_at_every_moment(event, places, stream):
+def test_no_wrong_write_when_the_unit_is_exchanged(event, places, stream):
     assert wrong(event, places, streams=(stream,)) == []
 
 
 @moments(["swap"])
-def test_another_unit_at_every_moment_where_the_first_is_bound(event, places):
+def test_no_wrong_write_when_the_unit_is_exchanged_and_the_serial_number_is_bound(event, places):
     assert wrong(event, places, policy=replace(POLICY, serial=ORIGIN_SERIAL)) == []
 
 
 @moments(["other writes", "other writes and saves", "other saves"])
-def test_a_second_master_at_every_moment(event, places):
+def test_no_wrong_write_when_another_program_writes(event, places):
     assert wrong(event, places) == []
 
 
 @moments(["restart", "other resets"])
-def test_a_restart_seen_or_unseen_at_every_moment(event, places):
+def test_no_wrong_write_when_the_device_restarts(event, places):
     assert wrong(event, places) == []
 
 
@@ -104,27 +106,27 @@ CLOCKS = ("clock", "kill and time is set", "host reboots")
         for j, wall_s in enumerate(write_histories.WALLS_S)
     ],
 )
-def test_the_hosts_clock_at_every_moment(event, wall_s):
+def test_no_wrong_write_when_the_host_clock_is_set(event, wall_s):
     places = [*PLACES[::3], "after PROVEN", "after VNWNV", "after FLASH_ACKED"]
     assert wrong(event, places, wall_s=wall_s, streams=("binary",)) == []
 
 
 @pytest.mark.parametrize("event", ["iron", "iron for a while", "iron while unsafe"])
-def test_a_calibration_that_becomes_void_at_every_moment(event):
+def test_no_wrong_write_when_the_calibration_becomes_void(event):
     proven_on = PLACES[PLACES.index("before PROVEN") :]
     assert wrong(event, ["after RAM_VERIFIED", *proven_on]) == []
 
 
 @moments(["kill", "kill and swap", "kill and other writes"])
-def test_a_killed_program_at_every_moment(event, places):
+def test_no_wrong_write_when_the_program_is_killed(event, places):
     assert wrong(event, places) == []
 
 
 @moments(["stop and start", "unsafe for a while", "disk full", "person"])
-def test_ordinary_trouble_at_every_moment(event, places):
+def test_no_wrong_write_with_ordinary_faults(event, places):
     assert wrong(event, places) == []
 
 
 @moments(["lie", "bad line", "silence", "journal lost"])
-def test_a_device_and_a_disk_that_lie_at_every_moment(event, places):
+def test_no_wrong_write_when_device_or_disk_report_falsely(event, places):
     assert wrong(event, places) == []

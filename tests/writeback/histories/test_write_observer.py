@@ -1,4 +1,4 @@
-"""The observer of writes sees each wrong that it is there for, and none in a right history."""
+"""The observer of writes detects each kind of wrong write, and none in a correct history."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "writeback" / "histories.
 
 
 class Story:
-    """A unit, its observer, and somebody who plays the daemon by hand."""
+    """A unit, its observer, and a hand-written sequence of the daemon's actions."""
 
     def __init__(self) -> None:
         iron = Iron(hard_gauss=np.array(HARD), gyro_bias_rad_s=np.array(BIAS))
@@ -77,7 +77,7 @@ class Story:
         return [kind for kind, _ in self.observer.violations]
 
 
-def test_a_right_story_is_right():
+def test_correct_sequence_has_no_violation():
     story = Story()
     story.to_flash()
     story.unit.restart(story.now_s)
@@ -88,7 +88,7 @@ def test_a_right_story_is_right():
     assert story.observer.counts["saves"] == 1
 
 
-def test_values_that_were_announced_for_another_unit():
+def test_values_announced_for_another_unit_are_a_violation():
     story = Story()
     story.announce()
     story.cable.exchange(Unit(2, Iron(), story.unit.vehicle, presets={6: "0"}), 10.0)
@@ -97,7 +97,7 @@ def test_values_that_were_announced_for_another_unit():
     assert story.kinds == ["not_judged_here", "other_journal"] * 2
 
 
-def test_values_that_nobody_announced_or_that_are_wrong_for_the_unit():
+def test_unannounced_or_wrong_values_are_a_violation():
     story = Story()
     story.prepare()
     story.write({23: GOOD[23]})
@@ -109,7 +109,7 @@ def test_values_that_nobody_announced_or_that_are_wrong_for_the_unit():
     assert story.kinds == ["not_judged_here"]
 
 
-def test_old_values_of_another_unit_are_not_this_ones():
+def test_old_values_of_another_unit_are_a_violation():
     story = Story()
     users = {23: FOREIGN, 6: "0"}
     story.cable.exchange(Unit(2, Iron(), story.unit.vehicle, presets=users), 10.0)
@@ -118,7 +118,7 @@ def test_old_values_of_another_unit_are_not_this_ones():
     assert story.kinds == ["not_judged_here"]
 
 
-def test_a_save_of_what_the_iron_made_wrong_a_while_ago():
+def test_save_after_an_earlier_change_of_the_iron_is_a_violation():
     story = Story()
     story.announce()
     story.prepare()
@@ -129,7 +129,7 @@ def test_a_save_of_what_the_iron_made_wrong_a_while_ago():
     assert story.kinds == ["void_save"]
 
 
-def test_a_save_just_after_the_iron_changed_is_nobodys_fault():
+def test_save_immediately_after_a_change_of_the_iron_is_no_violation():
     story = Story()
     story.announce()
     story.prepare()
@@ -139,7 +139,7 @@ def test_a_save_just_after_the_iron_changed_is_nobodys_fault():
     assert story.kinds == []
 
 
-def test_iron_that_leaves_the_fields_length_as_it_is_shows_in_no_reading_at_rest():
+def test_change_of_iron_that_keeps_the_field_magnitude_is_invisible_at_rest():
     story = Story()
     story.unit.vehicle.motion = Motion(rest_s=100.0)
     story.announce()
@@ -153,12 +153,12 @@ def test_iron_that_leaves_the_fields_length_as_it_is_shows_in_no_reading_at_rest
     story.now_s += 10.0
     story.save()
     assert story.kinds == []
-    story.unit.vehicle.motion = Motion()  # had it turned, it would have shown
+    story.unit.vehicle.motion = Motion()  # a turn would have shown it
     story.save()
     assert story.kinds == ["void_save"]
 
 
-def test_a_save_of_half_and_of_somebodys_values():
+def test_save_of_partial_or_foreign_values_is_a_violation():
     story = Story()
     story.announce()
     story.prepare()
@@ -168,7 +168,7 @@ def test_a_save_of_half_and_of_somebodys_values():
     assert story.kinds == ["half_save"]
     for saved_by_them in (False, True):
         story = Story()
-        story.say("VNRRG,23")  # from here on somebody listens
+        story.say("VNRRG,23")  # from here on the daemon listens
         story.announce()
         story.prepare()
         story.write()
@@ -180,7 +180,7 @@ def test_a_save_of_half_and_of_somebodys_values():
         assert sorted(story.kinds) == ["foreign_save"] * (not saved_by_them) + ["half_save"]
 
 
-def test_what_was_there_before_anybody_listened_is_the_units_own():
+def test_values_from_before_the_daemon_listened_belong_to_the_unit():
     story = Story()
     story.cable.other_master(f"VNWRG,84,{FOREIGN}", story.now_s)
     story.now_s += 5.0
@@ -192,7 +192,7 @@ def test_what_was_there_before_anybody_listened_is_the_units_own():
     assert story.kinds == []
 
 
-def test_somebodys_values_are_not_replaced_unseen():
+def test_replacing_foreign_values_unseen_is_a_violation():
     story = Story()
     story.announce()
     story.prepare()
@@ -203,7 +203,7 @@ def test_somebodys_values_are_not_replaced_unseen():
     assert story.kinds == ["foreign_replaced"]
 
 
-def test_a_write_that_the_unit_did_not_carry_out_makes_nothing_somebodys():
+def test_write_that_was_not_carried_out_changes_no_ownership():
     story = Story()
     story.observer.asked_by_client(f"VNWRG,23,{FOREIGN}")
     story.unit.lies.not_held.add(23)
@@ -213,13 +213,13 @@ def test_a_write_that_the_unit_did_not_carry_out_makes_nothing_somebodys():
     story.announce()
     story.prepare(values={23: GOOD[23]}, shown=FOREIGN)
     story.now_s += 5.0
-    story.write({23: GOOD[23]})  # over what was there before the other program came
+    story.write({23: GOOD[23]})  # over the value from before the other program
     assert story.kinds == []
 
 
-def test_a_save_that_no_record_announced_may_hold_nothing_of_the_daemons():
+def test_unannounced_save_must_not_contain_values_of_the_daemon():
     story = Story()
-    story.say("VNWNV")  # a client's, of what the unit had
+    story.say("VNWNV")  # a client's save of the unit's own values
     assert story.kinds == []
     story.announce()
     story.prepare()
@@ -228,7 +228,7 @@ def test_a_save_that_no_record_announced_may_hold_nothing_of_the_daemons():
     assert story.kinds == ["unproven_saved"]
 
 
-def test_a_register_that_shows_another_value_than_it_holds_is_replaced_unseen_by_anybody():
+def test_foreign_value_that_the_unit_does_not_show_may_be_replaced():
     story = Story()
     story.cable.other_master(f"VNWRG,23,{FOREIGN}", story.now_s)
     story.unit.lies.not_held, story.unit.lies.reads_told = {23}, True
@@ -243,7 +243,7 @@ def test_a_register_that_shows_another_value_than_it_holds_is_replaced_unseen_by
     assert "foreign_replaced" not in story.kinds
 
 
-def test_a_save_of_what_is_in_flash_already_makes_nothing_permanent():
+def test_save_of_values_already_in_flash_makes_nothing_permanent():
     story = Story()
     story.unit.memory.flash[23] = story.unit.memory.ram[23] = FACTORY
     story.observer.look(story.now_s)
@@ -258,7 +258,7 @@ def test_a_save_of_what_is_in_flash_already_makes_nothing_permanent():
     assert story.kinds == ["unproven_saved"]
 
 
-def test_somebodys_value_from_before_the_first_reading_behind_a_restart_is_the_units_own():
+def test_foreign_value_from_before_the_first_reading_after_a_restart_belongs_to_the_unit():
     for reads_after_s in (0.0, 2.0):
         story = Story()
         story.observer.begun(story.now_s)
@@ -280,18 +280,18 @@ def test_somebodys_value_from_before_the_first_reading_behind_a_restart_is_the_u
         assert story.kinds == ([] if reads_after_s else ["foreign_save"])
 
 
-def test_what_a_client_wrote_and_saved_is_its_own():
+def test_values_written_and_saved_by_a_client_belong_to_it():
     story = Story()
     story.observer.asked_by_client(f"VNWRG,23,{FOREIGN}")
     story.write({23: FOREIGN})
     story.say("VNWNV")
     assert story.kinds == []
     assert story.observer.counts["client writes"] == 1
-    story.write({23: GOOD[23]})  # over it, and no record knows of it
+    story.write({23: GOOD[23]})  # overwrites it without a record
     assert "foreign_replaced" in story.kinds
 
 
-def test_proven_without_both_values_in_the_device():
+def test_proven_without_both_values_in_the_device_is_a_violation():
     story = Story()
     story.announce()
     story.prepare()
@@ -302,7 +302,7 @@ def test_proven_without_both_values_in_the_device():
 
 
 @pytest.mark.parametrize("what", ["no restart", "restart before", "not saved", "another unit"])
-def test_a_false_confirmed(what):
+def test_false_confirmation_is_a_violation(what):
     story = Story()
     story.unit.lies.not_saved = what == "not saved"
     if what == "restart before":
@@ -318,29 +318,29 @@ def test_a_false_confirmed(what):
     assert story.kinds == ["false_confirmed"]
 
 
-def test_all_kinds_are_named():
+def test_all_kinds_of_violations_are_documented():
     assert set(KINDS) < set(write_histories.WRONG)
 
 
 @pytest.mark.parametrize("stream", ["binary", "imu"])
-def test_an_undisturbed_history_goes_to_flash_and_is_confirmed(stream):
+def test_undisturbed_history_is_saved_and_confirmed(stream):
     tally = write_histories.HistoriesTally()
     with fitted():
         world = write_histories.run_at("silence", "never", tally, stream=stream, seed=1)
     assert tally.wrong == []
     assert (tally.seen["saves"], tally.seen["FLASH_ACKED"]) == (1, 1)
-    # a stream without device time does not show the restart: nothing is confirmed then
+    # a stream without device time does not show the restart, so nothing is confirmed
     assert ("CONFIRMED" in world.kinds) is (stream == "binary")
 
 
-def test_a_history_is_the_same_each_time():
+def test_history_is_deterministic():
     with fitted():
         worlds = [write_histories.run_one(5, 2, write_histories.HistoriesTally()) for _ in range(2)]
     assert worlds[0].moments == worlds[1].moments
     assert worlds[0].states == worlds[1].states
 
 
-def test_the_command_goes_on_where_it_ended(tmp_path):
+def test_command_continues_where_it_ended(tmp_path):
     file = tmp_path / "found.json"
     command = [sys.executable, str(BENCHMARK), "--seed", "4", "--json", str(file)]
     for wanted in ("2", "2"):

@@ -1,4 +1,6 @@
-"""The corrected field, carried by the corrected gyroscope, stands still; what is wrong moves it."""
+"""The corrected field, propagated by the corrected gyro, is constant; wrong corrections make it
+vary.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ MAG = Affine(np.diag([1.1, 0.9, 1.0]), np.array([0.05, -0.03, 0.02]))
 
 
 def tumbling(seconds: float = 35.0, rate_hz: float = 40.0) -> SampleBlock:
-    """Samples of a sensor that turns about all axes, exact but for its bias and its iron."""
+    """Samples of a sensor that turns about all axes, exact but for bias and iron."""
     count = round(seconds * rate_hz)
     t = np.arange(count) / rate_hz
     rate = np.column_stack([0.4 * np.sin(0.5 * t), 0.3 * np.cos(0.3 * t), np.full(count, 0.5)])
@@ -34,7 +36,7 @@ def tumbling(seconds: float = 35.0, rate_hz: float = 40.0) -> SampleBlock:
     )
 
 
-def test_right_corrections_stand_still_and_each_wrong_one_shows():
+def test_field_is_constant_with_correct_registers_and_varies_with_any_wrong_one():
     turned = Affine(so3.exp(np.radians([0.0, 0.0, 10.0])) @ MAG.matrix, MAG.offset)
     carried = CarriedField([(MAG, BIAS), (MAG, -BIAS), (Affine.identity(), BIAS), (turned, BIAS)])
     carried.take(tumbling())
@@ -45,8 +47,10 @@ def test_right_corrections_stand_still_and_each_wrong_one_shows():
     assert rotated > 0.01
 
 
-def test_a_bias_turns_the_level_field_by_as_much_as_the_stretch_is_long():
-    """At rest: an angle that grows to 10 s x 5 mrad/s has a deviation of its range over sqrt 12."""
+def test_bias_rotates_the_level_field_in_proportion_to_the_interval():
+    """At rest. An angle that grows to 10 s x 5 mrad/s has a standard deviation of its range over
+    sqrt 12.
+    """
     block = tumbling(0.05)
     still = 450
     rest = SampleBlock(
@@ -65,7 +69,7 @@ def test_a_bias_turns_the_level_field_by_as_much_as_the_stretch_is_long():
     assert carried.spreads[1] == pytest.approx(10.0 * 0.005 / np.sqrt(12.0), rel=0.02)
 
 
-def test_before_the_first_stretch_has_ended_nothing_is_known():
+def test_spread_is_nan_before_the_first_interval_has_ended():
     carried = CarriedField([(MAG, BIAS)])
     carried.take(tumbling(5.0))
     assert np.isnan(carried.spreads).all()

@@ -1,4 +1,4 @@
-"""A trial tells right registers from wrong ones by a statistic of its own noise, with a margin."""
+"""A trial separates correct from wrong registers by a statistic of its own noise, with a margin."""
 
 from __future__ import annotations
 
@@ -21,13 +21,15 @@ from ahrsd.writeback.trial import (
 FIELD_N = np.array([0.24, 0.0, 0.42])
 TRUE = Affine(np.diag([1.05, 1.0, 0.95]), np.array([0.05, -0.03, 0.02]))
 OLD = Affine.identity()
-NOISES = (0.0005, 0.002, 0.005, 0.01)  # gauss, each axis: 0.1 to 2 % of the field
+NOISES = (0.0005, 0.002, 0.005, 0.01)  # gauss per axis: 0.1 to 2 % of the field
 EXTREMES = ((NOISES[0], "tumble"), (NOISES[-1], "level"))
 SEEDS = range(6)
 
 
-def lived(seed: int, noise_gauss: float, motion: str, *, places: bool = False) -> SampleBlock:
-    """Four minutes at 10 Hz: level circles, or a tumble; with places whose fields differ by 2 %."""
+def driven(seed: int, noise_gauss: float, motion: str, *, places: bool = False) -> SampleBlock:
+    """Four minutes at 10 Hz: level circles or tumbling, optionally with places whose fields
+    differ by 2 %.
+    """
     draw = np.random.default_rng(seed)
     time_s = 0.1 * np.arange(2400)
     yaw = 0.35 * time_s + draw.uniform(0, 6)
@@ -38,12 +40,12 @@ def lived(seed: int, noise_gauss: float, motion: str, *, places: bool = False) -
         np.column_stack([tilt, 0 * yaw])
     )
     strength = np.ones(len(time_s))
-    if places:  # another place for each half circle, so that heading and place go together
+    if places:  # another place for each half circle, so that heading and place are correlated
         strength += 0.02 * np.sign(np.sin(yaw)) * (np.floor(time_s / 30.0) % 2)
     true = strength[:, None] * np.einsum("kji,j->ki", R_nb, FIELD_N)
     raw = true @ np.linalg.inv(TRUE.matrix).T + TRUE.offset
     raw += noise_gauss * draw.normal(size=raw.shape)
-    # some noise is slow: passing steel, the vehicle's own currents
+    # slow noise: passing steel, the vehicle's own currents
     slow = np.convolve(draw.normal(size=len(time_s) + 19), np.ones(20) / np.sqrt(20), "valid")
     raw += 0.5 * noise_gauss * slow[:, None] * draw.normal(size=3)
     accel = np.einsum("kji,j->ki", R_nb, np.array([0.0, 0.0, -9.81]))
@@ -53,7 +55,7 @@ def lived(seed: int, noise_gauss: float, motion: str, *, places: bool = False) -
 
 
 def judged(written: Affine, block: SampleBlock) -> tuple[float, list[TrialVerdict]]:
-    """Sigmas at the end, and every finding on the way."""
+    """The excess error in sigmas at the end, and all findings until then."""
     policy = TrialPolicy(duration_s=1e9, turns=1e9)
     limit, trial = 0.01 * policy.max_wrong_percent, Trial(policy, 180.0)
     error, findings, left = LeftoverError(), [], Leftover()
@@ -66,8 +68,8 @@ def judged(written: Affine, block: SampleBlock) -> tuple[float, list[TrialVerdic
     return left.sigmas, findings
 
 
-def test_the_live_trial_says_it():
-    block = lived(3, 0.002, "tumble")
+def test_live_trial_reports_the_excess_error():
+    block = driven(3, 0.002, "tumble")
     off = Affine(TRUE.matrix, TRUE.offset + np.array([0.02, 0.015, 0.0]))
     for written, wrong in ((TRUE, False), (off, True)):
         live = LiveTrial(written, OLD, np.zeros(3))
@@ -87,12 +89,16 @@ def test_the_live_trial_says_it():
         for motion in ("level", "tumble")
     ],
 )
-def test_right_and_wrong_are_far_apart_at_every_level_of_noise(noise_gauss, motion):
-    """25 mG, some 6 deg of heading, or six times a larger noise; the limit is 2.5."""
+def test_correct_and_wrong_registers_are_separated_at_every_noise_level(noise_gauss, motion):
+    """25 mG, about 6 deg of heading, or six times a larger noise; the limit is 2.5."""
     right, wrong = [], []
     for seed in SEEDS:
-        block = lived(seed, noise_gauss, motion)
-        off = np.random.default_rng(1000 + seed).normal(size=3) * [1, 1, 0]  # what heading needs
+        block = driven(seed, noise_gauss, motion)
+        off = np.random.default_rng(1000 + seed).normal(size=3) * [
+            1,
+            1,
+            0,
+        ]  # accuracy that the heading needs
         off *= max(0.025, 6.0 * noise_gauss) / np.linalg.norm(off)
         sigmas, findings = judged(TRUE, block)
         right.append(sigmas)
@@ -108,31 +114,31 @@ def test_right_and_wrong_are_far_apart_at_every_level_of_noise(noise_gauss, moti
 
 
 @pytest.mark.parametrize("motion", ["level", "tumble"])
-def test_places_with_other_fields_do_not_make_right_registers_wrong(motion):
+def test_varying_field_between_places_does_not_fail_correct_registers(motion):
     for seed in SEEDS:
-        sigmas, findings = judged(TRUE, lived(seed, 0.002, motion, places=True))
+        sigmas, findings = judged(TRUE, driven(seed, 0.002, motion, places=True))
         assert sigmas < 2.0
         assert TrialVerdict.FAILED not in findings
 
 
-def test_a_soft_iron_that_is_wrong_shows_as_well():
+def test_wrong_soft_iron_fails():
     for seed in SEEDS:
-        block = lived(seed, 0.002, "tumble")
+        block = driven(seed, 0.002, "tumble")
         sigmas, findings = judged(Affine(np.diag([1.10, 1.0, 0.95]), TRUE.offset), block)
         assert sigmas > 6.0
         assert TrialVerdict.FAILED in findings
 
 
-def test_an_error_below_the_limit_is_none_however_clear():
+def test_significant_error_below_the_limit_does_not_fail():
     for seed in SEEDS:
-        block = lived(seed, 0.0005, "tumble")
+        block = driven(seed, 0.0005, "tumble")
         small = Affine(TRUE.matrix, TRUE.offset + np.array([0.002, 0.0, 0.0]))
         sigmas, _ = judged(small, block)
         assert sigmas < 0.0
 
 
-def test_a_vehicle_that_does_not_turn_says_nothing():
-    block = lived(1, 0.002, "level")
+def test_no_statistic_without_turns():
+    block = driven(1, 0.002, "level")
     still = SampleBlock(
         block.time_s, block.dt_s, block.host_s, np.tile(block.raw_b_gauss[0], (len(block), 1)),
         0 * block.gyro_b_rad_s, np.tile(block.accel_b_m_s2[0], (len(block), 1)),

@@ -1,4 +1,4 @@
-"""Figures of a trial: the new registers against the old ones on the same raw samples."""
+"""Figures of a trial: new and old registers compared on the same raw samples."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def run(trial: LiveTrial, block: SampleBlock):
     return metrics
 
 
-def test_right_registers_show_no_spread_and_wrong_ones_theirs():
+def test_figure_is_the_spread_of_the_field_magnitude():
     block = circle(30.0, 2.0)
     metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), block)
     assert metrics.new_figure == pytest.approx(0.0, abs=1e-12)
@@ -65,13 +65,13 @@ def test_right_registers_show_no_spread_and_wrong_ones_theirs():
     assert metrics.finite
 
 
-def test_turns_and_duration_are_those_of_the_motion():
+def test_turns_and_duration_equal_those_of_the_motion():
     metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), circle(30.0, 2.0))
     assert metrics.turns == pytest.approx(2.0, rel=1e-6)
     assert metrics.duration_s == pytest.approx(30.0 - 1 / RATE_HZ)
 
 
-def test_a_gyro_bias_is_no_turn():
+def test_gyro_bias_is_not_counted_as_turns():
     still = circle(30.0, 0.0)
     biased = SampleBlock(
         still.time_s, still.dt_s, still.host_s, still.raw_b_gauss,
@@ -82,13 +82,13 @@ def test_a_gyro_bias_is_no_turn():
     assert run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), biased).turns == pytest.approx(0.2387, rel=1e-3)
 
 
-def test_the_jump_is_the_difference_of_the_headings_at_the_change():
-    """Nose north: hard iron (0.05, -0.03) turns the heading of 0.24 G by atan2(0.03, 0.29)."""
+def test_heading_jump_is_the_difference_of_the_headings_at_the_change():
+    """Heading north: hard iron (0.05, -0.03) rotates the heading in 0.24 G by atan2(0.03, 0.29)."""
     metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), circle(5.0, 0.0))
     assert metrics.heading_jump_deg == pytest.approx(-np.degrees(np.arctan2(0.03, 0.29)), abs=1e-9)
 
 
-def test_the_jump_is_of_the_first_seconds_only():
+def test_heading_jump_uses_only_the_first_seconds():
     trial = LiveTrial(RIGHT, IDENTITY, NO_BIAS)
     early = run(trial, circle(3.0, 0.0)).heading_jump_deg
     later = run(trial, circle(20.0, 0.5, start_s=3.0)).heading_jump_deg
@@ -96,7 +96,7 @@ def test_the_jump_is_of_the_first_seconds_only():
 
 
 def gapped(yaws_deg: list[float], seconds: float, gap_s: float) -> SampleBlock:
-    """Samples at rest at these headings for some seconds each, with a gap before every one."""
+    """Samples at rest at these headings for some seconds each, with a gap before each."""
     parts = []
     for k, yaw in enumerate(yaws_deg):
         part = circle(seconds, 0.0, start_s=100.0 + k * (seconds + gap_s))
@@ -108,18 +108,17 @@ def gapped(yaws_deg: list[float], seconds: float, gap_s: float) -> SampleBlock:
 
 
 def jump_deg(yaw_deg: float) -> float:
-    """Of one heading: with the right registers and with the factory's."""
+    """Heading jump at one heading between the factory registers and the correct ones."""
     x, y = 0.24 * np.cos(np.radians(yaw_deg)), -0.24 * np.sin(np.radians(yaw_deg))
     old_deg = np.degrees(np.arctan2(-(y - 0.03), x + 0.05))
     return float((yaw_deg - old_deg + 180.0) % 360.0 - 180.0)
 
 
 @pytest.mark.parametrize("rows", [5, 40, 10_000])
-def test_a_gap_and_a_late_reader_are_no_jump_of_the_heading(rows):
-    """However the samples are cut into blocks: over a turn the mean field is none of the vehicle's.
-
-    Four headings a quarter turn apart: their mean field has the hard iron alone left, of which the
-    old registers make a heading that is anything.
+def test_gaps_and_large_blocks_do_not_change_the_heading_jump(rows):
+    """For any block size. Over a turn the mean field is not that of a heading: the mean of four
+    headings a quarter turn apart contains only the hard iron, from which the old registers
+    give an arbitrary heading.
     """
     yaws = [0.0, 90.0, 180.0, 270.0]
     block = gapped(yaws, 0.5, 8.0)
@@ -131,17 +130,19 @@ def test_a_gap_and_a_late_reader_are_no_jump_of_the_heading(rows):
     assert max(abs(jump_deg(yaw)) for yaw in yaws) < 15.0
 
 
-def test_a_gap_behind_the_write_does_not_use_up_the_seconds_of_the_jump():
+def test_gap_after_the_write_does_not_shorten_the_heading_jump():
     trial = LiveTrial(RIGHT, IDENTITY, NO_BIAS)
-    trial.take(circle(0.5, 0.0))  # at rest to the north
-    far = gapped([180.0], 10.0, 0.0)  # and half a minute later to the south
+    trial.take(circle(0.5, 0.0))  # at rest facing north
+    far = gapped([180.0], 10.0, 0.0)  # half a minute later facing south
     metrics = run(trial, far)
     expected = (0.5 * jump_deg(0.0) + 2.5 * jump_deg(180.0)) / 3.0
     assert metrics.heading_jump_deg == pytest.approx(expected, abs=0.2)
 
 
-def test_on_its_side_a_vehicle_shows_no_jump_until_it_is_level():
-    """There the hard iron of z turns the heading too, and only for level was the jump predicted."""
+def test_heading_jump_is_measured_only_when_level():
+    """When rolled, the hard iron of z rotates the heading too, and the jump was predicted for
+    level.
+    """
     level = circle(5.0, 0.0)
     side = so3.exp(np.array([[np.radians(70.0), 0.0, 0.0]]))[0]
     rolled = replace(
@@ -156,8 +157,8 @@ def test_on_its_side_a_vehicle_shows_no_jump_until_it_is_level():
 
 @pytest.mark.parametrize("roll_deg", [-14.0, 0.0, 14.0])
 @pytest.mark.parametrize("yaw_deg", [0.0, 70.0, 200.0])
-def test_a_tilt_within_what_counts_as_level_changes_no_jump(roll_deg, yaw_deg):
-    """The jump was predicted for level: a hard iron along the vertical adds none of its own."""
+def test_small_tilt_does_not_change_the_heading_jump(roll_deg, yaw_deg):
+    """The jump was predicted for level, so a vertical hard iron must not contribute."""
     iron = Affine(np.eye(3), np.array([0.05, -0.03, 0.25]))
     still = circle(5.0, 0.0)
     yaw, roll = np.radians(yaw_deg), np.radians(roll_deg)
@@ -171,26 +172,28 @@ def test_a_tilt_within_what_counts_as_level_changes_no_jump(roll_deg, yaw_deg):
     assert jump == pytest.approx(jump_deg(yaw_deg), abs=1e-6)
 
 
-def test_without_a_specific_force_there_is_no_jump_and_no_turn_but_a_figure():
+def test_only_the_figure_is_available_without_specific_force():
     metrics = run(LiveTrial(RIGHT, IDENTITY, NO_BIAS), circle(30.0, 2.0, force=False))
     assert metrics.heading_jump_deg is None
     assert metrics.turns == 0.0
     assert metrics.new_figure == pytest.approx(0.0, abs=1e-12)
 
 
-def test_the_figure_is_of_the_newest_minute():
+def test_figure_covers_the_newest_minute():
     trial = LiveTrial(IDENTITY, RIGHT, NO_BIAS)
     assert run(trial, circle(60.0, 2.0)).new_figure > 0.03
     assert run(trial, circle(61.0, 0.0, start_s=60.0)).new_figure < 1e-12
 
 
-def test_one_sample_says_nothing_of_a_spread():
+def test_single_sample_has_no_spread():
     metrics = LiveTrial(RIGHT, IDENTITY, NO_BIAS).take(pieces(circle(1.0, 0.0), 1)[0])
     assert not metrics.finite
 
 
 def at_rest(seconds: float, *, noise_gauss: float, bias_b_rad_s: np.ndarray) -> SampleBlock:
-    """A vehicle that stands, its nose along the axis that the matrix below makes shorter."""
+    """A vehicle at rest with its longitudinal axis along the axis that the matrix below
+    shortens.
+    """
     draw = np.random.default_rng(5)
     block = circle(seconds, 0.0)
     field = np.array([0.5, 0.0, 0.0]) + RIGHT.offset
@@ -202,13 +205,13 @@ def at_rest(seconds: float, *, noise_gauss: float, bias_b_rad_s: np.ndarray) -> 
 
 
 def judged(trial: LiveTrial, block: SampleBlock) -> list[str]:
-    """Why the trial fails, piece by piece."""
+    """Reasons why the trial fails, piece by piece."""
     rules = Trial(TrialPolicy(), 90.0)
     found = [rules.judge(trial.take(piece)) for piece in pieces(block)]
     return [reason for finding, reason in found if finding is TrialVerdict.FAILED]
 
 
-def test_at_rest_noise_that_a_matrix_makes_larger_is_no_worse_figure():
+def test_noise_amplified_by_the_matrix_is_not_judged_at_rest():
     flat = Affine(np.diag([0.8, 1.1, 1.0 / 0.88]), RIGHT.offset)
     block = at_rest(200.0, noise_gauss=2e-3, bias_b_rad_s=NO_BIAS)
     trial = LiveTrial(flat, RIGHT, NO_BIAS)
@@ -218,7 +221,7 @@ def test_at_rest_noise_that_a_matrix_makes_larger_is_no_worse_figure():
     assert metrics.new_swing > 1.1 * run(LiveTrial(RIGHT, RIGHT, NO_BIAS), block).new_swing
 
 
-def test_at_rest_a_wrong_gyro_bias_is_still_seen():
+def test_wrong_gyro_bias_is_found_at_rest():
     bias = np.array([0.0, 0.01, 0.0])
     block = at_rest(200.0, noise_gauss=2e-3, bias_b_rad_s=bias)
     reasons = judged(LiveTrial(RIGHT, IDENTITY, NO_BIAS, bias), block)

@@ -1,4 +1,4 @@
-"""A field along a way that nobody logged."""
+"""A field that varies along an unlogged path."""
 
 from dataclasses import replace
 
@@ -13,8 +13,8 @@ PLACES = ("position_north_m", "position_east_m", "position_down_m")
 
 
 @pytest.mark.slow
-def test_a_field_along_a_way_that_nobody_logged_is_no_set_of_names():
-    """Three gains of an on-board calibration followed it to a quarter of a hundredth."""
+def test_field_along_an_unlogged_path_is_unknown_in_the_world_frame():
+    """Three gains of an on-board calibration once followed it to a quarter of a percent."""
     trial = made(Trial(2, (), PLACES, scenario="lam", samples=4000))
     R_nb = simulate(trial.settings).R_nb
     rng, track = np.random.default_rng(2), trial.track

@@ -1,4 +1,4 @@
-"""A band that stands out of the noise: sources that turn or sway at no one rate."""
+"""Narrow bands above the noise: sources that turn or sway at a varying rate."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from ahrsd.diagnosis.where_and_when.narrow_band import loudest_band
 
 
 def turning(time_s: np.ndarray, rate_hz: float, spread_hz: float) -> np.ndarray:
-    """(N,) phase of something that turns at a rate that wanders."""
+    """(N,) phase of a source that turns at a wandering rate."""
     rng = np.random.default_rng(7)
     step_s = float(np.median(np.diff(time_s)))
     slow = np.convolve(rng.standard_normal(len(time_s)), np.ones(200) / 200**0.5, mode="same")
     return 2 * np.pi * np.cumsum(rate_hz + spread_hz * slow) * step_s
 
 
-def test_a_band_stands_out_and_colour_does_not() -> None:
+def test_narrow_band_is_found_and_coloured_noise_is_not() -> None:
     rng = np.random.default_rng(3)
     white = rng.standard_normal((10_000, 3))
     assert loudest_band(white, 25.0, 12.5) is None
@@ -35,8 +35,10 @@ def test_a_band_stands_out_and_colour_does_not() -> None:
     assert nats > 100.0
 
 
-def test_slow_noise_is_not_heard_again_at_the_rate_of_new_readings() -> None:
-    """Every third row has a new reading: a red noise seemed to ring at 16.7 Hz (one of 126)."""
+def test_alias_of_slow_noise_at_the_rate_of_new_readings_is_ignored() -> None:
+    """Every third row has a new reading: red noise then seemed to ring at 16.7 Hz (one case of
+    126).
+    """
     rng = np.random.default_rng(4)
     red = lfilter([1], [1, -0.98], rng.standard_normal((12_000, 3)), axis=0)
     seen = np.where(np.arange(12_000)[:, None] % 3 == 0, rng.standard_normal((12_000, 3)) + red, 0)
@@ -46,8 +48,8 @@ def test_slow_noise_is_not_heard_again_at_the_rate_of_new_readings() -> None:
 
 
 @pytest.mark.slow
-def test_a_propeller_that_nobody_logged_is_located_by_its_frequency() -> None:
-    """It was colour of the noise: the recording and the model agreed."""
+def test_unlogged_propeller_is_an_unknown_cause_with_its_frequency_band() -> None:
+    """It was once absorbed by the coloured noise, so that recording and model agreed."""
     quiet = replace(made(Trial(seed=8, samples=6000)).track, covariates={})
     phase = turning(quiet.time_s, 3.0, 0.25)
     field = np.outer(np.cos(phase), [1.2e-3, -0.8e-3, 0.0])

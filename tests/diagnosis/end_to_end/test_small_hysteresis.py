@@ -19,7 +19,7 @@ def play(values, radius):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("radius_gauss", [0.0007, pytest.param(0.003, marks=pytest.mark.slow)])
-def test_a_small_play_is_named_once_with_its_width(radius_gauss):
+def test_small_hysteresis_is_a_single_finding_with_its_width(radius_gauss):
     noisy = made(Trial(6, samples=8_000, rate_hz=25.0)).track
     clean = made(Trial(6, samples=8_000, rate_hz=25.0, sigma_mag=1e-9)).track.mag_b_gauss
     bent = noisy.mag_b_gauss + play(clean, radius_gauss) - clean

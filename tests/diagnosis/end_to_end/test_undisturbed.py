@@ -1,4 +1,4 @@
-"""What is said of a quiet recording."""
+"""Diagnosis of an undisturbed recording."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from ahrsd.diagnosis.track import Track
 
 
 @pytest.fixture(scope="module")
-def quiet() -> Track:
+def undisturbed() -> Track:
     return replace(made(Trial(seed=8, samples=5000)).track, covariates={})
 
 
-def test_nothing_is_said_of_a_quiet_recording_but_what_it_would_have_shown(quiet: Track) -> None:
-    answer = diagnose(quiet)
+def test_undisturbed_recording_has_no_finding_and_reports_its_sensitivity(
+    undisturbed: Track,
+) -> None:
+    answer = diagnose(undisturbed)
     assert not answer.mismatch
     assert answer.findings == ()
     limits = {(one.effect, one.parameter): one.smallest for one in answer.sensitivity}

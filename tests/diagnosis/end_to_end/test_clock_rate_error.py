@@ -1,4 +1,4 @@
-"""A clock that is off looks like a gyro whose axes are all off alike."""
+"""A clock-rate error looks like an isotropic gyro scale error."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ahrsd.diagnosis.inference.diagnose import diagnose
 
 
 @pytest.mark.slow
-def test_a_clock_that_is_off_shares_with_a_gyro_whose_axes_are_all_off_alike():
+def test_clock_rate_error_shares_its_posterior_with_an_isotropic_gyro_scale():
     trial = Trial(3, (("clock_rate", 1.0),), samples=8_000, rate_hz=25.0)
     found = diagnose(made(trial).track)
     (one,) = found.findings

@@ -1,4 +1,4 @@
-"""A field that jumps has its name and its time."""
+"""A step of the world's field."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def track(made):
 
 @pytest.fixture(scope="module")
 def jumped(made, track):
-    """The world's field jumps by a milligauss at 90 s."""
+    """The world's field changes by a milligauss at 90 s."""
     turned = np.swapaxes(fit_null(track).context().R_nb, 1, 2) @ JUMP_GAUSS
     read = turned @ true_model(made).soft_iron.T
     later = (track.time_s - track.time_s[0] > 90.0)[:, None]
@@ -35,8 +35,8 @@ def jumped(made, track):
 
 
 @pytest.mark.slow
-def test_a_field_that_jumps_has_its_name_and_its_time(jumped):
-    """For some seconds it looks like a field of another strength."""
+def test_field_step_is_found_with_its_time_and_size(jumped):
+    """For some seconds it looks like a change of the field's strength."""
     found = diagnose(jumped)
     (step,) = found.findings
     assert step.effect == "field_step"

@@ -1,4 +1,4 @@
-"""A current that its logger averages has its field and no field of its change."""
+"""A current that its logger averages has its field, and no field of its derivative."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PER_AMPERE = np.array([1.2e-3, -0.7e-3, 0.5e-3])
 
 
 def driven(seed: int, memory_s: float, mean_s: float):
-    """120 s beside a current that forgets in memory_s and is logged as a mean of mean_s."""
+    """120 s next to a current with correlation time memory_s, logged as a mean over mean_s."""
     track = track_of(experiment("wam", seed=seed, samples=3000))
     kept, count = np.exp(-track.step_s / memory_s), max(1, round(mean_s / track.step_s))
     drawn = np.random.default_rng(seed).normal(0.0, np.sqrt(1 - kept**2), len(track))
@@ -32,14 +32,18 @@ def driven(seed: int, memory_s: float, mean_s: float):
     ("memory_s", "mean_s"),
     [(0.5, 0.4), (6.0, 0.2), (2.0, 0.4)],
 )
-def test_it_is_one_name(memory_s: float, mean_s: float):
+def test_averaged_current_is_a_single_finding_with_its_averaging_time(
+    memory_s: float, mean_s: float
+):
     found = diagnose(driven(16, memory_s, mean_s))
     assert [one.effect for one in found.findings] == ["motor_current_field"]
     (said,) = [one for one in found.notes if one.startswith("column motor_current_a is taken as")]
     assert f"the mean of {mean_s:.2g} s" in said
     how = found.findings[0].setting
     assert how["mean_s"] == pytest.approx(mean_s, abs=0.05)
-    assert how["late_s"] == pytest.approx((mean_s - 0.04) / 2, abs=0.04)  # the rows before
+    assert how["late_s"] == pytest.approx(
+        (mean_s - 0.04) / 2, abs=0.04
+    )  # the mean of the preceding rows
     assert [term.setting for term in found.terms] == [how]
     values = [p.value for p in found.findings[0].parameters]
     np.testing.assert_allclose(values, PER_AMPERE, rtol=0.05)
@@ -47,8 +51,8 @@ def test_it_is_one_name(memory_s: float, mean_s: float):
 
 
 @pytest.mark.slow
-def test_a_field_of_the_change_that_is_there_stays_one():
-    """Another direction than the current's own: no other time of the log is both."""
+def test_true_derivative_field_is_found_next_to_the_current():
+    """Its direction differs from the current's, so no time shift of the column explains both."""
     track = driven(17, 0.5, 0.0)
     current = track.covariates["motor_current_a"]
     change = np.gradient(current, track.time_s)[:, None] * np.array([2e-4, 3e-4, -2e-4])
@@ -59,8 +63,8 @@ def test_a_field_of_the_change_that_is_there_stays_one():
 
 
 @pytest.mark.parametrize(("waves", "rel"), [(0.05, 0.005), (0.3, 0.02), (0.6, 0.06), (0.8, 0.35)])
-def test_ups_and_downs_are_as_they_were_before_the_mean(waves: float, rel: float):
-    """Waves within the mean; those of a whole one are gone."""
+def test_deconvolution_restores_the_amplitude_of_waves_within_the_mean(waves: float, rel: float):
+    """Waves shorter than the mean are restored; a wave of exactly its length is lost."""
     time_s = np.arange(4000) * 0.04 + 0.002 * np.sin(np.arange(4000))
     turn = 2 * np.pi * waves / 0.8
     averaged = np.cos(turn * time_s + 0.3) * np.sinc(waves)
@@ -71,7 +75,7 @@ def test_ups_and_downs_are_as_they_were_before_the_mean(waves: float, rel: float
     assert before * np.sinc(waves) == pytest.approx(1.0, rel=rel)
 
 
-def test_what_a_mean_leaves_nothing_of_is_not_blown_up():
+def test_deconvolution_does_not_amplify_noise_without_limit():
     rng = np.random.default_rng(1)
     noise = rng.normal(size=4000)
     found = deconvolve_mean(np.arange(4000) * 0.04, noise, 0.8)

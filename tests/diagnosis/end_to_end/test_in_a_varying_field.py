@@ -1,4 +1,4 @@
-"""Names held against the spectrum of what is left; delays beside wider names."""
+"""Findings in a recording whose remaining field varies as in a room."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ahrsd.diagnosis.track import Track
 
 @cache
 def room(samples: int = 4000) -> Track:
-    """A recording in whose remainder a field in sensor axes changes every eight seconds."""
+    """A recording in which a field in sensor axes changes every eight seconds."""
     track = track_of(experiment("wam", motion="rov", samples=samples))
     pieces = np.floor(track.time_s / 8.0).astype(int)
     values = np.random.default_rng(8).normal(0.0, 4e-3, (pieces.max() + 1, 3))
@@ -24,13 +24,13 @@ def room(samples: int = 4000) -> Track:
 
 
 def switched(track: Track) -> np.ndarray:
-    """(N,) a lamp that is on for a few seconds now and then."""
+    """(N,) a lamp that is switched on for a few seconds at random."""
     seconds = np.floor(track.time_s / 3.0).astype(int)
     return np.random.default_rng(9).integers(0, 2, seconds.max() + 1)[seconds].astype(float)
 
 
 @pytest.mark.slow
-def test_a_room_alone_gets_no_name():
+def test_varying_field_alone_gives_no_finding():
     track = room()
     found = diagnose(replace(track, covariates={"lamp_on": switched(track)}))
     assert found.findings == ()
@@ -38,7 +38,7 @@ def test_a_room_alone_gets_no_name():
 
 
 @pytest.mark.slow
-def test_a_lamp_is_named_beside_a_room_that_nothing_explains():
+def test_lamp_is_found_with_an_unexplained_varying_field():
     track = room()
     value = np.array([5e-3, -3e-3, 4e-3])
     lit = switched(track)
@@ -52,7 +52,7 @@ def test_a_lamp_is_named_beside_a_room_that_nothing_explains():
 
 
 @pytest.mark.slow
-def test_a_misalignment_is_named_beside_a_room_with_its_value():
+def test_misalignment_is_found_with_its_value_in_a_varying_field():
     track = room()
     angle = np.array([0.05, -0.03, 0.04])
     reading = track.mag_b_gauss @ so3.exp(angle[None])[0].T
@@ -66,8 +66,8 @@ def test_a_misalignment_is_named_beside_a_room_with_its_value():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="the step is told as a part of what changes there, unknown")
-def test_a_sharp_step_is_named_beside_a_room_and_a_change_like_the_others_is_not():
+@pytest.mark.xfail(strict=True, reason="the step is taken for a part of the unknown varying field")
+def test_large_step_is_found_in_a_varying_field_and_an_ordinary_change_is_not():
     track = room()
     later = (track.time_s >= 83.0)[:, None]
     for size, named in ((0.12, ["hard_iron_step"]), (0.006, [])):
@@ -82,8 +82,8 @@ def test_a_sharp_step_is_named_beside_a_room_and_a_change_like_the_others_is_not
 
 @pytest.mark.slow
 @pytest.mark.recordings
-@pytest.mark.xfail(strict=True, reason="what the magnet does there is called ordinary for a room")
-def test_a_magnet_that_stands_in_the_room_is_an_unknown_of_the_world() -> None:
+@pytest.mark.xfail(strict=True, reason="the field of the magnet is reported as ordinary for a room")
+def test_magnet_in_the_room_is_an_unknown_cause_in_the_world_frame() -> None:
     found = diagnose(recorded("broad/28_disturbed_stationary_magnet_A"))
     assert [one.effect for one in found.findings] == ["mag_time_lag"]
     where = found.unexplained.where

@@ -1,4 +1,4 @@
-"""What is put on and taken off again is one vector, there for a while."""
+"""A magnet that is put on and taken off is one vector over an interval."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _with_magnet(track: Track, begin_s: float, end_s: float) -> Track:
 
 
 @pytest.mark.slow
-def test_a_magnet_that_is_put_on_and_taken_off_is_one_step_with_its_end():
+def test_temporary_magnet_is_one_step_with_an_end():
     track = track_of(experiment("wam", seed=14, samples=2000))
     begin_s, end_s = float(track.time_s[600]), float(track.time_s[1300])
     found = diagnose(_with_magnet(track, begin_s, end_s))
@@ -36,8 +36,8 @@ def test_a_magnet_that_is_put_on_and_taken_off_is_one_step_with_its_end():
 
 
 @pytest.mark.slow
-def test_a_magnet_that_a_hand_brings_from_the_side_is_one_step_with_its_end():
-    # louder than the field itself, and a second on its way: no moment is that of a step
+def test_temporary_magnet_brought_by_hand_is_one_step_with_an_end():
+    # stronger than the field itself, and moved for a second: no single instant is that of a step
     track = track_of(experiment("wam", motion="rov", samples=2400))
     since_s = track.time_s - track.time_s[0]
     on, off = (np.clip((since_s - at) / 1.2 + 0.5, 0.0, 1.0) for at in (35.0, 65.0))
@@ -56,7 +56,7 @@ def test_a_magnet_that_a_hand_brings_from_the_side_is_one_step_with_its_end():
 
 
 @pytest.mark.slow
-def test_a_magnet_that_stays_has_no_end():
+def test_permanent_magnet_is_a_step_without_an_end():
     track = track_of(experiment("wam", seed=15, samples=4000))
     begin_s = float(track.time_s[1200])
     (magnet,) = diagnose(_with_magnet(track, begin_s, np.inf)).findings

@@ -1,4 +1,4 @@
-"""Moments at which steps are proposed: where a residual is largest, away from the ends."""
+"""Times at which steps are proposed: the largest residuals, away from the ends."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from ahrsd.diagnosis.inference.search.model_search import residual_peak_times
 
 
-def test_the_largest_are_found_apart_from_each_other_and_away_from_the_ends():
+def test_residual_peaks_are_separated_and_away_from_the_ends():
     time_s = 0.1 * np.arange(2000)
     left = 0.1 * np.random.default_rng(1).standard_normal((2000, 3))
     for row, size in ((3, 9.0), (500, 8.0), (503, 7.0), (1200, 6.0), (1998, 9.0)):

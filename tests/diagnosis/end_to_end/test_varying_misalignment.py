@@ -1,4 +1,4 @@
-"""Names that only stand in for something of another form are taken back: unknown, there."""
+"""Effects that only imitate an error of another form are rejected, and the cause is unknown."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def driven(samples: int) -> Track:
 
 
 def turned(track: Track, angle_rad: np.ndarray) -> Track:
-    """The magnetometer turned against the gyro by rotation vectors (N, 3)."""
+    """The magnetometer rotated relative to the gyro by rotation vectors (N, 3)."""
     return replace(track, mag_b_gauss=Rotation.from_rotvec(angle_rad).apply(track.mag_b_gauss))
 
 
 @pytest.mark.slow
-def test_a_mount_that_stays_crooked_has_a_name() -> None:
+def test_constant_misalignment_is_found() -> None:
     track = driven(3000)
     found = diagnose(turned(track, np.full((len(track), 3), 3e-3)))
     assert [one.effect for one in found.findings] == ["mag_gyro_misalignment"]
@@ -37,7 +37,7 @@ def test_a_mount_that_stays_crooked_has_a_name() -> None:
 
 
 @pytest.mark.slow
-def test_a_mount_that_bends_more_and_more_has_none(track: Track) -> None:
+def test_steadily_growing_misalignment_is_unknown(track: Track) -> None:
     share = np.linspace(0.0, 1.0, len(track))[:, None]
     found = diagnose(turned(track, share * np.array([6e-3, -4e-3, 5e-3])))
     assert found.findings == ()
@@ -46,8 +46,8 @@ def test_a_mount_that_bends_more_and_more_has_none(track: Track) -> None:
 
 
 @pytest.mark.slow
-def test_a_mount_that_bends_fast_and_then_stays_is_no_crowd_of_names(track: Track) -> None:
-    """It has its mean turn, and beside it something unknown: how it came to that."""
+def test_misalignment_that_settles_is_found_as_its_mean_with_an_unknown_rest(track: Track) -> None:
+    """Its mean is the finding; how it reached its final value remains unknown."""
     warmth = 1.0 - np.exp(-3.0 * np.linspace(0.0, 1.0, len(track)))[:, None]
     turns_rad = warmth * np.array([12e-3, -8e-3, 10e-3])
     found = diagnose(turned(track, turns_rad))
@@ -58,7 +58,7 @@ def test_a_mount_that_bends_fast_and_then_stays_is_no_crowd_of_names(track: Trac
 
 
 @pytest.mark.slow
-def test_a_gyro_bias_that_comes_and_goes_is_no_pair_of_steps(track: Track) -> None:
+def test_temporary_gyro_bias_is_not_a_pair_of_steps(track: Track) -> None:
     phase = np.clip((track.time_s - 120.0) / 40.0, 0.0, 1.0)
     bump = np.sin(np.pi * phase)[:, None] ** 2 * np.array([6e-4, -5e-4, 7e-4])
     found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + bump))

@@ -1,4 +1,4 @@
-"""Errors of the gyro that no name has: unknown, in its frame."""
+"""Errors of the gyro that no effect of the library describes: unknown, in the gyro's frame."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def track() -> Track:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 8])
-def test_a_gyro_that_is_off_for_a_while_is_no_object_outside(seed: int) -> None:
-    """It was a field that the vehicle passed, or a jump of the field, and something else beside."""
+def test_temporary_gyro_bias_is_not_attributed_to_an_external_object(seed: int) -> None:
+    """It was once taken for a passed field, or a step of the field, and a further cause."""
     quiet = made(Trial(seed=seed, samples=7500, rate_hz=25.0, scenario="mam", noise="white")).track
     inside = (quiet.time_s > 150.0) & (quiet.time_s < 190.0)
     spell = inside[:, None] * np.array([-1.7e-4, 2.0e-4, 1.4e-4])
@@ -33,7 +33,7 @@ def test_a_gyro_that_is_off_for_a_while_is_no_object_outside(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_scale_that_differs_between_the_senses_of_rotation_has_no_name(track: Track) -> None:
+def test_scale_that_depends_on_the_sense_of_rotation_is_unknown(track: Track) -> None:
     added = np.abs(track.gyro_b_rad_s) * np.array([3e-3, -4e-3, 5e-3])
     found = diagnose(replace(track, gyro_b_rad_s=track.gyro_b_rad_s + added))
     assert found.findings == ()
@@ -41,7 +41,7 @@ def test_a_scale_that_differs_between_the_senses_of_rotation_has_no_name(track: 
 
 
 @pytest.mark.slow
-def test_a_gyro_that_turns_more_to_one_side_has_its_mean_scale_and_an_unknown_of_the_gyro():
+def test_one_sided_gyro_scale_is_found_as_its_mean_with_an_unknown_of_the_gyro():
     track = made(Trial(8, samples=8_000, rate_hz=25.0)).track
     rate = track.gyro_b_rad_s
     uneven = rate + 0.004 * np.maximum(rate, 0.0)
@@ -58,8 +58,8 @@ def test_a_gyro_that_turns_more_to_one_side_has_its_mean_scale_and_an_unknown_of
 
 
 @pytest.mark.slow
-def test_a_bias_that_swells_and_fades_is_no_steps():
-    """Three steps that end where they began say nothing but that it came and went."""
+def test_bias_that_rises_and_falls_smoothly_is_not_steps():
+    """Three steps that end at the initial value only show that the bias was temporary."""
     track = made(Trial(12, samples=8_000, rate_hz=25.0)).track
     part = np.clip((track.time_s - track.time_s[0] - 140.0) / 40.0, 0.0, 1.0)
     swell = np.sin(np.pi * part)[:, None] ** 2 * np.array([8e-4, 7e-4, -9e-4])
