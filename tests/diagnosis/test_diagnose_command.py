@@ -148,8 +148,10 @@ def test_unusable_column_is_noted_and_the_diagnosis_continues(run, saved, clean,
     broken[:10] = 3.0
     changed = {**clean, "motor_current_a": broken, "temperature_c": np.full(rows, 20.0)}
     assert run("diagnose", str(saved(changed))) == 0
-    said = capsys.readouterr().out
-    assert "note: column motor_current_a was left out" in said
+    output = capsys.readouterr().out
+    assert "recording.csv: recording and model agree" in output
+    assert "note: column motor_current_a was left out" in output
+    assert "note: column temperature_c was left out: it is 20 throughout" in output
 
 
 @pytest.mark.slow
@@ -160,8 +162,10 @@ def test_recording_at_rest_has_no_finding(run, saved, clean, capsys):
     for axis, value in zip("xyz", (0.2, -0.1, 0.4), strict=True):
         still[f"mag_{axis}_gauss"] = value + 1e-3 * rng.standard_normal(rows)
         still[f"gyro_{axis}_rad_s"] = 5e-3 * rng.standard_normal(rows)
-    assert run("diagnose", str(saved(still))) == 0
-    assert "1 effect" not in capsys.readouterr().out
+    assert run("diagnose", str(saved(still)), "--json", "-") == 0
+    body = json.loads(capsys.readouterr().out)
+    assert body["findings"] == []
+    assert not body["unexplained"]["detected"]
 
 
 def test_simulation_with_a_shifted_clock_is_aligned(saved, clean):

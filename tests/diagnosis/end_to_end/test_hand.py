@@ -19,11 +19,11 @@ ON_S, OFF_S, HAND_S = 60.0, 110.0, 1.2
 LAG_S = 0.012
 
 
-def handled(lag_s: float = 0.0, hand_s: float = HAND_S) -> Track:
+def handled(lag_s: float = 0.0) -> Track:
     """A magnet put on and taken off by a hand, which brings it from the side."""
     track = track_of(experiment("wam", motion="rov", samples=4000))
     time_s = track.time_s - track.time_s[0]
-    on, off = (np.clip((time_s - at) / max(hand_s, 1e-9) + 0.5, 0.0, 1.0) for at in (ON_S, OFF_S))
+    on, off = (np.clip((time_s - at) / HAND_S + 0.5, 0.0, 1.0) for at in (ON_S, OFF_S))
     aside = np.sin(np.pi * on) ** 2 - 0.6 * np.sin(np.pi * off) ** 2
     field = (on - off)[:, None] * MAGNET + aside[:, None] * np.array([0.2, 0.15, 0.0])
     return delayed_gyro(replace(track, mag_b_gauss=track.mag_b_gauss + field), -lag_s)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import chdtri
+from search_spaces import middle_setting, sets_of
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis import priors
@@ -63,14 +64,6 @@ def with_current(track: Track, *, field: bool) -> Track:
     return replace(track, mag_b_gauss=mag, covariates={"motor_current_a": amps})
 
 
-def sets_of(track: Track) -> tuple[Hypotheses, Space]:
-    problem, cold = build_problem(track, Spec())
-    fit = fit_null(problem.track, problem.spec, cold, walk=False)
-    return build_search_space(
-        richest_model.fit_richest_model(problem, fit.filtered, EFFECTS), EFFECTS, ()
-    )
-
-
 @pytest.fixture(scope="module")
 def track():
     return replace(track_of(experiment("wam", seed=21, samples=3000)), accel_b_m_s2=None)
@@ -88,14 +81,10 @@ def driven(track):
     return sets_of(with_current(track, field=True))
 
 
-def key_of(space: Space, name: str) -> str:
-    return space.effects[name][len(space.effects[name]) // 2]
-
-
 def gains(found: tuple[Hypotheses, Space], name: str) -> tuple[float, float]:
     """Held-out gain, in nats over all readings, of an effect and of its best time-shifted copy."""
     all_sets, space = found
-    key = key_of(space, name)
+    key = middle_setting(space, name)
     held = HeldOut(all_sets, all_sets.judge({key}))
     told = held.held_out_gain((key,))
     return told.nll_gain_per_sample * held.samples, told.placebo_gain * held.samples
@@ -104,7 +93,7 @@ def gains(found: tuple[Hypotheses, Space], name: str) -> tuple[float, float]:
 def test_nearest_effect_is_compared_with_an_unknown_cause_in_its_place(track):
     """As in the decision: compared with no effect it may exceed the required odds."""
     all_sets, space = sets_of(with_current(track, field=True))
-    bare, key = all_sets.judge(()), key_of(space, "motor_current_field")
+    bare, key = all_sets.judge(()), middle_setting(space, "motor_current_field")
     answer = Answer(bare, (), (), {}, (), (), Unexplained(False), 0.0)
     named = all_sets.judge({key})
     (alone,) = nearest_effect(answer, all_sets)
@@ -117,7 +106,7 @@ def test_nearest_effect_is_compared_with_an_unknown_cause_in_its_place(track):
 
 def test_set_with_too_many_coefficients_is_skipped_as_a_candidate(idle, monkeypatch):
     all_sets, space = idle
-    key = key_of(space, "motor_current_field")
+    key = middle_setting(space, "motor_current_field")
     bare, course = all_sets.judge(()), space.courses[0]
     width = all_sets.component(course).width
     monkeypatch.setattr(priors, "WIDEST", width)  # with the calibration there is less room
@@ -149,7 +138,7 @@ def test_true_effect_has_held_out_gain_and_its_shifted_copies_do_not(driven):
     assert gain > 200.0
     assert copy < 0.1 * gain
     all_sets, space = driven
-    key = key_of(space, "motor_current_field")
+    key = middle_setting(space, "motor_current_field")
     told = HeldOut(all_sets, all_sets.judge({key})).held_out_gain((key,))
     # the prediction error is the sensor's noise; a row is a mean of several readings
     noise = 1e-3 / np.sqrt(all_sets.made.point.problem.averaged)
@@ -160,7 +149,9 @@ def test_true_effect_has_held_out_gain_and_its_shifted_copies_do_not(driven):
 def test_superfluous_effect_has_no_held_out_gain(driven):
     """With the current's field in the model, a step has nothing left to explain."""
     all_sets, space = driven
-    cause, step = (key_of(space, name) for name in ("motor_current_field", "hard_iron_step"))
+    cause, step = (
+        middle_setting(space, name) for name in ("motor_current_field", "hard_iron_step")
+    )
     held = HeldOut(all_sets, all_sets.judge({cause, step}))
     assert held.gain(held.without((step,))) * held.samples < 0.5
     assert held.gain(held.without((cause,))) * held.samples > 200.0
@@ -169,7 +160,7 @@ def test_superfluous_effect_has_no_held_out_gain(driven):
 def test_held_out_density_equals_that_of_the_dense_gaussian():
     short = replace(track_of(experiment("wam", seed=22, samples=900)), accel_b_m_s2=None)
     all_sets, space = sets_of(with_current(short, field=True))
-    held = HeldOut(all_sets, all_sets.judge({key_of(space, "motor_current_field")}))
+    held = HeldOut(all_sets, all_sets.judge({middle_setting(space, "motor_current_field")}))
     rows = held.rows(held.best.names)
     part = np.repeat(assign_folds(rows), 3)
     X, y = rows.X.reshape(len(part), -1), rows.y.ravel()
@@ -208,7 +199,7 @@ def test_free_process_gains_most_in_its_own_frame(track):
 
 def test_odds_change_by_the_logarithm_of_the_effect_prior(driven):
     all_sets, space = driven
-    best = all_sets.judge({key_of(space, "motor_current_field")})
+    best = all_sets.judge({middle_setting(space, "motor_current_field")})
     found = prior_sensitivity(all_sets, best, all_sets.judge(NOTHING), required=3.0)
     (by_name,) = (one for one in found.assumed if one.what == EFFECT)
     assert found.log_odds == pytest.approx(best.score - all_sets.judge(NOTHING).score)
@@ -220,7 +211,7 @@ def test_odds_change_by_the_logarithm_of_the_effect_prior(driven):
 
 def test_odds_with_another_noise_prior_agree_with_a_refit(driven, monkeypatch):
     all_sets, space = driven
-    names = frozenset({key_of(space, "motor_current_field")})
+    names = frozenset({middle_setting(space, "motor_current_field")})
     found = prior_sensitivity(
         all_sets, all_sets.judge(names), all_sets.judge(NOTHING), required=3.0
     )
@@ -234,7 +225,7 @@ def test_odds_with_another_noise_prior_agree_with_a_refit(driven, monkeypatch):
 
 def test_odds_over_a_free_process_change_by_its_assumed_prior(driven):
     all_sets, space = driven
-    best = all_sets.judge({key_of(space, "motor_current_field")})
+    best = all_sets.judge({middle_setting(space, "motor_current_field")})
     rival = all_sets.judge({"free sensor"})
     by = {one.what: one for one in prior_sensitivity(all_sets, best, rival, 3.0).assumed}
     assert by[COURSE].double_nats - by[COURSE].half_nats == pytest.approx(-2 * np.log(2.0))
@@ -262,7 +253,7 @@ def test_residual_of_a_null_is_like_its_simulated_copies_in_every_bin(idle):
 
 def test_check_by_column_fails_before_and_passes_with_the_effect(driven):
     all_sets, space = driven
-    names = frozenset({key_of(space, "motor_current_field")})
+    names = frozenset({middle_setting(space, "motor_current_field")})
     held = HeldOut(all_sets, all_sets.judge(names))
     found = fit_residuals(held.rows(names))
     maps = regime_maps(found)
@@ -306,7 +297,7 @@ def test_sensitivity_limit_is_detectable_and_a_third_of_it_is_not(idle, track):
         mag = column.mag_b_gauss.copy()
         mag[:, 0] += size * column.covariates["motor_current_a"]
         sets, asked = sets_of(replace(column, mag_b_gauss=mag))
-        key = key_of(asked, "motor_current_field")
+        key = middle_setting(asked, "motor_current_field")
         return sets.judge({key}).score - sets.judge(NOTHING).score
 
     assert odds(1.2 * limit.smallest) > priors.NAME_ODDS  # at the actual noise
