@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.track import Track
+from ahrsd.printable import counted
 from ahrsd.samples import Array
 
 _ATTITUDE = re.compile(r"^(ref_q[wxyz]|vn_|ref_|est_)")
@@ -244,9 +245,12 @@ def _fill_gaps(name: str, values: Array, time_s: Array) -> tuple[Array, str]:
     good = np.isfinite(values)
     if good.all():
         return values, ""
-    share = 1.0 - np.count_nonzero(good) / max(len(values), 1)
-    if share > priors.COLUMN_MISSING:
-        return values, f"column {label(name)} was left out: {share:.0%} of its values are missing"
+    present = int(np.count_nonzero(good))
+    if 1.0 - present / max(len(values), 1) > priors.COLUMN_MISSING:
+        return values, (
+            f"column {label(name)} was left out: it has {counted(present, 'value')} in "
+            f"{counted(len(values), 'row')}"
+        )
     known_s = np.concatenate([time_s[:1], time_s[good], time_s[-1:]])
     usual_s = float(np.median(np.diff(time_s)))
     gaps = [

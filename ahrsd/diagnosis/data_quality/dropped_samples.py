@@ -82,7 +82,7 @@ def find_lost_turns(done: Filtered, rate_b_rad_s: Array) -> list[Fact]:
     if jumps is not None and 2 * len(jumps.forward) >= expected:
         lost = zeros.copy()
         lost[jumps.forward] = np.round(jumps.steps[jumps.forward])
-        setting = {LONG: jumps.long} if jumps.long else {}
+        setting: dict[str, float] = {LONG: jumps.long} if jumps.long else {}
         turns = recover_lost_steps(done, rate_b_rad_s, lost)
     elif expected:
         setting = {UNSEEN: expected}

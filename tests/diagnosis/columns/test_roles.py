@@ -91,7 +91,8 @@ def test_sparse_column_is_interpolated_and_sparse_switch_holds_its_value():
     ("name", "values", "message"),
     [
         ("motor_current_a", np.where(np.arange(200) < 80, RAMP, np.nan), "no values from 7.9 to"),
-        ("motor_current_a", np.full(200, np.nan), "100% of its values are missing"),
+        ("motor_current_a", np.full(200, np.nan), "it has 0 values in 200 rows"),
+        ("motor_current_a", np.where(np.arange(200) < 3, RAMP, np.nan), "it has 3 values in 200"),
         ("motor_current_a", RAMP * 0 + 3, "it is 3 throughout, so it can explain nothing"),
         ("motor_current_a", RAMP * 1000, "it looks like milliampere"),
         ("temperature_c", RAMP + 295, "it looks like kelvin"),

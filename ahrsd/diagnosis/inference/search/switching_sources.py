@@ -216,7 +216,7 @@ def _level_component(context: Context, frame: Frame, change_rows: Sequence[int])
     segments = segments_between(time_s, edges)
 
     def indicators() -> Array:
-        return (segments.index[:, None] == np.arange(len(segments))).astype(float)
+        return np.asarray(segments.index[:, None] == np.arange(len(segments)), np.float64)
 
     columns = columns_in_frame(context, frame, indicators, len(segments))
     low, high = (np.array([np.log(one)]) for one in priors.COURSE_SIZES)
