@@ -22,6 +22,7 @@ def junk(seed, n, size, smooth, rate):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @given(
     seed=st.integers(0, 10**6),

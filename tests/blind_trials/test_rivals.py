@@ -15,6 +15,8 @@ from ahrsd.errors import AhrsdError
 from ahrsd.estimator.online import Estimator
 from ahrsd.recording.table import read_table
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def strong(tmp_path_factory):

@@ -13,6 +13,8 @@ from blind_trials.world import cases, chain, curves, ideal, limits, motion, ring
 from blind_trials.world.__main__ import csv_bytes, make_ring
 from scipy.spatial.transform import Rotation
 
+pytestmark = pytest.mark.slow
+
 PROJECT = Path(__file__).parents[2]
 RATE_HZ = 25.0
 

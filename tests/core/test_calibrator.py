@@ -67,6 +67,7 @@ def test_calibrator_finds_the_calibration_of_the_emulated_device(blocks):
     assert np.abs((estimate.gyro_bias_rad_s - truth.gyro_bias_rad_s) / estimate.sigma[9:]).max() < 4
 
 
+@pytest.mark.slow
 def test_held_out_samples_never_reach_the_estimator(blocks):
     """Changes of held-out samples do not change the estimate (a step would: `monitoring`)."""
     plain, other = (Calibrator(settings(), Affine.identity(), np.zeros(3)) for _ in range(2))

@@ -175,7 +175,7 @@ def test_simulation_with_a_shifted_clock_is_aligned(saved, clean):
     overlap = align(real, simulated)
     assert len(overlap.real) == pytest.approx(len(real), abs=2)
     assert overlap.real.time_s[0] == pytest.approx(overlap.simulated.time_s[0], abs=0.05)
-    assert any("moved by +1.2" in note for note in overlap.notes)
+    assert any("shifted by +1.2" in note for note in overlap.notes)
 
 
 @pytest.mark.parametrize("shift_s", [0.0, 1.2])
@@ -189,7 +189,7 @@ def test_simulation_of_a_part_is_aligned_with_that_part(saved, clean, shift_s):
     overlap = align(real, simulated)
     first, last = clean["time_s"][[400, 1149]]
     assert overlap.simulated.time_s[[0, -1]] == pytest.approx([first, last], abs=0.021)
-    assert any("was moved" in note for note in overlap.notes) == (shift_s > 0)
+    assert any("was shifted" in note for note in overlap.notes) == (shift_s > 0)
 
 
 def test_simulation_in_other_axes_is_aligned_by_the_magnitude_of_its_rate(saved, clean):
@@ -212,7 +212,7 @@ def test_simulation_of_another_time_or_motion_is_refused(run, saved, clean, caps
         moved[f"mag_{axis}_gauss"] = other.raw_b_gauss[:, k]
         moved[f"gyro_{axis}_rad_s"] = other.gyro_b_rad_s[:, k]
     assert run("diagnose", str(real), "--simulation", str(saved(moved, "other.csv"))) == 2
-    assert "is another motion" in capsys.readouterr().err
+    assert "is of another motion" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -100,12 +100,13 @@ def test_errors_with_an_imperfect_instrument_are_within_the_sigmas(trouble, moti
     assert sum(np.array(known) > 3.0) <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "motion",
     [
         (("roll", 100.0),),
-        pytest.param((("roll", 60.0), ("circles", 60.0)), marks=pytest.mark.slow),
-        pytest.param((("circles", 100.0), ("pitch", 40.0)), marks=pytest.mark.slow),
+        (("roll", 60.0), ("circles", 60.0)),
+        (("circles", 100.0), ("pitch", 40.0)),
     ],
     ids=["roll", "roll, circles", "circles, pitch"],
 )
@@ -148,6 +149,7 @@ def test_level_turns_of_a_perfect_instrument_still_converge(after):
         assert 0.02 < found.heading_sigma_deg < 0.5
 
 
+@pytest.mark.slow
 def test_misalignment_alone_is_within_the_sigmas():
     """A misaligned sensor without delay or scale error, in level circles."""
     perfect, known = [], []

@@ -6,8 +6,10 @@ import importlib
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 
+@pytest.mark.slow
 def test_cost_of_the_hundred_thousandth_sample_equals_that_of_the_first(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks" / "estimator"))
     points, error = importlib.import_module("bench_long").measure(100_000)

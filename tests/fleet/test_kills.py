@@ -44,6 +44,7 @@ def test_every_recording_has_one_row_after_kills(tmp_path):
     assert {"driver", "process"} <= found["kills"].keys()
 
 
+@pytest.mark.slow
 def test_interrupted_run_reports_it_and_leaves_no_process(tmp_path):
     """The run cannot end before the signal, because two recordings wait for a file."""
     archive = tmp_path / "archive"

@@ -166,6 +166,7 @@ def test_options_are_in_the_key_and_labels_come_from_folders(archive, tmp_path):
     assert every == [(json.dumps({"rate_hz": 25.0}), found["converged"])]
 
 
+@pytest.mark.slow
 def test_rows_are_the_same_through_fsspec(archive, out, tmp_path):
     pytest.importorskip("fsspec", reason="fsspec (the extra fleet) is not installed")
     small = tmp_path / "archive" / "rov0"

@@ -20,6 +20,8 @@ from generators.road_and_air.motion import (
     quat_to_matrix,
 )
 
+pytestmark = pytest.mark.slow
+
 
 def short_scene(vehicle: str, seed: int, rate_hz: float = 25.0) -> Scene:
     """A scene of one vehicle at a low rate."""

@@ -10,6 +10,8 @@ from blind_trials.answers import read_answer
 from blind_trials.judge import judge
 from generators.truths import WORLDS, made, truth_of
 
+pytestmark = pytest.mark.slow
+
 
 def told(kind: str, *names: str, noise: str = "white") -> dict:
     effects = [

@@ -26,6 +26,8 @@ from generators.workboat.world import (
     visibility_without_attitude,
 )
 
+pytestmark = pytest.mark.slow
+
 COUNTS = {"null": 1, "single": 1, "pair": 1, "withheld": 2, "outside": 1}
 
 

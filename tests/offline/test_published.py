@@ -67,6 +67,7 @@ def test_figure_of_a_single_method_is_refused(simulated, run, capsys):
     assert "--figure compares the methods: give --method all" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_magfactor3_uses_the_device_attitude_when_place_and_attitude_are_known(simulated, tmp_path):
     """The device's yaw is magnetic. At the Black Sea the field has the dip of the simulated one."""
     path, truth = simulated

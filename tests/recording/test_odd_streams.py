@@ -161,13 +161,14 @@ def test_correct_stream_with_cr_lf_is_unchanged(tmp_path):
     assert result.core.stream.facts.damaged == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("every", "first"),
     [
         (1, "rates"),
-        pytest.param(4, "field", marks=pytest.mark.slow),
-        pytest.param(1, "field", marks=pytest.mark.slow),
-        pytest.param(4, "rates", marks=pytest.mark.slow),
+        (4, "field"),
+        (1, "field"),
+        (4, "rates"),
     ],
 )
 def test_field_and_rates_of_two_outputs_are_put_together(tmp_path, first, every):

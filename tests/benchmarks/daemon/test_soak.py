@@ -76,7 +76,8 @@ def short_histories(monkeypatch):
     )
 
 
-@pytest.mark.parametrize("minutes", [6, pytest.param(9, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("minutes", [6, 9])
 def test_memory_and_update_time_do_not_grow(soak, tmp_path, short_histories, minutes):
     found = run(soak, tmp_path, float(minutes))
     print(found)

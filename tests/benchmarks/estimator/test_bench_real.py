@@ -48,6 +48,7 @@ def test_no_method_beats_one_that_uses_the_optical_attitude(bench, recordings):
     assert lines["magyc"].after_deg < lines["oracle"].after_deg + 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.benchmark
 def test_a_sensor_at_rest_is_refused_by_all(bench, recordings):
     rows = bench.at_rest(recordings, ("magical-nls", "twostep", "ellipsoid", "fnp"))

@@ -68,6 +68,7 @@ def peers(benchmark, tmp_path, monkeypatch):
     return bench
 
 
+@pytest.mark.slow
 def test_the_comparison_from_end_to_end(peers, tmp_path, capsys):
     arguments = ["--cache", tmp_path / "c", "--runs", "2,1", "--sets", "mam", "--motions", "rov"]
     peers.main([str(a) for a in (*arguments, "--output", tmp_path / "out")])
@@ -136,6 +137,7 @@ def test_bad_numbers_of_runs_are_refused(peers, tmp_path, runs, capsys):
     assert "--runs" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_time_is_compared_on_the_same_samples(peers, tmp_path):
     peers.TOOL.write_text(peers.TOOL.read_text().replace('known["MAGYC-IFG"] = broken', ""))
     rows = peers.times(tmp_path, Path(sys.executable), peers.TOOL, (600,))

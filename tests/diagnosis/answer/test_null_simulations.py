@@ -67,6 +67,7 @@ def _stepped() -> tuple[Track, Callable[[float], FittedDiagnosis]]:
     return track, answered
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_fits")
 def test_no_verdict_when_a_simulation_of_the_null_model_cannot_be_diagnosed() -> None:
     """It is then unknown how much evidence chance alone produces."""

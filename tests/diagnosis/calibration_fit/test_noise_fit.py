@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis import priors
@@ -19,6 +20,7 @@ def test_noise_of_differences_recovers_the_true_levels() -> None:
     assert abs(gyro / 2e-3 - 1) < 0.06
 
 
+@pytest.mark.slow
 def test_gyro_noise_fit_does_not_absorb_a_bias_drift() -> None:
     """Without a bound sigma_gyro would grow until the drift counts as noise."""
     made = experiment(samples=3000)

@@ -51,6 +51,7 @@ def test_cold_start_recovers_the_truth_within_its_covariance(
     assert 1e-3 < stats.chi2.sf(sum(squares), 22) < 1 - 1e-3
 
 
+@pytest.mark.slow
 def test_fit_leaves_a_local_minimum_when_motion_is_small() -> None:
     """With small angular motion each of three starts ended 0.26 gauss off, 208 nats above this
     minimum.
@@ -101,6 +102,7 @@ def test_slow_turns_at_a_high_noise_level_are_not_taken_for_rest() -> None:
     assert np.max(found / np.sqrt(np.diag(fit.covariance))[8:11]) < 4
 
 
+@pytest.mark.slow
 def test_null_model_contains_a_random_walk_of_the_gyro_bias() -> None:
     made = experiment(samples=8000, seed=4)
     track = track_of(made)

@@ -114,6 +114,7 @@ def test_plausible_break_is_kept() -> None:
     assert without_clock_jumps(whole) == (whole, ())
 
 
+@pytest.mark.slow
 def test_recording_whose_clock_is_set_is_diagnosed() -> None:
     """From 1970 to 2025: this once needed more than a terabyte."""
     found = diagnose(_jumping(1.7471e9, samples=2500))

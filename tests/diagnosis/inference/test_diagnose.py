@@ -204,6 +204,7 @@ def test_repaired_model_contains_the_delay_with_its_value(name, strength):
         assert np.max(np.abs(gyro)) > 1e-3
 
 
+@pytest.mark.slow
 def test_current_logged_with_a_delay_is_found_and_shifted():
     """As logged it does not explain the field."""
     track = track_of(experiment("wam", seed=10, samples=3000))

@@ -101,6 +101,7 @@ def test_whitening_by_directed_noise_and_its_log_determinant():
     assert made.log_whitening - plain.log_whitening == pytest.approx(denser, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_fast_unlogged_current_is_unknown_along_its_direction():
     """It was once absorbed by coloured noise, and nothing was reported."""
     track = track_of(experiment("wam", seed=14, samples=4000, sigma_mag=5e-4))

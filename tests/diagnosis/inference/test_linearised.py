@@ -83,6 +83,7 @@ def test_log_bayes_factor_of_a_candidate_equals_its_gain_in_evidence(bare):
     assert worth[LAG] == pytest.approx(with_it.nats - without.nats, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_long_delay_is_found_from_zero():
     found = richest(delayed(track_of(experiment("wam", seed=9, samples=4000)), 0.11))
     value = coefficients_by_key(found.base.made, found.base.whole, found.at)[LAG]

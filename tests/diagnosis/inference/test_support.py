@@ -265,6 +265,7 @@ def test_check_by_column_fails_before_and_passes_with_the_effect(driven):
     assert max(current.after) < 10.0
 
 
+@pytest.mark.slow
 def test_unmodelled_source_fails_the_checks_by_time_and_whiteness(track):
     t = track.time_s - track.time_s[0]
     pulse = ((t > 50.0) & (t < 75.0))[:, None] * np.array([4e-3, -3e-3, 2e-3])
@@ -284,6 +285,7 @@ def test_unmodelled_source_fails_the_checks_by_time_and_whiteness(track):
     assert whiteness(start, found)["ljung_box"].p_after < 1e-4
 
 
+@pytest.mark.slow
 def test_sensitivity_limit_is_detectable_and_a_third_of_it_is_not(idle, track):
     all_sets, space = idle
     found = effect_evidence(all_sets, space, NOTHING)

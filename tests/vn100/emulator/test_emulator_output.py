@@ -186,6 +186,7 @@ def test_every_field_of_a_vn100_can_be_sent_and_is_finite(group, word, sizes):
     assert np.isfinite(decoded.values).all()
 
 
+@pytest.mark.slow
 def test_compensated_set_agrees_with_the_codec_and_with_the_truth():
     """syn_time_imu_comp_uncomp: FA 06 8100 0E07; HSI is not applied, so Mag = UncompMag."""
     bias = np.array([0.01, -0.02, 0.03])
