@@ -53,7 +53,7 @@ def test_delayed_column_clock_is_found_with_a_delayed_magnetometer(driven) -> No
     named = {one.effect: one for one in found.findings}
     assert sorted(named) == ["mag_time_lag", "motor_current_field"]
     assert named["mag_time_lag"].parameters[0].value == pytest.approx(0.1, abs=2e-3)
-    assert found.notes[0].startswith("column motor_current_a runs 3 s late against the sensor")
+    assert found.notes[0].startswith("column motor_current_a is 3 s late against the sensor")
     assert not found.unexplained.detected
 
 
@@ -61,8 +61,8 @@ def test_delayed_column_clock_is_found_with_a_delayed_magnetometer(driven) -> No
 @pytest.mark.parametrize(
     ("clock", "words"),
     [
-        (lambda t: t - 3.0, "runs 3 s late against the sensor:"),
-        (lambda t: t + 20.0, "runs 20 s early against the sensor:"),
+        (lambda t: t - 3.0, "is 3 s late against the sensor:"),
+        (lambda t: t + 20.0, "is 20 s early against the sensor:"),
         (lambda t: 0.98 * t, "and its clock drifts by 2"),
     ],
     ids=["late", "early", "drift"],
@@ -72,7 +72,7 @@ def test_wrong_column_clock_is_reported_and_its_current_found(driven, clock, wor
     at_s = clock(track.time_s - track.time_s[0])
     found = diagnose_logged(logged(track, "motor_current_a", levels(at_s, 7)))
     assert [one.effect for one in found.findings] == ["motor_current_field"]
-    assert "column motor_current_a runs " in found.notes[0]
+    assert "column motor_current_a is " in found.notes[0]
     assert words in found.notes[0]
     for value, truth in zip(found.findings[0].parameters, FIELD_PER_AMPERE, strict=True):
         assert value.value == pytest.approx(truth, abs=max(5 * value.std, 1e-4))
@@ -86,7 +86,7 @@ def test_unrelated_column_is_no_cause_at_any_time_shift(driven, seed: int) -> No
     found = diagnose_logged(logged(track, "shaft_rpm", 100 * other))
     assert found.findings == ()
     assert found.unexplained.detected
-    assert not any("runs" in note for note in found.notes)
+    assert not any("against the sensor" in note for note in found.notes)
 
 
 @pytest.mark.slow

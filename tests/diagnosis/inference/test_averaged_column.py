@@ -59,7 +59,7 @@ def test_true_derivative_field_is_found_next_to_the_current():
     found = diagnose(replace(track, mag_b_gauss=track.mag_b_gauss + change))
     names = sorted(one.effect for one in found.findings)
     assert names == ["current_derivative_field", "motor_current_field"]
-    assert not any(" is read as " in note for note in found.notes)
+    assert not any(" is taken as " in note for note in found.notes)
 
 
 @pytest.mark.parametrize(("waves", "rel"), [(0.05, 0.005), (0.3, 0.02), (0.6, 0.06), (0.8, 0.35)])
