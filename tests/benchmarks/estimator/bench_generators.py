@@ -26,7 +26,7 @@ from generators.truths import KINDS, WORLDS, Iron, Made, made
 
 from ahrsd.__main__ import main as command
 
-GENERIC = "a table says nothing of registers"
+GENERIC = "a table does not say what the registers held"
 COLUMNS = ("cases", "converged", "silent", "any3", "h3", "h3&1")
 
 
