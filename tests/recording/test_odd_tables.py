@@ -322,7 +322,7 @@ def test_coarse_readings_at_rest_are_no_hold(tmp_path):
     still = np.round(1e-3 * draw.normal(size=(COUNT, 3)) / 4e-3) * 4e-3
     table = read(tmp_path, text(cells({**DATA, "gyro": still})))
     assert len(table.rows) == COUNT
-    assert not any("new reading" in note or "each counts once" in note for note in table.notes)
+    assert not any("new reading" in note or "each is used once" in note for note in table.notes)
 
 
 def test_alternating_sensors_are_separated_by_their_column(tmp_path):
