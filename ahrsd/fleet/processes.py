@@ -11,10 +11,10 @@ them from its neighbours, and the refusal comes up in the task's own words. What
 what was asked for; Arrow's own pool reserves a gigabyte that it never touches, so the processes use
 the system's allocator.
 
-A task whose process died is tried again, because whoever killed it may have meant another;
-after `TRIES` it is lost, and so it is said. That includes one that no process began with: pebble
-forgets a task whose process ended while it took it, as where the code that it needs is gone, and
-gives up all processes where none of them was at work then.
+Each thread that asks has a process and a pipe of its own, and nothing is shared between them: a
+process that is killed while it takes or answers a task holds up no other one, as it would where all
+wait for one queue with its lock. A task whose process died is tried again, because whoever killed
+it may have meant another; after `TRIES` it is lost, and the answer says so.
 
 **On a cluster** every worker has a guard with a process for each of its threads. Dask distributes
 and tries again what lay on a worker that died; it has no limits of time and memory for a task,
@@ -30,6 +30,7 @@ import importlib.util
 import logging
 import multiprocessing
 import os
+import pickle
 import resource
 import signal
 import threading
@@ -37,14 +38,12 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from concurrent.futures import ThreadPoolExecutor as Threads
-from concurrent.futures import TimeoutError as LateError
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
+from multiprocessing import connection
+from multiprocessing.connection import Connection
 from typing import Any, Protocol, TypeVar
-
-from pebble import ProcessExpired, ProcessPool
 
 from ahrsd.errors import EXIT_BUSY, AhrsdError
 
@@ -55,8 +54,8 @@ TOO_SLOW, TOO_LARGE, CRASHED, BUG = "too slow", "out of memory", "crashed", "int
 TRIES = 3
 _RECYCLED = 500  # tasks after which a process is replaced: whatever leaked is gone
 _PR_SET_PDEATHSIG = 1
-_START_S = 120.0
-_LOOKS_S = 0.5
+_START_S = 120.0  # within which a process has loaded what the tasks need
+_END_S = 5.0  # within which a process ends that has closed its pipe; it is killed then
 #: read by the processes when they load numpy and Arrow
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"}
 
@@ -66,14 +65,10 @@ _R = TypeVar("_R")
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Of each task; 0 is none.
-
-    begin_s: within which a process begins with it, as many as tasks are asked for at once
-    """
+    """Of each task; 0 is none."""
 
     time_s: float = 0.0
     memory_bytes: int = 0
-    begin_s: float = _START_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +84,6 @@ class Loss:
     seconds: float
 
 
-class _NotBegunError(Exception):
-    """No process took the task, or the one that did ended at that moment."""
-
-
 class Ask(Protocol):
     """What takes a task: `Guard.ask`, but at once."""
 
@@ -102,100 +93,141 @@ class Ask(Protocol):
 
 
 class Guard:
-    """Processes that do tasks; `ask` may be called from as many threads.
+    """Processes that do tasks, one for each thread that calls `ask`.
 
     loads: modules that the tasks need, which a process loads before its first one
     """
 
-    def __init__(self, processes: int, limits: Limits, loads: tuple[str, ...] = ()) -> None:
+    def __init__(self, limits: Limits, loads: tuple[str, ...] = ()) -> None:
         if multiprocessing.current_process().daemon:
             raise AhrsdError(
                 "a process of this Dask worker may not start others: start it with --no-nanny"
             )
         for name, value in _ENVIRONMENT.items():
             os.environ.setdefault(name, value)
-        self._processes, self._limits, self._loads = processes, limits, loads
+        self._limits, self._loads = limits, loads
         self._closed, self._lock = False, threading.Lock()
-        # the processes belong to the thread that starts them: this one, which outlives them
-        self._pool = self._started()
-
-    def _started(self) -> ProcessPool:
-        pool = ProcessPool(
-            self._processes,
-            max_tasks=_RECYCLED,
-            initializer=_begin,
-            initargs=(os.getpid(), self._limits.memory_bytes, self._loads),
-            context=multiprocessing.get_context("spawn"),
-        )
-        pool.schedule(_ready, timeout=_START_S).result()
-        return pool
-
-    def _in_place_of(self, broken: ProcessPool) -> None:
-        """Other processes, unless another thread has started them."""
-        with self._lock:
-            if self._pool is broken and not self._closed:
-                broken.stop()  # type: ignore[no-untyped-call]
-                broken.join()
-                self._pool = self._started()
+        self._processes: dict[int, _Process] = {}  # by the thread that uses it
 
     def ask(self, do: Callable[[_T], _R], task: _T, lost: Callable[[_T, Loss], _R]) -> _R:
         """What `do` answers to a task, or `lost` where it has no answer; it waits for it."""
-        found = self._answer(do, task)
-        return lost(task, found) if isinstance(found, Loss) else found
-
-    def _answer(self, do: Callable[[_T], _R], task: _T) -> _R | Loss:
+        begun = time.monotonic()
+        message = pickle.dumps((do, task))
         for number in range(1, TRIES + 1):
-            begun = time.monotonic()
-            pool = self._pool
-            try:
-                future = pool.schedule(do, args=[task], timeout=self._limits.time_s or None)
-                error = self._error(future)
-            except RuntimeError as closed:  # all its processes ended
-                error = BrokenProcessPool(str(closed))
-            if error is None:
-                return future.result()
-            outcome, words = self._loss(error)
+            outcome, answer = self._answer(message)
             if self._closed:
                 raise CancelledError
-            if isinstance(error, BrokenProcessPool):
-                self._in_place_of(pool)
-            if outcome == CRASHED and number < TRIES:
-                continue
-            return Loss(outcome, words, number, time.monotonic() - begun)
-        raise AssertionError("the last try returns")
+            if outcome is None:
+                return answer  # type: ignore[no-any-return]
+            if outcome != CRASHED:
+                return lost(task, Loss(outcome, answer, number, time.monotonic() - begun))
+        words = f"{answer}, {TRIES} times"
+        return lost(task, Loss(CRASHED, words, TRIES, time.monotonic() - begun))
 
-    def _error(self, future: Future[_R]) -> BaseException | None:
-        """Wait for a task; its error, _NotBegunError where no process began with it."""
-        until = time.monotonic() + self._limits.begin_s
-        while not wait([future], _LOOKS_S).done:
-            if self._closed:  # the pool leaves what it was at without an answer
+    def _answer(self, message: bytes) -> tuple[str | None, Any]:
+        """None and the answer, or an outcome without one and its words."""
+        process = self._process()
+        if not process.is_ready():
+            process.end()
+            return CRASHED, "no process could begin with it"
+        time_s = self._limits.time_s or None
+        try:
+            reply = process.exchange(message, time_s)
+        except TimeoutError:
+            process.end()
+            return TOO_SLOW, f"stopped after {time_s:g} s"
+        except _ProcessEndedError as ended:
+            return CRASHED, f"its process ended {ended}"
+        outcome, answer = pickle.loads(reply)
+        if outcome == TOO_LARGE:
+            answer = f"asked for more than {self._limits.memory_bytes >> 20} MiB"
+        return outcome, answer
+
+    def _process(self) -> _Process:
+        """The calling thread's; another one where that has ended or done enough."""
+        thread = threading.get_ident()
+        with self._lock:
+            if self._closed:
                 raise CancelledError
-            if future.running():  # pebble would cancel it all the same, and kill its process
-                continue
-            if time.monotonic() > until and future.cancel():
-                return _NotBegunError()
-        return future.exception()
-
-    def _loss(self, error: BaseException) -> tuple[str, str]:
-        """The outcome that an error of a process is, and its words."""
-        if isinstance(error, LateError):
-            return TOO_SLOW, f"stopped after {self._limits.time_s:g} s"
-        if isinstance(error, MemoryError):
-            mib = self._limits.memory_bytes >> 20
-            return TOO_LARGE, f"asked for more than {mib} MiB"
-        if isinstance(error, ProcessExpired):
-            code = error.exitcode
-            how = f"by signal {-code} ({_signal(-code)})" if code < 0 else f"with code {code}"
-            return CRASHED, f"its process ended {how}, {TRIES} times"
-        if isinstance(error, BrokenProcessPool | _NotBegunError):
-            return CRASHED, f"no process could begin with it, {TRIES} times"
-        return BUG, f"{type(error).__name__}: {error}"
+            process = self._processes.get(thread)
+            if process is None or process.has_ended() or process.tasks >= _RECYCLED:
+                if process is not None:
+                    process.end()
+                process = self._processes[thread] = _Process(self._limits, self._loads)
+            return process
 
     def close(self) -> None:
         """End the processes; what they were at has no answer."""
-        self._closed = True
-        self._pool.stop()  # type: ignore[no-untyped-call]
-        self._pool.join()
+        with self._lock:
+            self._closed = True
+            for process in self._processes.values():
+                process.end()
+
+
+class _ProcessEndedError(Exception):
+    """A process ended while it had a task; how it did."""
+
+
+class _Process:
+    """A process that does one task after the other, used by the thread that starts it.
+
+    The kernel ends it with that thread (`end_with`).
+    """
+
+    _starting = threading.Lock()  # multiprocessing keeps a set of all processes
+
+    def __init__(self, limits: Limits, loads: tuple[str, ...]) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, its_pipe = context.Pipe()
+        arguments = (its_pipe, os.getpid(), limits.memory_bytes, loads)
+        self._process = context.Process(target=_do_tasks, args=arguments, daemon=True)
+        with self._starting:
+            self._process.start()
+        its_pipe.close()
+        self.tasks = 0
+
+    def is_ready(self) -> bool:
+        """Wait until it has loaded what the tasks need; False where it does not come to that."""
+        if self.tasks:
+            return True
+        try:
+            return self._receive(_START_S) == _READY
+        except (_ProcessEndedError, TimeoutError):
+            return False
+
+    def exchange(self, message: bytes, time_s: float | None) -> bytes:
+        """Its reply to a task.  _ProcessEndedError; TimeoutError after `time_s`."""
+        self.tasks += 1
+        try:
+            self._pipe.send_bytes(message)
+        except OSError:
+            raise _ProcessEndedError(self._how()) from None
+        return self._receive(time_s)
+
+    def _receive(self, time_s: float | None) -> bytes:
+        ready = connection.wait([self._pipe, self._process.sentinel], time_s)
+        if not ready:
+            raise TimeoutError
+        with suppress(EOFError, OSError):  # its end of the pipe is closed: it ends as well
+            if self._pipe.poll():
+                return self._pipe.recv_bytes()
+        raise _ProcessEndedError(self._how())
+
+    def _how(self) -> str:
+        connection.wait([self._process.sentinel], _END_S)
+        self.end()
+        code = self._process.exitcode or 0
+        return f"by signal {-code} ({_signal(-code)})" if code < 0 else f"with code {code}"
+
+    def has_ended(self) -> bool:
+        """Whether it runs no more."""
+        return bool(connection.wait([self._process.sentinel], 0.0))
+
+    def end(self) -> None:
+        """Kill it, where it has not ended."""
+        with self._starting:
+            self._process.kill()
+            self._process.join()
 
 
 def _signal(number: int) -> str:
@@ -209,8 +241,13 @@ def end_with(parent: int) -> None:
         os._exit(1)
 
 
-def _begin(parent: int, memory_bytes: int, loads: tuple[str, ...]) -> None:
-    """In a new process: end with the parent, load what a task needs, and hold the limits."""
+_READY = b"ready"
+
+
+def _do_tasks(
+    pipe: Connection[Any, Any], parent: int, memory_bytes: int, loads: tuple[str, ...]
+) -> None:
+    """In a new process: load what a task needs, hold the limit, and answer one task at a time."""
     end_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver's to answer
     logging.getLogger("ahrsd").setLevel(logging.CRITICAL)  # what a task has to say: in its answer
@@ -218,10 +255,20 @@ def _begin(parent: int, memory_bytes: int, loads: tuple[str, ...]) -> None:
         importlib.import_module(name)
     if memory_bytes:
         resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, memory_bytes))
+    pipe.send_bytes(_READY)
+    while True:
+        pipe.send_bytes(_reply(pipe.recv_bytes()))
 
 
-def _ready() -> int:
-    return os.getpid()
+def _reply(message: bytes) -> bytes:
+    """An outcome, None where there is an answer, with the answer or words, as bytes."""
+    try:
+        do, task = pickle.loads(message)
+        return pickle.dumps((None, do(task)))
+    except MemoryError:
+        return pickle.dumps((TOO_LARGE, ""))
+    except Exception as error:  # noqa: BLE001 - whatever a task's own code raises
+        return pickle.dumps((BUG, f"{type(error).__name__}: {error}"))
 
 
 # -- A Dask cluster --------------------------------------------------------------------------------
@@ -285,13 +332,9 @@ def on_worker(
     loads: tuple[str, ...],
 ) -> _R:
     """The task of a Dask worker."""
-    from distributed import get_worker
-
-    worker: Any = get_worker()
     with _lock:
         if limits not in _guards:
-            threads: int = worker.state.nthreads
-            _guards[limits] = Guard(threads, limits, loads)
+            _guards[limits] = Guard(limits, loads)
     return _guards[limits].ask(do, task, lost)
 
 
@@ -357,7 +400,7 @@ def crew(place: Place, limits: Limits) -> Iterator[Crew]:
         with connected(place.cluster, limits, place.loads) as (ask, processes):
             yield Crew(ask, _WINDOW * processes)
         return
-    guard = Guard(place.jobs, limits, place.loads)
+    guard = Guard(limits, place.loads)
     threads = Threads(place.jobs, thread_name_prefix="crew")
     try:
         yield Crew(

@@ -124,40 +124,83 @@ def found_here(number: int, here: int) -> GoneThere:
     return GoneThere(number, here)
 
 
-def slowly(task: GoneThere) -> int:
-    time.sleep(1.0)
+def number_of(task: GoneThere) -> int:
     return task.number
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_task_that_no_process_can_load_fails_and_others_continue(jobs):
-    tasks = [GoneThere(number, os.getpid() if number == 1 else 0) for number in range(5)]
-    limits = Limits(begin_s=8.0)
-    with crew(Place(jobs), limits) as workers:
-        found = {task.number: answer for task, answer in workers.map(slowly, tasks, told)}
-    assert found.pop(1) == (CRASHED, "no process could begin with it, 3 times", TRIES)
-    assert found == {number: number for number in (0, 2, 3, 4)}
-
-
-def for_seconds(task: tuple[int, float]) -> int:
-    time.sleep(task[1])
-    return task[0]
-
-
-def of_seconds(_: tuple[int, float], loss: Loss) -> int:
-    raise AssertionError(loss)
-
-
-def test_task_may_take_longer_than_the_start_limit():
-    limits = Limits(begin_s=4.0)
-    with crew(Place(1), limits) as workers:
-        found = [answer for _, answer in workers.map(for_seconds, [(1, 7.0), (2, 0.0)], of_seconds)]
-    assert sorted(found) == [1, 2]
 
 
 def told(_: GoneThere, loss: Loss) -> tuple[str, str, int]:
     return loss.outcome, loss.words, loss.tries
+
+
+def test_task_that_no_process_can_load_fails_and_others_continue():
+    tasks = [GoneThere(number, os.getpid() if number == 1 else 0) for number in range(5)]
+    with crew(Place(1), Limits()) as workers:
+        found = {task.number: answer for task, answer in workers.map(number_of, tasks, told)}
+    assert found.pop(1) == (BUG, "ModuleNotFoundError: No module named 'moved_meanwhile'", 1)
+    assert found == {number: number for number in (0, 2, 3, 4)}
+
+
+def test_tasks_are_lost_where_processes_do_not_start():
+    with crew(Place(1, loads=("no_such_module",)), Limits()) as workers:
+        ((_, found),) = workers.map(squared, [3], words)
+    assert found == (3, (CRASHED, "no process could begin with it, 3 times", TRIES))
+
+
+def as_function(number: int) -> object:
+    return lambda: number
+
+
+def test_answer_that_cannot_be_sent_is_a_failure():
+    with crew(Place(1), Limits()) as workers:
+        ((_, (outcome, said, tries)),) = workers.map(as_function, [3], of_function)
+    assert (outcome, tries) == (BUG, 1)
+    assert "lambda" in said
+
+
+def of_function(_: int, loss: Loss) -> object:
+    return loss.outcome, loss.words, loss.tries
+
+
+def ends_at_once(number: int) -> tuple[int, object]:
+    raise SystemExit(3)
+
+
+def test_task_that_ends_its_process_is_lost_with_its_exit_code():
+    with crew(Place(1), Limits()) as workers:
+        ((_, found),) = workers.map(ends_at_once, [1], words)
+    assert found == (1, (CRASHED, "its process ended with code 3, 3 times", TRIES))
+
+
+class KilledOnce:
+    """A task whose first process is killed while it takes it, so that it never begins."""
+
+    def __init__(self, folder: Path, number: int, here: int = 0) -> None:
+        self.folder, self.number, self.here = folder, number, here
+
+    def __reduce__(self):
+        return taken, (self.folder, self.number, os.getpid())
+
+
+def taken(folder: Path, number: int, here: int) -> KilledOnce:
+    if here != os.getpid() and number == 1 and not (folder / "killed").exists():
+        (folder / "killed").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return KilledOnce(folder, number)
+
+
+def its_number(task: KilledOnce) -> int:
+    time.sleep(0.05)
+    return task.number
+
+
+def test_process_killed_while_it_takes_a_task_holds_up_no_other(tmp_path):
+    tasks = [KilledOnce(tmp_path, number) for number in range(8)]
+    begun = time.monotonic()
+    with crew(Place(2), Limits()) as workers:
+        found = [answer for _, answer in workers.map(its_number, tasks, failed)]
+    assert sorted(found) == list(range(8))
+    assert (tmp_path / "killed").exists()
+    assert time.monotonic() - begun < PATIENCE_S
 
 
 def test_processes_hold_one_blas_thread(monkeypatch):
