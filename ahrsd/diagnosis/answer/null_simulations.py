@@ -1,4 +1,4 @@
-"""The evidence of a diagnosis with a noisy gyro, compared with simulations of the null model.
+"""Evidence that noise may produce, compared with simulations of the null model.
 
 The filter takes the measured rates for the true ones.  If the gyro's noise turns the field between
 two readings by more than the magnetometer's noise, that noise is in every column and every
@@ -8,14 +8,18 @@ effect: a sensor that turns slowly and is hardly tilted determines the scale of 
 from turns as small as the noise.  Then calibrations that are a tenth of a gauss off are more
 likely, with a flexible mount and viscous iron to explain the remainder.
 
+Readings in steps that are coarser than their noise have rounding errors that follow the motion:
+they keep their value for as long as the field stays within a step.  The likelihood takes them for
+noise of one spectrum at all times, so they may appear as an unknown process in time.
+
 Therefore the distribution of the evidence is measured (a parametric bootstrap).  The fitted
 calibration alone is simulated along the recording's own motion, with its time stamps, its columns
-and the fitted noise.  First the calibration is fitted to each copy as it was to the recording.  If
-the residuals of the recording are like those of the copies, recording and calibration agree,
-whatever else was found.  If not, the first copies are diagnosed as well, and a finding must be far
-beyond what is found in these.  Calibration and noise are those of the fit without any effect or of
-the fit with the effects, whichever has the noisier gyro relative to its magnetometer: the residual
-of a missing effect is not magnetometer noise.
+and the fitted noise, rounded if the recording's readings are.  First the calibration is fitted to
+each copy as it was to the recording.  If the residuals of the recording are like those of the
+copies, recording and calibration agree, whatever else was found.  If not, the first copies are
+diagnosed as well, and a finding must be far beyond what is found in these.  Calibration and noise
+are those of the fit without any effect or of the fit with the effects, whichever has the noisier
+gyro relative to its magnetometer: the residual of a missing effect is not magnetometer noise.
 
 The motion is the expected value of the gyro's readings without their noise
 (`time_series.wiener_filter`), aligned by field and accelerometer.  A copy has no mismatch, so
@@ -59,12 +63,13 @@ from ahrsd.diagnosis.innovation_filter.innovation import (
     nuisance_columns,
     sensitivities,
 )
-from ahrsd.diagnosis.model import Noise, NullModel
+from ahrsd.diagnosis.model import Noise, NullModel, Term
 from ahrsd.diagnosis.repaired_model import forward
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
 LOUD = "the gyro is noisier than the magnetometer"
+ROUNDED = "the readings come in steps that are coarser than their noise"
 NOT_DIAGNOSED = "a simulation of the calibration model alone, with this noise, cannot be diagnosed"
 BENT = "the gyro's noise biases the calibration, which this motion hardly determines"
 
@@ -74,11 +79,13 @@ class FittedDiagnosis:
     """A diagnosis, with the calibration that was fitted before any effect.
 
     problem, start: None where nothing was fitted
+    rounding: the quantisation steps of the readings as a term, where they are coarse
     """
 
     found: Diagnosis
     problem: Problem | None = None
     start: NullFit | None = None
+    rounding: tuple[Term, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,53 +126,71 @@ class RefitComparison:
 
 
 def diagnose_beyond_chance(track: Track, diagnose: Callable[[Track], FittedDiagnosis]) -> Diagnosis:
-    """Diagnose a track; with a noisy gyro, report only what is clearly beyond chance.
+    """Diagnose a track; if noise may produce evidence, report only what is clearly beyond chance.
 
     diagnose: the diagnosis of a track
-    If the gyro is noisy, by itself or for this motion, and there is a finding or a failed check,
-    the calibration is fitted to `CHANCE_FITS` copies (seeds 0, 1 and so on).  If the recording's
-    fit differs from theirs, `CHANCE_COPIES` of these at most are diagnosed.
+    If the gyro is noisy, by itself or for this motion, or the readings are rounded, and there is a
+    finding or a failed check, the calibration is fitted to `CHANCE_FITS` copies (seeds 0, 1 and so
+    on).  If the recording's fit differs from theirs, `CHANCE_COPIES` of these at most are
+    diagnosed.
     """
     first = diagnose(track)
     found, problem, start = first.found, first.problem, first.start
-    evidence = max(_reported_evidence(found), default=0.0)
-    seen = evidence > 0.0 or found.failed_checks or found.p_value < priors.FAMILY_P
-    if problem is None or start is None or not seen:
+    if problem is None or start is None:
         return found
     recorded = problem.recorded
     models = [model_of_samples(start.model, problem), *([found.model] if found.model else [])]
     model = max(models, key=lambda one: gyro_to_mag_noise(recorded, one))
-    noisy = gyro_to_mag_noise(recorded, model) >= priors.CHANCE_LOUD
-    if not noisy and calibration_bend(start) < priors.CHANCE_BENT:
+    if (why := _reason_to_simulate(first, problem, start, model)) is None:
         return found
-    why = LOUD if noisy else BENT
     truth = noise_free_motion(recorded, model)
-    for noise in _candidate_noises(model, start):
+    comparison = None
+    for noise in _candidate_noises(model, first):
         copies = [
-            simulated_copy(recorded, truth, noise, seed) for seed in range(priors.CHANCE_FITS)
+            simulated_copy(recorded, truth, noise, seed, first.rounding)
+            for seed in range(priors.CHANCE_FITS)
         ]
+        if why == ROUNDED and any(map(_is_fitted, found.findings)):
+            break  # the calibration alone is not what these copies would have to look like
         comparison = RefitComparison.of(problem, start, copies)
         if not comparison.differs:
-            break
-    if not comparison.differs:
-        return _null_answer(
-            first,
-            problem,
-            start,
-            comparison,
-            _agreement_note(why, found, evidence, comparison),
-            comparison.undecided,
-        )
-    if evidence <= 0.0:
-        return replace(found, posterior_predictive=comparison.checks)
-    shown, bound = _evidence_in_copies(copies[: priors.CHANCE_COPIES], diagnose, found)
-    note = _comparison_note(why, found, evidence, shown, bound)
-    if evidence <= bound:
+            note = _agreement_note(why, found, comparison)
+            return _null_answer(first, problem, start, comparison, note, comparison.undecided)
+    evidence = _evidence_by_chance(found, why)
+    if not evidence:
+        return replace(found, posterior_predictive=comparison.checks) if comparison else found
+    shown, bound = _evidence_in_copies(copies[: priors.CHANCE_COPIES], diagnose, evidence, why)
+    note = _comparison_note(why, found, shown, bound)
+    if max(evidence) <= bound:
+        if comparison is None:
+            return replace(found, unexplained=Unexplained(False), notes=(*found.notes, note))
         undecided = None if np.isfinite(bound) else NOT_DIAGNOSED
         return _null_answer(first, problem, start, comparison, note, undecided)
-    weak = [one.effect for one in found.findings if _is_fitted(one) and one.evidence_nats <= bound]
+    weak = [
+        one.effect for one in found.findings
+        if why != ROUNDED and _is_fitted(one) and one.evidence_nats <= bound
+    ]  # fmt: skip
     note = f"{note}; doubtful for this reason: {', '.join(weak)}" if weak else note
     return replace(found, notes=(*found.notes, note))
+
+
+def _reason_to_simulate(
+    answered: FittedDiagnosis, problem: Problem, start: NullFit, model: NullModel
+) -> str | None:
+    """Why the answer may rest on noise; None where it does not, or where nothing was found.
+
+    Rounding errors resemble an unknown process in time, and no effect's own form.
+    """
+    found = answered.found
+    fitted = any(map(_is_fitted, found.findings))
+    if answered.rounding and (found.unexplained.detected or (found.failed_checks and not fitted)):
+        return ROUNDED
+    seen = fitted or found.unexplained.detected or found.failed_checks
+    if not seen and found.p_value >= priors.FAMILY_P:
+        return None
+    if gyro_to_mag_noise(problem.recorded, model) >= priors.CHANCE_LOUD:
+        return LOUD
+    return BENT if calibration_bend(start) >= priors.CHANCE_BENT else None
 
 
 def gyro_to_mag_noise(track: Track, model: NullModel) -> float:
@@ -203,13 +228,17 @@ def noise_free_motion(track: Track, model: NullModel) -> Readings:
     return forward.noise_free_readings(along)
 
 
-def _candidate_noises(model: NullModel, start: NullFit) -> list[Noise]:
+def _candidate_noises(model: NullModel, answered: FittedDiagnosis) -> list[Noise]:
     """The noise of a model, or two where the magnetometer's is at the least that a fit assumes.
 
     How much it really is, is then unknown: the noise that the innovations show, and none.
+    The noise of rounded readings is that before they were rounded.
     """
+    found, start = answered.found, answered.start
     noise = forward.model_noise(model)
-    if start.model.sigma_mag_gauss > priors.FLOOR_MAG_GAUSS:
+    if answered.rounding and found.noise is not None:
+        return [found.noise]
+    if start is None or start.model.sigma_mag_gauss > priors.FLOOR_MAG_GAUSS:
         return [noise]
     less = min(
         1.0, constant_level_noise(start).mag_gauss / forward.model_noise(start.model).mag_gauss
@@ -217,9 +246,11 @@ def _candidate_noises(model: NullModel, start: NullFit) -> list[Noise]:
     return [replace(noise, mag_gauss=less * noise.mag_gauss), replace(noise, mag_gauss=0.0)]
 
 
-def simulated_copy(track: Track, truth: Readings, noise: Noise, seed: int) -> Track:
-    """The track with simulated readings: those of the truth with noise."""
-    made = forward.simulate_readings(truth, (), noise, seed)
+def simulated_copy(
+    track: Track, truth: Readings, noise: Noise, seed: int, rounding: Sequence[Term] = ()
+) -> Track:
+    """The track with simulated readings: those of the truth with noise, rounded by a term."""
+    made = forward.simulate_readings(truth, rounding, noise, seed)
     read = np.isfinite(track.mag_b_gauss)
     mag = np.where(read, made.mag_b_gauss, track.mag_b_gauss)
     return replace(track, mag_b_gauss=mag, gyro_b_rad_s=made.gyro_b_rad_s)
@@ -250,15 +281,9 @@ def _fit_copy(copy: Track, problem: Problem) -> NullFit | None:
         return None
 
 
-def _agreement_note(
-    why: str, found: Diagnosis, evidence: float, comparison: RefitComparison
-) -> str:
+def _agreement_note(why: str, found: Diagnosis, comparison: RefitComparison) -> str:
     """The note on what was found, and why it is not reported."""
-    seen = (
-        f"{why}: {_reported_effects(found)} is worth {evidence:.0f} nats here"
-        if evidence > 0.0
-        else why
-    )
+    seen = _evidence_text(why, found) if _evidence_by_chance(found, why) else why
     if (undecided := comparison.undecided) is not None:
         return f"{seen}; {undecided}"
     return (
@@ -268,15 +293,16 @@ def _agreement_note(
     )
 
 
-def _reported_effects(found: Diagnosis) -> str:
-    """The reported effects that rest on a fit."""
-    effects = [one.effect for one in found.findings if _is_fitted(one)]
-    return ", ".join([*effects, *(["something unknown"] if found.unexplained.detected else [])])
+def _evidence_text(why: str, found: Diagnosis) -> str:
+    """What noise may have produced, and its evidence."""
+    effects = [one.effect for one in found.findings if why != ROUNDED and _is_fitted(one)]
+    seen = ", ".join([*effects, *(["something unknown"] if found.unexplained.detected else [])])
+    return f"{why}: {seen} is worth {max(_evidence_by_chance(found, why)):.0f} nats here"
 
 
-def _reported_evidence(found: Diagnosis) -> list[float]:
-    """The evidence of each reported mismatch that was fitted, nats."""
-    nats = [one.evidence_nats for one in found.findings if _is_fitted(one)]
+def _evidence_by_chance(found: Diagnosis, why: str) -> list[float]:
+    """The evidence of each reported mismatch that noise may have produced, nats."""
+    nats = [one.evidence_nats for one in found.findings if why != ROUNDED and _is_fitted(one)]
     left = found.unexplained
     return [*nats, *([left.evidence_nats] if left.detected else [])]
 
@@ -294,34 +320,35 @@ def required_ratio(copies: int, chance: float) -> float:
 
 
 def _evidence_in_copies(
-    copies: Sequence[Track], diagnose: Callable[[Track], FittedDiagnosis], found: Diagnosis
+    copies: Sequence[Track],
+    diagnose: Callable[[Track], FittedDiagnosis],
+    evidence: Sequence[float],
+    why: str,
 ) -> tuple[list[float], float]:
     """Evidence found in copies, nats, until that decides; and the bound of chance evidence."""
-    evidence, last = _reported_evidence(found), required_ratio(len(copies), priors.CHANCE_P)
+    last = required_ratio(len(copies), priors.CHANCE_P)
     largest, shown = priors.ALONE_NATS, list[float]()
     for count, copy in enumerate(copies[:-1], 1):
-        shown.append(_evidence_in_copy(copy, diagnose))
+        shown.append(_evidence_in_copy(copy, diagnose, why))
         largest = max(largest, shown[-1])
         early = largest * required_ratio(count, priors.CHANCE_EARLY_P)
         if min(evidence) > early:
             return shown, early
         if max(evidence) <= last * largest:
             return shown, last * largest
-    shown.append(_evidence_in_copy(copies[-1], diagnose))
+    shown.append(_evidence_in_copy(copies[-1], diagnose, why))
     return shown, last * max(largest, shown[-1])
 
 
-def _evidence_in_copy(copy: Track, diagnose: Callable[[Track], FittedDiagnosis]) -> float:
+def _evidence_in_copy(copy: Track, diagnose: Callable[[Track], FittedDiagnosis], why: str) -> float:
     """The largest evidence reported of a copy, nats; infinite if the copy cannot be fitted."""
     try:
-        return max(_reported_evidence(diagnose(copy).found), default=0.0)
+        return max(_evidence_by_chance(diagnose(copy).found, why), default=0.0)
     except (np.linalg.LinAlgError, ValueError):
         return float("inf")
 
 
-def _comparison_note(
-    why: str, found: Diagnosis, evidence: float, shown: Sequence[float], bound: float
-) -> str:
+def _comparison_note(why: str, found: Diagnosis, shown: Sequence[float], bound: float) -> str:
     """The note on what was found, what simulations show, and what is reported given that."""
     count, largest = len(shown), max(shown)
     seeds = "seed 0" if count == 1 else f"seeds 0 to {count - 1}"
@@ -329,13 +356,15 @@ def _comparison_note(
     shows = "shows" if count == 1 else "show"
     by_chance = f"an effect of up to {largest:.0f} nats" if largest > 0.0 else "no effect"
     seen = (
-        f"{why}: {_reported_effects(found)} is worth {evidence:.0f} nats here; {made} of the "
-        f"calibration model alone, with this noise ({seeds}), "
+        f"{_evidence_text(why, found)}; {made} of the calibration model alone, with this noise "
+        f"({seeds}), "
     )
     if not np.isfinite(largest):
         failed = "cannot be diagnosed" if count == 1 else "were tried, the last without a diagnosis"
         return f"{seen}{failed}"
-    untold = ", so nothing is reported" if evidence <= bound else ""
+    rest_stays = why == ROUNDED and any(map(_is_fitted, found.findings))
+    unreported = ", so that is not reported" if rest_stays else ", so nothing is reported"
+    untold = unreported if max(_evidence_by_chance(found, why)) <= bound else ""
     return f"{seen}{shows} {by_chance}; up to {bound:.0f} nats may be chance{untold}"
 
 
@@ -369,7 +398,7 @@ def _null_answer(
         undecided=None if counted else undecided,
         notes=(*found.notes, note, *more),
         model=model,
-        noise=forward.model_noise(model),
+        noise=_candidate_noises(model, answered)[0],
         terms=terms,
         drawn=drawn,
         omnibus={k: replace(one, p_after=one.p_before) for k, one in found.omnibus.items()},

@@ -1,4 +1,4 @@
-"""With a gyro noisier than the magnetometer, only findings beyond chance are reported."""
+"""With a noisy gyro or with rounded readings, only findings beyond chance are reported."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from ahrsd.diagnosis.answer.null_simulations import (
 from ahrsd.diagnosis.answer.text import verdict
 from ahrsd.diagnosis.calibration_fit.null_fit import fit_null
 from ahrsd.diagnosis.calibration_fit.problem import build_problem
+from ahrsd.diagnosis.model import Noise, Term
 from ahrsd.diagnosis.repaired_model.forward import model_noise
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.simulation import Experiment
@@ -118,6 +119,40 @@ def test_note_reports_evidence_that_simulations_of_the_null_model_produce(
     (note,) = found.notes[:1]
     beside = "" if is_reported else ", so nothing is reported"
     assert note.endswith(f" an effect of up to 12 nats; up to {chance} nats may be chance{beside}")
+
+
+ROUNDED_STEP_GAUSS = 12e-3
+
+
+def _rounded(jump_gauss: float) -> tuple[Track, FittedDiagnosis]:
+    """A track in coarse steps, with a jump in the middle, answered with an unknown cause."""
+    made = experiment("mam", motion="rov", samples=1500, sigma_mag=8e-4, sigma_gyro=3e-4)
+    track = track_of(made)
+    jump = (np.arange(len(track)) >= 750)[:, None] * jump_gauss * np.array([0.6, -0.64, 0.48])
+    steps = np.round((track.mag_b_gauss + jump) / ROUNDED_STEP_GAUSS)
+    track = replace(track, mag_b_gauss=ROUNDED_STEP_GAUSS * steps)
+    problem, cold = build_problem(track, Spec())
+    start = fit_null(problem.track, problem.spec, cold)
+    left = Unexplained(True, Where(((0.0, 50.0),), ("x",), "sensor"), evidence_nats=60.0)
+    found = Diagnosis("", None, True, 1e-9, (), left, {}, noise=Noise(8e-4, 3e-4))
+    step = np.array([ROUNDED_STEP_GAUSS])
+    rounding = (Term("mag_quantisation", step, np.zeros(1)),)
+    return track, FittedDiagnosis(found, problem, start, rounding)
+
+
+@pytest.mark.usefixtures("few_fits")
+@pytest.mark.parametrize(("jump_gauss", "is_reported"), [(0.0, False), (30e-3, True)])
+def test_source_in_rounded_readings_is_compared_with_rounded_simulations(
+    jump_gauss: float, is_reported: bool
+) -> None:
+    """Rounding errors follow the motion, so noise of one spectrum does not explain them."""
+    track, answered = _rounded(jump_gauss)
+    none_found = replace(answered.found, unexplained=Unexplained(False))
+    found = diagnose_beyond_chance(
+        track, lambda one: answered if one is track else replace(answered, found=none_found)
+    )
+    assert found.unexplained.detected == is_reported
+    assert found.notes[0].startswith("the readings come in steps that are coarser than their noise")
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,8 @@ def build_diagnosis(
     answer, all_sets = found.answer, found.all_sets
     held, fast_held = HeldOut(all_sets, answer.best), HeldOut(fast.all_sets, fast.answer.best)
     slow = support.validate_findings(answer, held, 0)
-    findings = (*slow, *support.validate_findings(fast.answer, fast_held, len(slow)))
+    quick = support.validate_findings(fast.answer, fast_held, len(slow))
+    findings = tuple(sorted((*slow, *quick), key=lambda one: -one.evidence_nats))
     processes = pictures.locate_processes(all_sets, answer.best)
     added = [
         *pictures.contributions(all_sets, answer),
