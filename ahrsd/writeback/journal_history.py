@@ -354,7 +354,7 @@ class JournalHistory:
             if record.kind in RecordKind.__members__:
                 history = history.with_record(RecordKind(record.kind), record.facts)
             elif record.kind == BY_HAND:
-                history = history._with_values(record.facts)._without_trials(record.facts)
+                history = history._with_write_of_others(record.facts)
         return history
 
     def with_record(self, kind: RecordKind, facts: Mapping[str, Any]) -> JournalHistory:
@@ -363,8 +363,8 @@ class JournalHistory:
             return self
         at = Stamp.of(facts)
         now = replace(self, newest_at=at)
-        if kind is RecordKind.CLIENT_WRITES:  # in RAM: the next start may bring either value
-            return now._with_values(facts)._without_holds_of(facts)._without_trials(facts)
+        if kind is RecordKind.CLIENT_WRITES:
+            return now._with_write_of_others(facts)
         if kind is RecordKind.LOCKED:
             return replace(now, locked=str(facts.get("reason", "no reason given")))
         if kind is RecordKind.UNLOCKED:
@@ -405,6 +405,10 @@ class JournalHistory:
             self, open=transaction, last=RecordKind.PREPARED, last_at=at, holds=None,
             trials=trials[-TIMES_KEPT:],
         )  # fmt: skip
+
+    def _with_write_of_others(self, facts: Mapping[str, Any]) -> JournalHistory:
+        """With a person's or client's write in RAM: the next start may bring either value."""
+        return self._with_values(facts)._without_holds_of(facts)._without_trials(facts)
 
     def _without_trials(self, facts: Mapping[str, Any]) -> JournalHistory:
         """Another program or person wrote these values: they are no trial values of ours."""

@@ -154,6 +154,74 @@ def test_refused_write_leaves_the_device_unchanged(run, emulated, tmp_path, caps
     assert "the old values are back" in error
 
 
+@pytest.mark.parametrize(
+    ("number", "values", "words"),
+    [
+        (5, ("9600",), "register 5 is not written: the device would answer at its new rate"),
+        (6, ("0", "2"), "register 6 is written for the connected port only"),
+        (7, ("1", "1"), "register 7 is written for the connected port only"),
+    ],
+)
+def test_what_cannot_be_read_back_is_not_written(
+    run, emulated, tmp_path, capsys, number, values, words
+):
+    with emulated() as (emulator, path):
+        assert run("registers", "write", path, number, *values, "--yes",
+                   "--state-directory", tmp_path, *BAUD) == 2  # fmt: skip
+        assert emulator.memory.ram == emulator.memory.flash
+    assert words in capsys.readouterr().err
+    assert kinds(tmp_path) == []
+
+
+def on_trial(tmp_path, emulator) -> None:
+    """A daemon that was killed while it had values on trial."""
+    old, new = {"23": FACTORY, "84": FACTORY}, {"23": NEW_VALUES, "84": tuple(map(float, BIAS))}
+    facts = {"serial": SERIAL, "txn": "a-1", "firmware": "3.1.0.0", "snapshot": {},
+             "heading_change_deg": 9.0, "approver": "operator", "old": old, "new": new}  # fmt: skip
+    journal = Journal.open(journal_path(tmp_path, SERIAL))
+    journal.append("PREPARED", **facts)
+    journal.append("RAM_VERIFIED", txn="a-1")
+    for number, values in new.items():
+        emulator.memory.preset(int(number), values)
+
+
+def test_save_by_hand_keeps_no_values_of_a_trial(run, emulated, tmp_path, capsys):
+    state = ("--state-directory", tmp_path, *BAUD)
+    with emulated() as (emulator, path):
+        on_trial(tmp_path, emulator)
+        assert run("registers", "write", path, 35, 1, 0, 1, 1, "--yes", "--save", *state) == 1
+        assert "unproven values of a trial in registers 23, 84" in capsys.readouterr().err
+        assert emulator.memory.get(35) == (1, 1, 1, 1)
+        assert emulator.counters["saves"] == 0
+        assert run("registers", "rollback", path, 1, "--yes", "--save", *state) == 0
+        assert ram(emulator) == ram(emulator, 84) == FACTORY
+        assert emulator.counters["saves"] == 1
+
+
+def test_values_of_a_trial_are_saved_when_a_person_names_them(run, emulated, tmp_path):
+    with emulated() as (emulator, path):
+        on_trial(tmp_path, emulator)
+        emulator.memory.preset(84, FACTORY)
+        assert run("registers", "write", path, 23, *NEW, "--yes", "--save",
+                   "--state-directory", tmp_path, *BAUD) == 0  # fmt: skip
+        assert emulator.counters["saves"] == 1
+
+
+def test_save_by_hand_keeps_no_outputs_of_a_killed_session(run, emulated, tmp_path, capsys):
+    state, kept = ("--state-directory", tmp_path, *BAUD), {"6": [14], "75": [0, 1, 0]}
+    with emulated() as (emulator, path):
+        journal = Journal.open(journal_path(tmp_path, SERIAL))
+        journal.append("OUTPUTS_KEPT", serial=SERIAL, old=kept)
+        emulator.memory.preset(6, (0,))
+        emulator.memory.preset(75, (1, 8, 1, 0x0829))
+        assert run("registers", "write", path, 23, *NEW, "--yes", "--save", *state) == 1
+        assert "the outputs of a killed session" in capsys.readouterr().err
+        assert ram(emulator) == FACTORY
+        assert emulator.counters["saves"] == 0
+        assert run("registers", "rollback", path, 1, "--yes", "--save", *state) == 0
+        assert (emulator.memory.get(6, 1), emulator.memory.get(75)) == ((14,), (0, 1, 0))
+
+
 def test_without_a_journal_nothing_is_written(run, emulated, tmp_path, capsys):
     (tmp_path / "state").write_text("a file where the folder should be")
     with emulated() as (emulator, path):

@@ -20,11 +20,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ahrsd.cli.device.access import describe, open_device, read_all
+from ahrsd.core.device_session import KeptOutputs
 from ahrsd.daemon import host_clock
 from ahrsd.daemon.journal import Journal, Record, journal_path, register_values
 from ahrsd.errors import AhrsdError, DeviceError, JournalError
 from ahrsd.foreign_file import ForeignFileError, read_regular
 from ahrsd.writeback.composition import GYRO, MAG, UnwritableError, refuse_unsafe
+from ahrsd.writeback.journal_history import JournalHistory
 from drivers.serial_port import PortError
 from drivers.vn100.commands import (
     Command,
@@ -34,6 +36,7 @@ from drivers.vn100.commands import (
     Word,
     Write,
     quiet,
+    read_present,
     read_registers,
     restore,
     save_settings,
@@ -43,6 +46,7 @@ from drivers.vn100.device import Device
 from drivers.vn100.errors import DriverError
 from drivers.vn100.registers import (
     REGISTERS,
+    SESSION_SETTINGS,
     RegisterValueError,
     Values,
     format_command,
@@ -54,6 +58,7 @@ from drivers.vn100.registers import (
 
 
 Changes = dict[int, Values]
+BAUD_RATE = 5  # a line that changes it cuts off the lines behind it
 
 
 def gate(registers: set[int], save: bool) -> Callable[[Command], bool]:
@@ -70,6 +75,49 @@ def gate(registers: set[int], save: bool) -> Callable[[Command], bool]:
         return isinstance(command, Read) or (isinstance(command, Word) and command.word in words)
 
     return allow
+
+
+def refuse_unprovable(present: Changes, changes: Changes) -> None:
+    """Raise AhrsdError for a write that could be neither read back nor put back from here."""
+    for number, values in changes.items():
+        if number == BAUD_RATE:
+            raise AhrsdError(
+                "register 5 is not written: the device would answer at its new rate, where this "
+                "command can neither read it back nor put it back; nothing was written"
+            )
+        port = len(REGISTERS[number].fields) - 1
+        if REGISTERS[number].fields[port].optional and values[port:] not in (
+            (),
+            present[number][port:],
+        ):
+            raise AhrsdError(
+                f"register {number} is written for the connected port only, because that of the "
+                "other one can be neither read back nor put back: leave the port number out, or "
+                "connect to the other port; nothing was written"
+            )
+
+
+def refuse_unproven_save(
+    device: Device, journal: Journal, identity: Identity, wanted: Changes
+) -> None:
+    """Raise JournalError where a save of RAM would make permanent what only was on trial.
+
+    wanted: what the person named; that is the person's decision, whatever the journal says of it
+    """
+    records, numbers = journal.records(), (MAG, GYRO, *SESSION_SETTINGS)
+    history, kept = JournalHistory.of(records), KeptOutputs()
+    after = {**device.run(read_present(numbers)), **wanted}
+    unnamed = [n for n in (MAG, GYRO) if n in after and n not in wanted]
+    if tried := [n for n in unnamed if history.is_trial_value(n, after[n])]:
+        which = f"register{'s' * (len(tried) > 1)} {', '.join(map(str, tried))}"
+        raise JournalError(
+            f"{journal.path}: the device has unproven values of a trial in {which}, and a save "
+            "keeps all of RAM; `ahrsd registers rollback` puts the old ones back; nothing was "
+            "written"
+        )
+    kept.update(identity.serial, after, records)
+    if kept.left:
+        raise JournalError(f"{journal.path}: {kept.describe_left(put_back=False)}")
 
 
 def to_write(present: Changes, wanted: Changes) -> Changes:
