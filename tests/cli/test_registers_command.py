@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 
 import pytest
 
+from ahrsd.cli.device.register_changes import apply, gate
 from ahrsd.daemon.journal import Journal, journal_path
+from ahrsd.errors import DeviceError
+from drivers.serial_port import SerialPort
+from drivers.vn100.commands import identify
+from drivers.vn100.device import Device
 
 SERIAL = 100130608
 BAUD = ("--baud", "115200")
@@ -222,6 +228,33 @@ def test_save_by_hand_keeps_no_outputs_of_a_killed_session(run, emulated, tmp_pa
         assert (emulator.memory.get(6, 1), emulator.memory.get(75)) == ((14,), (0, 1, 0))
 
 
+def test_rollback_finds_a_write_that_was_broken_off(run, emulated, tmp_path):
+    with emulated() as (emulator, path):
+        on_trial(tmp_path, emulator)
+        emulator.memory.preset(84, FACTORY)
+        assert run("registers", "rollback", path, "--yes",
+                   "--state-directory", tmp_path, *BAUD) == 0  # fmt: skip
+        assert ram(emulator) == ram(emulator, 84) == FACTORY
+
+
+def test_another_unit_is_neither_written_nor_put_back(emulated, tmp_path):
+    with emulated() as (emulator, path), SerialPort(path, 115200) as port:
+        device = Device(port, gate({23}, save=False))
+        judged = replace(device.run(identify()), serial=SERIAL + 1)
+        journal = Journal.open(tmp_path / "j.jsonl")
+        with pytest.raises(DeviceError, match=f"{SERIAL}, not {SERIAL + 1}; NOT put back"):
+            apply(device, journal, judged, {23: NEW_VALUES})
+        assert ram(emulator) == FACTORY
+
+
+def test_save_without_an_answer_is_told_as_unknown(run, emulated, tmp_path, capsys):
+    with emulated(faults=("power_cut_wnv@0",)) as (_, path):
+        assert run("registers", "write", path, 23, *NEW, "--yes", "--save",
+                   "--state-directory", tmp_path, *BAUD) == 1  # fmt: skip
+    assert "whether it was saved is not known: switch the device off" in capsys.readouterr().err
+    assert kinds(tmp_path)[-1] == "HAND_FLASH_SENT"
+
+
 def test_without_a_journal_nothing_is_written(run, emulated, tmp_path, capsys):
     (tmp_path / "state").write_text("a file where the folder should be")
     with emulated() as (emulator, path):
@@ -349,6 +382,17 @@ def test_a_calibration_is_written_whole_journaled_and_can_be_undone(
     records = Journal.open(journal_path(tmp_path, SERIAL)).records()
     assert [r.kind for r in records] == ["HAND_PREPARED", "HAND_VERIFIED"] * 2
     assert records[0].facts["calibration"] == "calibration.json"
+
+
+def test_restart_between_two_writes_leaves_no_half_a_calibration(
+    write_from, emulated, tmp_path, capsys
+):
+    with emulated(faults=("power_cut_wrg=2@0",)) as (emulator, port):
+        assert write_from(port, calibration(tmp_path), "--yes") == 1
+        assert emulator.counters["restarts"] == 1
+        assert ram(emulator) == ram(emulator, 84) == FACTORY
+    assert kinds(tmp_path) == ["HAND_PREPARED", "HAND_FAILED"]
+    assert "the old values are back" in capsys.readouterr().err
 
 
 FLIPPED = [-1.0, *FACTORY[1:]]

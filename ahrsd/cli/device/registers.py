@@ -413,7 +413,7 @@ def rollback(
 ) -> None:
     """Write back the values that the registers had before record ID of the journal.
 
-    Without ID: before the newest change whose values the device holds now.
+    Without ID: before the newest change of which the device holds a value now.
     """
 
     def wanted(device: Device, journal: Journal) -> tuple[Changes, Mapping[str, object]]:
@@ -467,7 +467,7 @@ def _change(
         for line in wrg_lines(record):
             click.echo(f"  {line}")
         if save:
-            save_to_flash(device, journal, record)
+            save_to_flash(device, journal, identity, record)
             click.echo("saved to flash")
 
 
