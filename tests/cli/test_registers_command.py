@@ -228,6 +228,17 @@ def test_save_by_hand_keeps_no_outputs_of_a_killed_session(run, emulated, tmp_pa
         assert (emulator.memory.get(6, 1), emulator.memory.get(75)) == ((14,), (0, 1, 0))
 
 
+def test_rotation_is_said_to_act_after_a_restart(run, emulated, tmp_path, capsys):
+    turned = ("0", "1", "0", "-1", "0", "0", "0", "0", "1")
+    with emulated() as (_, path):
+        assert run("registers", "write", path, 26, *turned, "--yes",
+                   "--state-directory", tmp_path, *BAUD) == 0  # fmt: skip
+    said = capsys.readouterr().out.splitlines()
+    assert said[-1].startswith(
+        "register 26 acts only once it is saved and the device has restarted"
+    )
+
+
 def test_rollback_finds_a_write_that_was_broken_off(run, emulated, tmp_path):
     with emulated() as (emulator, path):
         on_trial(tmp_path, emulator)

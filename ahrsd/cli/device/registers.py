@@ -68,6 +68,7 @@ from drivers.vn100.device import Device
 from drivers.vn100.register_codec import Register, RegisterField, Value
 from drivers.vn100.registers import (
     REGISTERS,
+    ROTATION,
     RegisterValueError,
     Values,
     format_command,
@@ -197,6 +198,10 @@ _SAVE = click.option(
 
 
 Ids = TypeVar("Ids", int, int | None, tuple[int, ...])
+_ROTATION_ACTS_LATER = (
+    "register 26 acts only once it is saved and the device has restarted: switch it off and on "
+    "before ahrsd runs or captures again"
+)
 _SHOWN = ("txn", "reason", "undoes", "error", "restored")  # facts of a record besides its registers
 
 
@@ -469,6 +474,8 @@ def _change(
         if save:
             save_to_flash(device, journal, identity, record)
             click.echo("saved to flash")
+        if ROTATION in changes:
+            click.echo(_ROTATION_ACTS_LATER)
 
 
 def _again(
