@@ -17,8 +17,9 @@ STATUS_S = 60.0  # interval of the status line
 _AMISS_S = 5.0  # a fault is reported when it has lasted this long
 _SILENT = "nothing comes from the device: check its power and cable"
 _OFF = (
-    "the device answers and sends nothing by itself: its outputs are off; switch one on (register "
-    "6 or 75), or let the daemon do it: device.configure_stream = true"
+    "the device answers and sends nothing by itself: its outputs are off (registers 6 and 75 to "
+    "77), or paused by a program that was killed (then switch the device off and on); "
+    "device.configure_stream = true lets the daemon switch one on"
 )
 _DEAF = "bytes arrive but no message: not a VN-100, or not the rate of its port"
 

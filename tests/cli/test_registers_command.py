@@ -228,6 +228,17 @@ def test_save_by_hand_keeps_no_outputs_of_a_killed_session(run, emulated, tmp_pa
         assert (emulator.memory.get(6, 1), emulator.memory.get(75)) == ((14,), (0, 1, 0))
 
 
+def test_values_that_could_not_be_put_back_are_not_replaced(run, emulated, tmp_path, capsys):
+    dust = (1.0, *(-3.02119e-30,) * 3, 1.0, *(-3.02119e-30,) * 3, 1.0, 0.1, 0.2, 0.3)
+    with emulated() as (emulator, path):
+        emulator.memory.preset(23, dust)
+        held = emulator.memory.get(23)
+        assert run("registers", "write", path, 23, *NEW, "--yes",
+                   "--state-directory", tmp_path, *BAUD) == 2  # fmt: skip
+        assert emulator.memory.get(23) == held
+    assert "the present values could not be put back" in capsys.readouterr().err
+
+
 def test_rotation_is_said_to_act_after_a_restart(run, emulated, tmp_path, capsys):
     turned = ("0", "1", "0", "-1", "0", "0", "0", "0", "1")
     with emulated() as (_, path):

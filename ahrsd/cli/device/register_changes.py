@@ -86,6 +86,10 @@ def gate(registers: set[int], save: bool) -> Callable[[Command], bool]:
 def refuse_unprovable(present: Changes, changes: Changes) -> None:
     """Raise AhrsdError for a write that could be neither read back nor put back from here."""
     for number, values in changes.items():
+        try:
+            format_command(number, present[number], held=True)
+        except RegisterValueError as error:
+            raise AhrsdError(f"the present values could not be put back: {error}") from error
         if number == BAUD_RATE:
             raise AhrsdError(
                 "register 5 is not written: the device would answer at its new rate, where this "
