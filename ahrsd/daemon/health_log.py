@@ -16,6 +16,11 @@ from ahrsd.printable import counted
 STATUS_S = 60.0  # interval of the status line
 _AMISS_S = 5.0  # a fault is reported when it has lasted this long
 _SILENT = "nothing comes from the device: check its power and cable"
+_OFF = (
+    "the device answers and sends nothing by itself: its outputs are off (registers 6 and 75 to "
+    "77), or paused by a program that was killed (then switch the device off and on); "
+    "device.configure_stream = true lets the daemon switch one on"
+)
 _DEAF = "bytes arrive but no message: not a VN-100, or not the rate of its port"
 
 
@@ -54,6 +59,7 @@ class Watch:
     _bytes: _Count = field(init=False)
     _messages: _Count = field(init=False)
     _taken: _Count = field(init=False)
+    _streamed: _Count = field(init=False)
 
     def __post_init__(self) -> None:
         self._status_s = self.started_s
@@ -65,6 +71,7 @@ class Watch:
         self._bytes = _Count(-1.0, now_s)
         self._messages = _Count(-1.0, now_s)
         self._taken = _Count(-1.0, now_s)
+        self._streamed = _Count(-1.0, now_s)
         self.silent = self.garbage = False
 
     def look(self, core: Core, now_s: float, capture_error: str, is_open: bool) -> list[Remark]:
@@ -86,6 +93,8 @@ class Watch:
         self.garbage = is_open and deaf_s >= _AMISS_S and not self.silent
         if not is_open:
             return ""  # that the port is gone is said elsewhere
+        if self._outputs_off(core, now_s, deaf_s):
+            return _OFF
         if self.silent:
             return _SILENT
         if self.garbage:
@@ -93,6 +102,15 @@ class Watch:
         if idle_s >= _AMISS_S:
             return _no_samples(core)
         return ""
+
+    def _outputs_off(self, core: Core, now_s: float, deaf_s: float) -> bool:
+        """Whether an identified device only answers, and has sent nothing by itself for longer."""
+        streamed = sum(core.stream.by_layout.values())
+        unsent_s = self._streamed.stuck_s(streamed, now_s)
+        answers = deaf_s < core.writeback.policy.recheck_s + _AMISS_S
+        only_answers = not streamed or unsent_s - deaf_s >= _AMISS_S
+        known = core.device_session.identity is not None
+        return known and answers and only_answers and unsent_s >= _AMISS_S
 
     def _amiss(self, stream: str, capture_error: str, flowing: bool) -> list[Remark]:
         capture = f"capture: {capture_error}, records are being lost" if capture_error else ""

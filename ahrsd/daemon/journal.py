@@ -166,6 +166,8 @@ class Journal:
         create = 0 if self._size else os.O_CREAT  # one that was read and is gone is not begun anew
         descriptor = _open(self.path, os.O_WRONLY | create)
         try:
+            if create:
+                _give_to_owner(descriptor, self.path.parent)
             if os.fstat(descriptor).st_size != self._size + len(self.torn):
                 raise JournalError(
                     f"{self.path}: another program wrote into the journal; start again to read it"
@@ -219,6 +221,13 @@ def _open(path: Path, flags: int) -> int:
         os.close(descriptor)
         raise
     return descriptor
+
+
+def _give_to_owner(descriptor: int, folder: Path) -> None:
+    """Give a file that root begins to the owner of its folder: the daemon must write there, too."""
+    status = folder.stat()
+    if os.geteuid() == 0 and os.fstat(descriptor).st_uid == 0 != status.st_uid:
+        os.fchown(descriptor, status.st_uid, status.st_gid)
 
 
 def _refuse_others(path: Path, status: os.stat_result) -> None:

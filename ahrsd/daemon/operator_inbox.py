@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import json
 import logging
 import os
@@ -162,6 +163,7 @@ class OperatorInbox:
         self._answered: dict[str, float] = {}
         self._odd: set[str] = set()
         self._looked_s: float | None = None
+        self._held: int | None = None  # a descriptor of the folder, locked for this daemon
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="operator", daemon=True)
         self._thread.start()
@@ -196,6 +198,7 @@ class OperatorInbox:
             closing = self._closing.wait(_EVERY_S)
             try:
                 with self.box.open() as folder:
+                    self._hold(folder)
                     self._look(folder, boot_s())
                 self.fault = ""
             except OSError as error:
@@ -203,6 +206,30 @@ class OperatorInbox:
                 text = error if named else f"{self.box.folder}: {error.strerror}"
                 self.fault = f"{text}; until then nobody can approve"
                 self._looked_s = None  # what is found there afterwards may be anybody's
+        self._let_go()
+
+    def _hold(self, folder: int) -> None:
+        """Keep other daemons from taking this folder's commands. Raises OperatorFolderError."""
+        if self._held is not None and os.path.sameopenfile(self._held, folder):
+            return
+        self._let_go()
+        held = os.dup(folder)
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(held)
+            raise OperatorFolderError(
+                f"{self.box.folder}: another daemon takes the commands; give each daemon a state "
+                "directory of its own (--state-directory)"
+            ) from None
+        except OSError as error:  # a file system without locks
+            log.debug("operator: %s cannot be locked: %s", self.box.folder, error.strerror)
+        self._held = held
+
+    def _let_go(self) -> None:
+        if self._held is not None:
+            os.close(self._held)
+            self._held = None
 
     def _look(self, folder: int, now_s: float) -> None:
         """One turn: answers out, words in, what is too old away."""

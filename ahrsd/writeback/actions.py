@@ -135,6 +135,7 @@ class ActionOutbox:
         self.device_s: float | None = None  # the device's newest time since its start-up
         self.history = JournalHistory()
         self.running = ""
+        self.rotation_waits = False  # register 26 is not what the device applies
         self._allow = allow
         self._wall_offset_s: float | None = None
         self._least_offset_s: float | None = None  # of all plausible wall clock readings
@@ -292,7 +293,8 @@ class ActionOutbox:
 
     def set_in_force(self, registers: Mapping[int, Values] | None) -> None:
         """The device applies these registers from now on; None: unknown."""
-        self.append(InForce(None if registers is None else dict(registers)))
+        unknown = registers is None or self.rotation_waits
+        self.append(InForce(None if unknown else dict(registers or {})))
 
     def run(self, what: str, purpose: Purpose, make: Callable[[], Procedure[object]]) -> None:
         """Start a procedure; its gate checks each command at the newest host time."""

@@ -30,7 +30,13 @@ import numpy as np
 
 from ahrsd.calibration import Affine, Estimate
 from ahrsd.samples import Array
-from drivers.vn100.registers import Values, as_stored, register_lines
+from drivers.vn100.registers import (
+    RegisterValueError,
+    Values,
+    as_stored,
+    format_command,
+    register_lines,
+)
 
 MAG, GYRO = 23, 84
 MAX_CONDITION: Final = 8.0  # as gate G9 (docs/reference/gates.md), but not configurable
@@ -88,6 +94,7 @@ def compose(
     _refuse_out_of_bounds(written, estimate.gyro_bias_rad_s)
     new = {n: v for n, v in proposed.items() if not _equals_present(registers[n], v)}
     lines = register_lines(new)
+    _refuse_irreversible({number: registers[number] for number in new})
     return Proposal(
         id=hashlib.sha256("\n".join(lines).encode()).hexdigest()[:8],
         old={number: registers[number] for number in new},
@@ -210,6 +217,15 @@ def _numbers_by_name(
     upper = soft_iron[np.triu_indices(3)]
     numbers = np.concatenate([upper, hard_iron_gauss, gyro_bias_rad_s])
     return dict(zip(_NAMES, numbers.tolist(), strict=True))
+
+
+def _refuse_irreversible(old: Mapping[int, Values]) -> None:
+    """Refuse to replace values that could not be written back: their line would be too long."""
+    for number, values in old.items():
+        try:
+            format_command(number, values, held=True)
+        except RegisterValueError as error:
+            raise UnwritableError(f"the present values could not be put back: {error}") from error
 
 
 def refuse_unsafe(values: Mapping[int, Values]) -> None:

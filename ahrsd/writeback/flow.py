@@ -53,7 +53,7 @@ from ahrsd.writeback.journal_history import RecordKind, Transaction
 from ahrsd.writeback.permissions import permitted
 from ahrsd.writeback.policy import Safeguards, WriteBackPolicy, contradicts, worth_writing
 from ahrsd.writeback.reconcile import TABLE as RECONCILE
-from ahrsd.writeback.reconcile import compare_contents
+from ahrsd.writeback.reconcile import DeviceContents, compare_contents
 from ahrsd.writeback.states import (
     LIVED_WITH,
     ON_TIMEOUT,
@@ -842,6 +842,7 @@ class Flow:
 
     def _check_last_transaction(self) -> None:
         """No transaction is open: note if the device differs from the last one's result."""
+        self._check_write_by_hand()
         held = self.outbox.history.holds or {}
         changed = [n for n, v in held.items() if not same(n, v, self.registers.get(n, ()))]
         if changed:
@@ -873,6 +874,18 @@ class Flow:
                 f"register {', '.join(map(str, strange))} holds values that are neither the "
                 "factory's nor in the journal: somebody calibrated the device before, or a journal "
                 "was lost in a trial; then switch the device off and on",
+            )
+
+    def _check_write_by_hand(self) -> None:
+        """Note if a write by hand was broken off and left some of its values."""
+        if (by_hand := self.outbox.history.by_hand) is None:
+            return
+        if compare_contents(*by_hand, self.registers, False) is DeviceContents.MIXED:
+            which = ", ".join(map(str, by_hand[1]))
+            self.outbox.note(
+                "error",
+                f"a write by hand of registers {which} was broken off: the device holds some old "
+                "and some new values; `ahrsd registers rollback` puts the old ones back",
             )
 
     def transaction(self) -> Transaction:

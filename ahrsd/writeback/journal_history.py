@@ -275,6 +275,7 @@ TIMES_KEPT: Final = 1000  # far more than any budget allows in a day
 
 
 BY_HAND: Final = "HAND_PREPARED"  # a write of the registers command
+BY_HAND_DONE: Final = "HAND_VERIFIED"  # its good end; at a bad one, `restored` says how it ended
 
 
 _TOUCHED_RAM: Final = (RecordKind.RAM_VERIFIED, RecordKind.RAM_FAILED, RecordKind.ROLLBACK)
@@ -344,6 +345,7 @@ class JournalHistory:
     holds: dict[int, Values] | None = None
     values: tuple[tuple[int, Values], ...] = ()
     trials: tuple[tuple[int, Values], ...] = ()
+    by_hand: tuple[dict[int, Values], dict[int, Values]] | None = None
     broken: str | None = None
 
     @staticmethod
@@ -354,7 +356,9 @@ class JournalHistory:
             if record.kind in RecordKind.__members__:
                 history = history.with_record(RecordKind(record.kind), record.facts)
             elif record.kind == BY_HAND:
-                history = history._with_values(record.facts)._without_trials(record.facts)
+                history = history._with_write_of_others(record.facts)._with_by_hand(record.facts)
+            elif record.kind == BY_HAND_DONE or record.facts.get("restored"):
+                history = replace(history, by_hand=None)
         return history
 
     def with_record(self, kind: RecordKind, facts: Mapping[str, Any]) -> JournalHistory:
@@ -363,8 +367,8 @@ class JournalHistory:
             return self
         at = Stamp.of(facts)
         now = replace(self, newest_at=at)
-        if kind is RecordKind.CLIENT_WRITES:  # in RAM: the next start may bring either value
-            return now._with_values(facts)._without_holds_of(facts)._without_trials(facts)
+        if kind is RecordKind.CLIENT_WRITES:
+            return now._with_write_of_others(facts)
         if kind is RecordKind.LOCKED:
             return replace(now, locked=str(facts.get("reason", "no reason given")))
         if kind is RecordKind.UNLOCKED:
@@ -405,6 +409,16 @@ class JournalHistory:
             self, open=transaction, last=RecordKind.PREPARED, last_at=at, holds=None,
             trials=trials[-TIMES_KEPT:],
         )  # fmt: skip
+
+    def _with_write_of_others(self, facts: Mapping[str, Any]) -> JournalHistory:
+        """With a person's or client's write in RAM: the next start may bring either value."""
+        return self._with_values(facts)._without_holds_of(facts)._without_trials(facts)
+
+    def _with_by_hand(self, facts: Mapping[str, Any]) -> JournalHistory:
+        try:
+            return replace(self, by_hand=(_from_json(facts["old"]), _from_json(facts["new"])))
+        except (KeyError, TypeError, ValueError, AttributeError):
+            return self
 
     def _without_trials(self, facts: Mapping[str, Any]) -> JournalHistory:
         """Another program or person wrote these values: they are no trial values of ours."""

@@ -39,7 +39,7 @@ from ahrsd.writeback.states import (
 from ahrsd.writeback.transaction import HSI_RESULT, ProcedureOutcome
 from ahrsd.writeback.trial import TrialMetrics, TrialVerdict
 from drivers.vn100.commands import Identity, Seen, differences
-from drivers.vn100.registers import COMPENSATING, Values, same
+from drivers.vn100.registers import COMPENSATING, ROTATION, Values, same
 
 RESTS = frozenset(  # states in which a proven restart since the newest record causes a new reading
     {
@@ -81,6 +81,8 @@ class WriteBack:
         self._changed_in_run: dict[
             int, frozenset[int]
         ] = {}  # registers by serial number; see `_changed_by_others`
+        self._rotations: dict[int, Values] = {}  # by serial number; see `_rotation_waits`
+        self._reset_seen = False  # since the device was read
         self.confirmed_s: float | None = None  # see `on_looked`
 
     # -- read by others ----------------------------------------------------------------------------
@@ -223,7 +225,8 @@ class WriteBack:
         self._changed_in_run[identity.serial] = self._safe.update_changed_by_others(
             changed, registers
         )
-        self._safe.bind(identity, registers, journal is not None)
+        self._outbox.rotation_waits = self._rotation_waits(identity.serial, registers, restarted)
+        self._safe.bind(identity, registers, journal is not None, self._outbox.rotation_waits)
         self._safe.client_registers = clients
         flow.identity, flow.registers, flow.session_keys = identity, dict(registers), session_keys
         self._outbox.set_in_force(registers)
@@ -261,6 +264,7 @@ class WriteBack:
         client:   the client whose VNRST it was; empty: none
         """
         self._outbox.host_s = host_s
+        self._reset_seen = True
         self._restarts.on_restart(self.history.last_at, self._outbox.stamp, host_s, uptime_s)
         if client:
             self._flow.signal(Signal.CLIENT_RESET, f"{client} reset the device")
@@ -644,6 +648,20 @@ class WriteBack:
             compared = known.keys() & registers.keys() - session_keys - written - {HSI_RESULT}
             changed |= {n for n in compared if not same(n, known[n], registers[n])}
         return changed
+
+    def _rotation_waits(
+        self, serial: int, registers: Mapping[int, Values], restarted: bool
+    ) -> bool:
+        """Whether register 26 was changed in this run: unlike all others it acts after a restart.
+
+        What it held when this run read it first counts as what acts.
+        """
+        if (rotation := registers.get(ROTATION)) is None:
+            return False
+        if restarted or self._reset_seen:
+            self._rotations[serial] = rotation
+        self._reset_seen = False
+        return not same(ROTATION, self._rotations.setdefault(serial, rotation), rotation)
 
     def _request_look(self) -> None:
         """Request a look at identity and registers, unless something else runs."""

@@ -251,6 +251,11 @@ UNEXAMINED_S = 2.0  # longest lag of the estimate: samples that are not in it ma
 SAVE_CHECKS_S = 0.5  # always allowed for the checks before VNWNV, which pause the samples
 SAVE_CHECKS_PER_ASKING = 6.0  # or so many quickest looks: the checks need 4 to 5 times the replies
 ASKINGS = 5  # newest looks: the quickest had no late reply; more would hide a line that got slower
+ROTATION_WAITS = (
+    "register 26 was changed and acts only once it is saved and the device has restarted: until "
+    "then no sample is used; save it, or put it back, and switch the device off and on (and start "
+    "ahrsd again if the stream has no time)"
+)
 NOT_ARMED = "nobody has armed this run: `ahrsd operator arm`"
 
 
@@ -294,9 +299,16 @@ class Safeguards:
         self._limits, self._is_ours = [why], False
 
     def bind(
-        self, identity: Identity, registers: Mapping[int, Values], journal_readable: bool
+        self,
+        identity: Identity,
+        registers: Mapping[int, Values],
+        journal_readable: bool,
+        rotation_waits: bool = False,
     ) -> None:
-        """Check a device that was identified and read; writes are bound to the first one."""
+        """Check a device that was identified and read; writes are bound to the first one.
+
+        rotation_waits: register 26 was changed and the device has not restarted since
+        """
         self.journal_ok = self.journal_read = journal_readable
         self.gates = self.flash_gates = ()  # earlier verdicts no longer count
         self._look_durations_s.clear()
@@ -311,6 +323,8 @@ class Safeguards:
             )
         if not identity.profile.writable:
             self._limits.append(f"observe only: {identity.profile.observed_for}")
+        if rotation_waits:
+            self._limits.append(ROTATION_WAITS)
         if missing := [n for n in (MAG, GYRO, HSI_CONTROL) if n not in registers]:
             self._limits.append(f"registers {missing} could not be read")
         if not journal_readable:

@@ -620,6 +620,12 @@ def asked_of(known: Seen, command: Speech) -> Procedure[Reply]:
     raise AssertionError("no attempt is left")
 
 
+def save_settings_of(known: Seen) -> Procedure[None]:
+    """`save_settings` of this unit while it holds these values; raises as `asked_of`."""
+    yield from asked_of(known, Word("VNWNV"))
+    yield Pause(ERROR_WINDOW_S, watch_errors=True)
+
+
 def identify_in(seconds: float) -> Procedure[Identity]:
     """`identify_surely` after a while."""
     yield Pause(seconds)

@@ -59,6 +59,7 @@ __all__ = [
     "BINARY_OUTPUT_OFF",
     "COMPENSATING",
     "REGISTERS",
+    "ROTATION",
     "SAMPLE_RATE_HZ",
     "SESSION_SETTINGS",
     "SUPPORTED_BAUD",
@@ -420,7 +421,8 @@ MEASUREMENT_ROWS = (
 
 ORTHONORMAL_WITHIN = 1e-5  # register 26: what the device still accepts
 
-COMPENSATING = (23, 25, 26, 44, 84)  # what the device computes of a reading depends on them
+ROTATION = 26  # acts only once it was saved and the device has restarted
+COMPENSATING = (23, 25, ROTATION, 44, 84)  # what the device computes of a reading depends on them
 
 
 def check_rotation(values: Values) -> None:

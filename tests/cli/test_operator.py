@@ -74,6 +74,22 @@ def test_command_is_taken_once_and_in_order(box, inbox):
     assert list(box.folder.iterdir()) == []
 
 
+def test_of_two_daemons_with_one_folder_only_the_first_takes_commands(box, inbox):
+    second = OperatorInbox(box)
+    try:
+        until(lambda: second.fault)
+        assert "another daemon takes the commands; give each daemon" in second.fault
+        box.put("lock", "crew aboard")
+        assert [word.argument for word in heard(inbox)] == ["crew aboard"]
+        assert second.take() == []
+        inbox.close(10.0)
+        until(lambda: not second.fault)
+        box.put("unlock", "nobody aboard")
+        assert [word.argument for word in heard(second)] == ["nobody aboard"]
+    finally:
+        second.close(10.0)
+
+
 def test_sender_of_a_command_gets_the_answer(box, inbox):
     answers = []
     caller = threading.Thread(

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 
 import pytest
 
+from ahrsd.cli.device.register_changes import apply, gate
 from ahrsd.daemon.journal import Journal, journal_path
+from ahrsd.errors import DeviceError
+from drivers.serial_port import SerialPort
+from drivers.vn100.commands import identify
+from drivers.vn100.device import Device
 
 SERIAL = 100130608
 BAUD = ("--baud", "115200")
@@ -154,6 +160,123 @@ def test_refused_write_leaves_the_device_unchanged(run, emulated, tmp_path, caps
     assert "the old values are back" in error
 
 
+@pytest.mark.parametrize(
+    ("number", "values", "words"),
+    [
+        (5, ("9600",), "register 5 is not written: the device would answer at its new rate"),
+        (6, ("0", "2"), "register 6 is written for the connected port only"),
+        (7, ("1", "1"), "register 7 is written for the connected port only"),
+    ],
+)
+def test_what_cannot_be_read_back_is_not_written(
+    run, emulated, tmp_path, capsys, number, values, words
+):
+    with emulated() as (emulator, path):
+        assert run("registers", "write", path, number, *values, "--yes",
+                   "--state-directory", tmp_path, *BAUD) == 2  # fmt: skip
+        assert emulator.memory.ram == emulator.memory.flash
+    assert words in capsys.readouterr().err
+    assert kinds(tmp_path) == []
+
+
+def on_trial(tmp_path, emulator) -> None:
+    """A daemon that was killed while it had values on trial."""
+    old, new = {"23": FACTORY, "84": FACTORY}, {"23": NEW_VALUES, "84": tuple(map(float, BIAS))}
+    facts = {"serial": SERIAL, "txn": "a-1", "firmware": "3.1.0.0", "snapshot": {},
+             "heading_change_deg": 9.0, "approver": "operator", "old": old, "new": new}  # fmt: skip
+    journal = Journal.open(journal_path(tmp_path, SERIAL))
+    journal.append("PREPARED", **facts)
+    journal.append("RAM_VERIFIED", txn="a-1")
+    for number, values in new.items():
+        emulator.memory.preset(int(number), values)
+
+
+def test_save_by_hand_keeps_no_values_of_a_trial(run, emulated, tmp_path, capsys):
+    state = ("--state-directory", tmp_path, *BAUD)
+    with emulated() as (emulator, path):
+        on_trial(tmp_path, emulator)
+        assert run("registers", "write", path, 35, 1, 0, 1, 1, "--yes", "--save", *state) == 1
+        assert "unproven values of a trial in registers 23, 84" in capsys.readouterr().err
+        assert emulator.memory.get(35) == (1, 1, 1, 1)
+        assert emulator.counters["saves"] == 0
+        assert run("registers", "rollback", path, 1, "--yes", "--save", *state) == 0
+        assert ram(emulator) == ram(emulator, 84) == FACTORY
+        assert emulator.counters["saves"] == 1
+
+
+def test_values_of_a_trial_are_saved_when_a_person_names_them(run, emulated, tmp_path):
+    with emulated() as (emulator, path):
+        on_trial(tmp_path, emulator)
+        emulator.memory.preset(84, FACTORY)
+        assert run("registers", "write", path, 23, *NEW, "--yes", "--save",
+                   "--state-directory", tmp_path, *BAUD) == 0  # fmt: skip
+        assert emulator.counters["saves"] == 1
+
+
+def test_save_by_hand_keeps_no_outputs_of_a_killed_session(run, emulated, tmp_path, capsys):
+    state, kept = ("--state-directory", tmp_path, *BAUD), {"6": [14], "75": [0, 1, 0]}
+    with emulated() as (emulator, path):
+        journal = Journal.open(journal_path(tmp_path, SERIAL))
+        journal.append("OUTPUTS_KEPT", serial=SERIAL, old=kept)
+        emulator.memory.preset(6, (0,))
+        emulator.memory.preset(75, (1, 8, 1, 0x0829))
+        assert run("registers", "write", path, 23, *NEW, "--yes", "--save", *state) == 1
+        assert "the outputs of a killed session" in capsys.readouterr().err
+        assert ram(emulator) == FACTORY
+        assert emulator.counters["saves"] == 0
+        assert run("registers", "rollback", path, 1, "--yes", "--save", *state) == 0
+        assert (emulator.memory.get(6, 1), emulator.memory.get(75)) == ((14,), (0, 1, 0))
+
+
+def test_values_that_could_not_be_put_back_are_not_replaced(run, emulated, tmp_path, capsys):
+    dust = (1.0, *(-3.02119e-30,) * 3, 1.0, *(-3.02119e-30,) * 3, 1.0, 0.1, 0.2, 0.3)
+    with emulated() as (emulator, path):
+        emulator.memory.preset(23, dust)
+        held = emulator.memory.get(23)
+        assert run("registers", "write", path, 23, *NEW, "--yes",
+                   "--state-directory", tmp_path, *BAUD) == 2  # fmt: skip
+        assert emulator.memory.get(23) == held
+    assert "the present values could not be put back" in capsys.readouterr().err
+
+
+def test_rotation_is_said_to_act_after_a_restart(run, emulated, tmp_path, capsys):
+    turned = ("0", "1", "0", "-1", "0", "0", "0", "0", "1")
+    with emulated() as (_, path):
+        assert run("registers", "write", path, 26, *turned, "--yes",
+                   "--state-directory", tmp_path, *BAUD) == 0  # fmt: skip
+    said = capsys.readouterr().out.splitlines()
+    assert said[-1].startswith(
+        "register 26 acts only once it is saved and the device has restarted"
+    )
+
+
+def test_rollback_finds_a_write_that_was_broken_off(run, emulated, tmp_path):
+    with emulated() as (emulator, path):
+        on_trial(tmp_path, emulator)
+        emulator.memory.preset(84, FACTORY)
+        assert run("registers", "rollback", path, "--yes",
+                   "--state-directory", tmp_path, *BAUD) == 0  # fmt: skip
+        assert ram(emulator) == ram(emulator, 84) == FACTORY
+
+
+def test_another_unit_is_neither_written_nor_put_back(emulated, tmp_path):
+    with emulated() as (emulator, path), SerialPort(path, 115200) as port:
+        device = Device(port, gate({23}, save=False))
+        judged = replace(device.run(identify()), serial=SERIAL + 1)
+        journal = Journal.open(tmp_path / "j.jsonl")
+        with pytest.raises(DeviceError, match=f"{SERIAL}, not {SERIAL + 1}; NOT put back"):
+            apply(device, journal, judged, {23: NEW_VALUES})
+        assert ram(emulator) == FACTORY
+
+
+def test_save_without_an_answer_is_told_as_unknown(run, emulated, tmp_path, capsys):
+    with emulated(faults=("power_cut_wnv@0",)) as (_, path):
+        assert run("registers", "write", path, 23, *NEW, "--yes", "--save",
+                   "--state-directory", tmp_path, *BAUD) == 1  # fmt: skip
+    assert "whether it was saved is not known: switch the device off" in capsys.readouterr().err
+    assert kinds(tmp_path)[-1] == "HAND_FLASH_SENT"
+
+
 def test_without_a_journal_nothing_is_written(run, emulated, tmp_path, capsys):
     (tmp_path / "state").write_text("a file where the folder should be")
     with emulated() as (emulator, path):
@@ -281,6 +404,17 @@ def test_a_calibration_is_written_whole_journaled_and_can_be_undone(
     records = Journal.open(journal_path(tmp_path, SERIAL)).records()
     assert [r.kind for r in records] == ["HAND_PREPARED", "HAND_VERIFIED"] * 2
     assert records[0].facts["calibration"] == "calibration.json"
+
+
+def test_restart_between_two_writes_leaves_no_half_a_calibration(
+    write_from, emulated, tmp_path, capsys
+):
+    with emulated(faults=("power_cut_wrg=2@0",)) as (emulator, port):
+        assert write_from(port, calibration(tmp_path), "--yes") == 1
+        assert emulator.counters["restarts"] == 1
+        assert ram(emulator) == ram(emulator, 84) == FACTORY
+    assert kinds(tmp_path) == ["HAND_PREPARED", "HAND_FAILED"]
+    assert "the old values are back" in capsys.readouterr().err
 
 
 FLIPPED = [-1.0, *FACTORY[1:]]

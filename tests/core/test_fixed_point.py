@@ -257,6 +257,13 @@ def test_unusable_registers_are_refused(held: dict[int, Values]) -> None:
         compose(truth(np.random.default_rng(12)), held)
 
 
+def test_values_that_could_not_be_written_back_are_not_replaced() -> None:
+    dust = (1.0, *(-3.02119e-30,) * 3, 1.0, *(-3.02119e-30,) * 3, 1.0, 0.1, 0.2, 0.3)
+    held: dict[int, Values] = {23: dust, 84: Affine.identity().to_register()}
+    with pytest.raises(UnwritableError, match="the present values could not be put back"):
+        compose(truth(np.random.default_rng(12)), held)
+
+
 def test_undetermined_direction_must_keep_the_value_of_the_device() -> None:
     rng = np.random.default_rng(13)
     identity = Affine.identity().to_register()

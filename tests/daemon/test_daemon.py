@@ -11,14 +11,17 @@ import numpy as np
 import pytest
 from patience import PATIENCE_S
 from planted_operator import Operator
+from virtual_run import VirtualRun
 
-from ahrsd.config.config import Config
+from ahrsd.config.config import Config, core_settings
 from ahrsd.daemon import host_clock
 from ahrsd.daemon.core_runner import FoldedLog
+from ahrsd.daemon.health_log import Watch
 from ahrsd.events import SamplesSeen
 from ahrsd.inputs import Examined, LinkLost, WallClock
 from ahrsd.offline.replay import replay
 from ahrsd.recording.capture import CaptureReader
+from drivers.vn100.emulator.scenarios import Setup, build
 
 OWN_STREAM = {"configure_stream": True, "rate_hz": 50.0}
 LIMIT_S = 3.0
@@ -173,6 +176,23 @@ def test_stalled_device_is_reported_once_and_recovers(live, caplog):
         daemon.until(lambda: "all is well again" in caplog.text, 20.0)
         daemon.flowing()
     assert caplog.text.count("nothing comes from the device") == 1
+
+
+@pytest.mark.parametrize("outputs", ["off", "on, then the cable is pulled"])
+def test_device_whose_outputs_are_off_is_not_called_silent(outputs):
+    device = build(Setup("static", output="imu", faults=("mute@20",)))
+    if outputs == "off":
+        device.memory.preset(6, (0,))
+        device.restart(0.0)
+    run = VirtualRun(device, core_settings(Config()), step_s=0.1)
+    watch, said = Watch(run.now_s), []
+    while run.now_s < 40.0:
+        run.run(1.0)
+        said += [(run.now_s, r.text) for r in watch.look(run.core, run.now_s, "", True)]
+    texts = [text.partition(":")[0] for _, text in said]
+    answers = "the device answers and sends nothing by itself"
+    assert texts == [answers] * (outputs == "off") + ["nothing comes from the device"]
+    assert 25.0 <= said[-1][0] < 36.5  # the mute begins at 20 s, the last answer came before it
 
 
 def test_device_that_did_not_answer_is_queried_again(live):

@@ -257,6 +257,16 @@ def test_journal_of_another_user_is_refused_unless_the_folder_owner(tmp_path):
     assert len(Journal.open(folder / "j.jsonl").records()) == 1
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")
+def test_journal_that_root_begins_is_of_the_folder_owner(tmp_path):
+    folder = tmp_path / "state"
+    folder.mkdir()
+    os.chown(folder, 12345, 12346)
+    fill(folder / "j.jsonl", 2)
+    status = (folder / "j.jsonl").stat()
+    assert (status.st_uid, status.st_gid) == (12345, 12346)
+
+
 def test_reserved_keys_are_refused_as_facts(tmp_path):
     with pytest.raises(ValueError, match="seq is the journal's own key"):
         Journal.open(tmp_path / "j.jsonl").append("PREPARED", seq=9)

@@ -10,7 +10,7 @@ from virtual_run import VirtualRun
 from ahrsd.calibration import Estimate, Observability
 from ahrsd.config.config import Config, core_settings
 from ahrsd.core.write_back import DeviceRecord
-from ahrsd.writeback.policy import WriteBackPolicy
+from ahrsd.writeback.policy import ROTATION_WAITS, WriteBackPolicy
 from ahrsd.writeback.states import Mode
 from drivers.vn100.emulator.scenarios import Setup, build
 
@@ -26,11 +26,11 @@ def estimate() -> Estimate:
     )  # fmt: skip
 
 
-@pytest.fixture
-def observing() -> VirtualRun:
+@pytest.fixture(params=["imu"])
+def observing(request) -> VirtualRun:
     """A run that would write the estimate of its calibrator as soon as a person approves it."""
     policy = WriteBackPolicy(mode=Mode.STAGE, armed_at_start=True, max_change_auto_deg=180.0)
-    device = build(Setup("rov", seed=3, output="imu", rate_hz=50))
+    device = build(Setup("rov", seed=3, output=request.param, rate_hz=50))
     run = VirtualRun(device, core_settings(Config(), policy=policy), step_s=0.1)
     assert run.until(lambda: run.core.writeback.state.value == "OBSERVING", 10.0), run.notes
     run.run(3.0)
@@ -62,6 +62,24 @@ def test_change_explained_by_a_restart_does_not_restart_the_calibration(observin
     run.run(10.0)
     assert run.core.calibrator is before
     assert not [text for _, text in run.notes if "somebody" in text]
+
+
+@pytest.mark.parametrize("observing", ["binary"], indirect=True)
+def test_rotation_that_does_not_act_yet_allows_no_sample_and_no_write(observing):
+    run, turned = observing, (0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    run.emulator.memory.ram[26, 0] = turned  # the device goes on with the one before
+    run.run(15.0)
+    waits = [text for text in run.core.writeback.obstacles() if text.startswith("register 26")]
+    assert waits == [ROTATION_WAITS]
+    assert run.core.writeback.mode is Mode.OBSERVE
+    run.run(15.0)
+    assert not run.core.calibrator.started
+    run.emulator.memory.save()
+    run.emulator.restart(run.now_s)
+    run.run(25.0)
+    assert run.core.registers[26] == turned
+    assert run.core.writeback.mode is Mode.STAGE
+    assert run.core.calibrator.started
 
 
 def test_values_that_differ_only_by_printing_are_equal():

@@ -430,6 +430,40 @@ def test_values_without_a_journal_record_are_reported(make_rig, number):
     assert rig.notes("warning") == []
 
 
+@pytest.mark.parametrize(
+    ("end", "reported"),
+    [
+        (None, True),
+        (Record("HAND_FAILED", {"txn": 1, "restored": False}), True),
+        (Record("HAND_FAILED", {"txn": 1, "restored": True}), False),
+        (Record("HAND_VERIFIED", {"txn": 1}), False),
+    ],
+)
+def test_write_by_hand_that_was_broken_off_is_reported(make_rig, end, reported):
+    rig = make_rig(Mode.STAGE)
+    old = {str(n): list(rig.device.ram[n]) for n in (23, 84)}
+    rig.device.ram[23] = OTHER  # and not 84
+    prepared = Record("HAND_PREPARED", {"old": old, "new": {key: list(OTHER) for key in old}})
+    rig.connect(journal=[prepared, *([end] if end else [])])
+    said = [text for text in rig.notes("error") if "by hand of registers 23, 84 was broken" in text]
+    assert len(said) == reported
+
+
+def test_write_by_hand_after_a_save_is_not_called_somebody_elses(make_rig):
+    rig = saved(make_rig)
+    rig.back("device")
+    assert rig.wb.state is State.CONFIRMED
+    held = rig.device.ram[23]
+    rig.device.ram[23] = rig.device.flash[23] = OTHER
+    by_hand = {"old": {"23": list(held)}, "new": {"23": list(OTHER)}}
+    rig.journal.append(Record("HAND_PREPARED", by_hand))
+    rig.back("all")
+    assert rig.notes("error") == []
+    rig.device.ram[84] = rig.device.flash[84] = OTHER
+    rig.back("all")
+    assert "register 84 changed since the journal's last record" in rig.notes("error")[-1]
+
+
 def test_values_of_an_own_save_are_not_reported(make_rig):
     rig = saved(make_rig)
     rig.back("device")

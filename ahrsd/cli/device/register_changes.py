@@ -20,29 +20,39 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ahrsd.cli.device.access import describe, open_device, read_all
+from ahrsd.core.device_session import KeptOutputs
 from ahrsd.daemon import host_clock
 from ahrsd.daemon.journal import Journal, Record, journal_path, register_values
 from ahrsd.errors import AhrsdError, DeviceError, JournalError
 from ahrsd.foreign_file import ForeignFileError, read_regular
 from ahrsd.writeback.composition import GYRO, MAG, UnwritableError, refuse_unsafe
+from ahrsd.writeback.journal_history import JournalHistory
 from drivers.serial_port import PortError
 from drivers.vn100.commands import (
     Command,
     Identity,
+    NotAsKnown,
     Procedure,
     Read,
+    Seen,
+    TooLate,
+    VerifyFailed,
     Word,
     Write,
+    WrongDevice,
     quiet,
+    read,
+    read_present,
     read_registers,
     restore,
-    save_settings,
+    save_settings_of,
     write_verified,
 )
 from drivers.vn100.device import Device
 from drivers.vn100.errors import DriverError
 from drivers.vn100.registers import (
     REGISTERS,
+    SESSION_SETTINGS,
     RegisterValueError,
     Values,
     format_command,
@@ -54,6 +64,7 @@ from drivers.vn100.registers import (
 
 
 Changes = dict[int, Values]
+BAUD_RATE = 5  # a line that changes it cuts off the lines behind it
 
 
 def gate(registers: set[int], save: bool) -> Callable[[Command], bool]:
@@ -70,6 +81,53 @@ def gate(registers: set[int], save: bool) -> Callable[[Command], bool]:
         return isinstance(command, Read) or (isinstance(command, Word) and command.word in words)
 
     return allow
+
+
+def refuse_unprovable(present: Changes, changes: Changes) -> None:
+    """Raise AhrsdError for a write that could be neither read back nor put back from here."""
+    for number, values in changes.items():
+        try:
+            format_command(number, present[number], held=True)
+        except RegisterValueError as error:
+            raise AhrsdError(f"the present values could not be put back: {error}") from error
+        if number == BAUD_RATE:
+            raise AhrsdError(
+                "register 5 is not written: the device would answer at its new rate, where this "
+                "command can neither read it back nor put it back; nothing was written"
+            )
+        port = len(REGISTERS[number].fields) - 1
+        if REGISTERS[number].fields[port].optional and values[port:] not in (
+            (),
+            present[number][port:],
+        ):
+            raise AhrsdError(
+                f"register {number} is written for the connected port only, because that of the "
+                "other one can be neither read back nor put back: leave the port number out, or "
+                "connect to the other port; nothing was written"
+            )
+
+
+def refuse_unproven_save(
+    device: Device, journal: Journal, identity: Identity, wanted: Changes
+) -> None:
+    """Raise JournalError where a save of RAM would make permanent what only was on trial.
+
+    wanted: what the person named; that is the person's decision, whatever the journal says of it
+    """
+    records, numbers = journal.records(), (MAG, GYRO, *SESSION_SETTINGS)
+    history, kept = JournalHistory.of(records), KeptOutputs()
+    after = {**device.run(read_present(numbers)), **wanted}
+    unnamed = [n for n in (MAG, GYRO) if n in after and n not in wanted]
+    if tried := [n for n in unnamed if history.is_trial_value(n, after[n])]:
+        which = f"register{'s' * (len(tried) > 1)} {', '.join(map(str, tried))}"
+        raise JournalError(
+            f"{journal.path}: the device has unproven values of a trial in {which}, and a save "
+            "keeps all of RAM; `ahrsd registers rollback` puts the old ones back; nothing was "
+            "written"
+        )
+    kept.update(identity.serial, after, records)
+    if kept.left:
+        raise JournalError(f"{journal.path}: {kept.describe_left(put_back=False)}")
 
 
 def to_write(present: Changes, wanted: Changes) -> Changes:
@@ -99,9 +157,9 @@ def apply(
         **why,
     )
     try:
-        device.run(quiet(_write_all(changes, held="undoes" in why)))
+        device.run(quiet(_write_all(identity, changes, held="undoes" in why)))
     except (DriverError, PortError) as error:
-        restored = _put_back(device, old)
+        restored = _put_back(device, identity, old)
         _append(journal, "HAND_FAILED", txn=prepared.seq, error=str(error), restored=not restored)
         outcome = f"NOT put back: {restored}" if restored else "the old values are back"
         raise DeviceError(f"{error}; {outcome}") from error
@@ -109,14 +167,22 @@ def apply(
     return prepared
 
 
-def save_to_flash(device: Device, journal: Journal, prepared: Record) -> None:
+def save_to_flash(device: Device, journal: Journal, identity: Identity, prepared: Record) -> None:
     """VNWNV: everything that is in RAM becomes what the device starts with."""
     expected = register_values(prepared, "new")
     present = device.run(read_registers(expected))
     if changed := to_write(present, expected):
         raise DeviceError(f"register {min(changed)} no longer holds what was written; not saved")
     _append(journal, "HAND_FLASH_SENT", txn=prepared.seq)
-    device.run(quiet(save_settings()))
+    try:
+        device.run(quiet(save_settings_of(Seen(identity.unit, present))))
+    except (NotAsKnown, TooLate) as error:
+        raise DeviceError(f"not saved: {error}") from error
+    except (DriverError, PortError) as error:
+        raise DeviceError(
+            f"{error}; whether it was saved is not known: switch the device off and on and compare "
+            f"it with {prepared.seq}:new of the journal (`ahrsd registers diff`)"
+        ) from error
     _append(journal, "HAND_FLASH_ACKED", txn=prepared.seq)
 
 
@@ -125,18 +191,39 @@ def _append(journal: Journal, kind: str, **facts: object) -> Record:
     return journal.append(kind, **{**host_clock.stamp(), **facts})
 
 
-def _write_all(changes: Changes, held: bool) -> Procedure[None]:
+def _write_all(identity: Identity, changes: Changes, held: bool) -> Procedure[None]:
+    """Write and read back each; then read all of them again: a restart in between undoes some."""
     for number, values in changes.items():
+        yield from _refuse_other_device(identity)
         yield from write_verified(number, values, held=held)
+    yield from _refuse_other_device(identity)
+    for number, values in changes.items():
+        back = yield from read(number)
+        if to_write({number: back}, {number: values}):
+            raise VerifyFailed(number, values, back, 1)
 
 
-def _put_back(device: Device, old: Changes) -> str:
+def _put_back(device: Device, identity: Identity, old: Changes) -> str:
     """Whatever differs from `old` gets it again; "" or why that failed."""
     try:
-        device.run(quiet(restore(old, old)))
+        device.run(quiet(_restore(identity, old)))
     except (DriverError, PortError) as error:
         return str(error)
     return ""
+
+
+def _restore(identity: Identity, old: Changes) -> Procedure[None]:
+    yield from _refuse_other_device(identity)
+    yield from restore(old, old)
+
+
+def _refuse_other_device(identity: Identity) -> Procedure[None]:
+    """Raises WrongDevice; asked twice, for a reply may be altered on its way."""
+    for _ in range(2):
+        answered = int((yield from read(3))[0])
+        if answered == identity.serial:
+            return
+    raise WrongDevice(f"the device has the serial number {answered}, not {identity.serial}")
 
 
 def _texts(values: Changes) -> dict[str, list[float | int | str]]:
@@ -174,6 +261,8 @@ def find(journal: Journal, number: int) -> Record:
 def newest_in_force(journal: Journal, read: Callable[[Iterable[int]], Changes]) -> Record:
     """The newest change that is in the device and was not undone; undoing is no change itself.
 
+    One that was broken off is in the device in part: each register holds the old or the new value.
+
     Raises JournalError where there is none: then a person must say which record is meant.
     """
     records = journal.records()
@@ -183,8 +272,9 @@ def newest_in_force(journal: Journal, read: Callable[[Iterable[int]], Changes]) 
         new = register_values(record, "new")
         if not new or record.seq in undone or "undoes" in record.facts:
             continue
-        present = read(new)
-        if not to_write(present, new) and to_write(present, register_values(record)):
+        present, old = read(new), register_values(record)
+        to_undo = to_write(present, old)
+        if to_undo and not to_write(present, {n: new[n] for n in to_undo}):
             return record
     raise JournalError(
         f"{journal.path}: the device holds the values of none of the journal's changes; "

@@ -26,6 +26,7 @@ import click
 
 from ahrsd.cli.device.access import PORT, describe, open_device
 from ahrsd.cli.device.register_changes import (
+    BAUD_RATE,
     Changes,
     Sources,
     apply,
@@ -34,6 +35,8 @@ from ahrsd.cli.device.register_changes import (
     gate,
     journals,
     newest_in_force,
+    refuse_unprovable,
+    refuse_unproven_save,
     save_to_flash,
     to_write,
 )
@@ -65,6 +68,7 @@ from drivers.vn100.device import Device
 from drivers.vn100.register_codec import Register, RegisterField, Value
 from drivers.vn100.registers import (
     REGISTERS,
+    ROTATION,
     RegisterValueError,
     Values,
     format_command,
@@ -194,7 +198,10 @@ _SAVE = click.option(
 
 
 Ids = TypeVar("Ids", int, int | None, tuple[int, ...])
-_BAUD_RATE = 5  # a line that changes it cuts off the lines behind it
+_ROTATION_ACTS_LATER = (
+    "register 26 acts only once it is saved and the device has restarted: switch it off and on "
+    "before ahrsd runs or captures again"
+)
 _SHOWN = ("txn", "reason", "undoes", "error", "restored")  # facts of a record besides its registers
 
 
@@ -383,7 +390,7 @@ def export(
     identity, values = Sources(_state(state_directory), journal_file, baud).read(source)
     if missing := [number for number in ids if number not in values]:
         raise AhrsdError(f"{source} has no register {missing[0]}")
-    chosen = {n: row for n, row in values.items() if (n in ids if ids else n != _BAUD_RATE)}
+    chosen = {n: row for n, row in values.items() if (n in ids if ids else n != BAUD_RATE)}
     text = _json(chosen, identity) if as_json else "\n".join(typed_lines(chosen)) + "\n"
     if output is None:
         click.echo(text, nl=False)
@@ -411,7 +418,7 @@ def rollback(
 ) -> None:
     """Write back the values that the registers had before record ID of the journal.
 
-    Without ID: before the newest change whose values the device holds now.
+    Without ID: before the newest change of which the device holds a value now.
     """
 
     def wanted(device: Device, journal: Journal) -> tuple[Changes, Mapping[str, object]]:
@@ -445,6 +452,9 @@ def _change(
         if "undoes" not in why:  # what goes back to where it was is not locked out
             refuse_locked(journal)
         present = device.run(read_registers(changes))
+        refuse_unprovable(present, changes)
+        if save:
+            refuse_unproven_save(device, journal, identity, changes)
         changes = to_write(present, changes)
         _show(identity, present, changes)
         if not changes and not save:
@@ -462,8 +472,10 @@ def _change(
         for line in wrg_lines(record):
             click.echo(f"  {line}")
         if save:
-            save_to_flash(device, journal, record)
+            save_to_flash(device, journal, identity, record)
             click.echo("saved to flash")
+        if ROTATION in changes:
+            click.echo(_ROTATION_ACTS_LATER)
 
 
 def _again(
