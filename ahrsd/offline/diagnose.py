@@ -168,14 +168,15 @@ def diagnose_recording(
     if simulation is None:
         found = _diagnose_track(real, track, known)
         return replace(found, notes=(*notes, *found.notes))
-    simulated, _ = load_track(simulation, rate_hz, spec=known)
+    simulated, simulation_notes = load_track(simulation, rate_hz, spec=known)
+    notes += [f"of the simulation: {note}" for note in simulation_notes]
     try:
         overlap = align(track, simulated)
     except ValueError as error:
         raise RecordingError(simulation, str(error), "bring a simulation of this motion") from None
     found = _diagnose_track(real, overlap.real, known)
     own = _diagnose_track(simulation, overlap.simulated, Spec())
-    difference = remove_common_findings(found, own)
+    difference = remove_common_findings(found, own, overlap.other_axes)
     return replace(difference, notes=(*notes, *overlap.notes, *difference.notes))
 
 
