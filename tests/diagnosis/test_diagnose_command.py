@@ -10,7 +10,7 @@ import pytest
 from ahrsd.diagnosis.external_simulation import align
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import AhrsdError, RecordingError
-from ahrsd.offline.diagnose import load_spec, load_track
+from ahrsd.offline.diagnose import check_spec_noise, load_spec, load_track
 from ahrsd.recording.table import write_table
 from ahrsd.simulation import ScenarioSettings, simulate
 
@@ -238,6 +238,25 @@ def test_spec_rate_that_differs_from_the_time_stamps_is_noted(saved, clean, rati
     _, notes = load_track(saved(clean), spec=Spec(rate_hz=ratio * rate_hz))
     assert len([note for note in notes if "the stamps are used" in note]) == lines
     assert not any("--rate" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("spec", "used", "words"),
+    [
+        (Spec(sigma_mag_gauss=1e-3, sigma_gyro_rad_s=1e-5), True, None),
+        (Spec(sigma_mag_gauss=0.05), True, "check its unit; only noise that is slow"),
+        (Spec(sigma_mag_gauss=1e-4), True, "what the spec does not explain is a mismatch"),
+        (Spec(sigma_mag_gauss=1e-5), False, "it was left out; check its unit, or the sensor"),
+        (Spec(field_gauss=0.5), True, "the spec's field_gauss changes nothing"),
+        (Spec(sigma_gyro_rad_s=0.05), True, "the spec says sigma_gyro_rad_s = 0.05, but"),
+    ],
+)
+def test_spec_noise_that_the_readings_contradict_is_noted(saved, clean, spec, used, words):
+    track, _ = load_track(saved(clean))
+    left, notes = check_spec_noise(track, spec)
+    assert left == (spec if used else Spec())
+    assert len(notes) == (words is not None)
+    assert all(words in note for note in notes)
 
 
 def test_missing_recording_is_refused(tmp_path):
