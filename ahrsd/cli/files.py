@@ -25,10 +25,20 @@ from ahrsd.errors import AhrsdError
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
-def _parsed(_context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> object:
+_COLUMNS_AS_GIVEN = "ahrsd.columns"
+
+
+def _parsed(context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> object:
     from ahrsd.recording.column_names import parse_columns
 
+    context.meta[_COLUMNS_AS_GIVEN] = texts
     return parse_columns(texts)
+
+
+def columns_as_given() -> tuple[str, ...]:
+    """The texts of `--columns` of the command that runs."""
+    given: tuple[str, ...] = click.get_current_context().meta.get(_COLUMNS_AS_GIVEN, ())
+    return given
 
 
 def columns_option(command: _Command) -> _Command:

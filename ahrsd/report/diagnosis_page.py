@@ -22,6 +22,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Validation,
 )
 from ahrsd.diagnosis.answer.text import (
+    agrees,
     component_lines,
     direction_text,
     evidence_text,
@@ -325,6 +326,7 @@ def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
         title=f"Diagnosis of {found.recording}",
         found=found,
         verdict=verdict(found),
+        agrees=agrees(found),
         findings=[_finding(found, one) for one in found.findings],
         unexplained=_unexplained(found),
         ordinary=None if ordinary is None else ordinary_text(ordinary),
@@ -404,6 +406,11 @@ def _unexplained(found: Diagnosis) -> list[tuple[str, str]]:
         )
         for s in left.follows
     ]
+    if left.priors is not None:
+        rows.append(("evidence", evidence_text(left.priors)))
+    if left.heldout is not None:
+        gain = f"{left.heldout.nll_gain_per_sample:+.4f} nats per sample"
+        rows.append(("on data not fitted", f"{gain} with a free time series in its place"))
     return rows
 
 

@@ -79,6 +79,24 @@ def test_current_is_found_and_all_files_are_written(run, saved, clean, tmp_path,
     assert run("simulate", *model, "-o", str(again)) == 0
 
 
+def test_report_of_wrong_axes_leaves_no_model_of_another_recording(run, saved, clean, tmp_path):
+    folder, spec = tmp_path / "report", tmp_path / "my spec.json"
+    folder.mkdir()
+    (folder / "model.json").write_text("of another recording")
+    spec.write_text('{"rate_hz": 25}')
+    wrong = saved({**clean, "gyro_x_rad_s": -clean["gyro_x_rad_s"]}, "wrong.csv")
+    options = ("--spec", str(spec), "--columns", "time=time_s:s")
+    assert run("diagnose", str(wrong), *options, "--report", str(folder)) == 0
+    assert json.loads((folder / "diagnosis.json").read_text())["findings"][0]["effect"] == (
+        "frame_error"
+    )
+    assert not (folder / "model.json").exists()
+    made_by = (
+        "diagnose wrong.csv --spec &#39;my spec.json&#39; --columns time=time_s:s --report report"
+    )
+    assert made_by in (folder / "report.html").read_text()
+
+
 @pytest.mark.slow
 def test_simulation_of_the_repaired_model_contains_the_current(run, saved, clean, tmp_path):
     folder, again, found = tmp_path / "report", tmp_path / "again.csv", tmp_path / "found.json"

@@ -114,6 +114,12 @@ def verdict(found: Diagnosis) -> str:
     return f"MISMATCH: {text} (p = {found.p_value:.1g}){rest}"
 
 
+def agrees(found: Diagnosis) -> bool:
+    """Whether the verdict is good: nothing is left out, and nothing undecided or unlike."""
+    unlike = bool(found.failed_checks) and ordinary_residual(found) is None
+    return not found.mismatch and found.undecided is None and not unlike
+
+
 def headline(finding: Finding) -> str:
     """The effect and its probability."""
     return f"{finding.words or finding.effect} ({finding.effect}), {finding.confidence:.1%} sure"

@@ -9,6 +9,7 @@ import pytest
 from effect_motion import moving
 
 from ahrsd.diagnosis.answer.diagnosis import (
+    Check,
     Component,
     Diagnosis,
     Finding,
@@ -137,6 +138,22 @@ def test_report_page_distinguishes_ordinary_residual_from_unknown(tmp_path):
     assert "Unknown, here" in said
     assert WHY in said
     assert "Remaining residual, ordinary" not in said
+
+
+def test_page_marks_only_an_agreement_as_good(tmp_path):
+    """Undecided, or unlike its simulations in a statistic, is neither good nor bad."""
+    page, agreeing = tmp_path / "report.html", diagnosis_of(remaining(8e-3))
+    plain = replace(agreeing, unexplained=Unexplained(False))
+    unlike = {"line": Check(9.0, (1.0, 2.0), inside_before=False, inside_after=False)}
+    marks = {
+        "yes": (agreeing, plain, replace(agreeing, posterior_predictive=unlike)),
+        "": (replace(plain, posterior_predictive=unlike), replace(plain, undecided="too short")),
+        "no": (replace(plain, mismatch=True), diagnosis_of(remaining(80e-3, within=False))),
+    }
+    for mark, diagnoses in marks.items():
+        for one in diagnoses:
+            write_diagnosis_report(page, one, "ahrsd diagnose walk.csv")
+            assert f'<p class="verdict {mark}">' in page.read_text(encoding="utf-8")
 
 
 def test_residual_without_a_single_component_is_reported_as_a_whole():
