@@ -15,14 +15,13 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
-from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.external_simulation import align, remove_common_findings
 from ahrsd.diagnosis.inference.diagnose import diagnose_logged
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, from_text
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
-from ahrsd.offline.track import check_track, track_of
+from ahrsd.offline.track import check_spec_noise, check_track, track_of
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import TABLE_ROWS, on_one_thread
@@ -34,10 +33,6 @@ FEWEST_ROWS = 100
 RATE_AGREES = (
     0.05  # relative, of spec and time stamps: clock errors are smaller, unit errors larger
 )
-#: factors between a spec's noise and the scatter of successive readings: beyond the first a note
-#: says so, as slow noise scatters less and a magnetometer that is shaken more; with readings that
-#: scatter by more than the second no calibration comes near them, so the entry is not used
-NOISE_AGREES, NOISE_IMPOSSIBLE = 5.0, 30.0
 #: entries of a spec: smallest and largest plausible value, unit
 _SPEC_KEYS = {
     "sigma_mag_gauss": (1e-7, 0.3, "gauss per sample"),
@@ -85,30 +80,6 @@ def _rate_notes(track: Track, spec_hz: float | None) -> list[str]:
         f"the spec says {spec_hz:g} Hz, the time stamps {rate_hz:.4g} Hz: the stamps are used; "
         "check that they are in seconds"
     ]
-
-
-def check_spec_noise(track: Track, spec: Spec) -> tuple[Spec, list[str]]:
-    """The spec without a noise that its readings contradict, and one line on each that they do.
-
-    A gyro may scatter by far more than its noise, which is its motion.
-    """
-    names = "sigma_mag_gauss", "sigma_gyro_rad_s"
-    notes = []
-    if spec.field_gauss is not None:
-        notes.append("the spec's field_gauss changes nothing: the field's strength is not judged")
-    for key, scatter in zip(names, noise_of_differences(track), strict=True):
-        given = getattr(spec, key)
-        if given is None or scatter == 0.0 or not np.isfinite(scatter):
-            continue
-        words = f"the spec says {key} = {given:g}, but successive readings scatter by {scatter:.2g}"
-        if given > NOISE_AGREES * scatter:
-            notes.append(f"{words}: check its unit; only noise that is slow scatters so little")
-        elif key == "sigma_mag_gauss" and scatter > NOISE_IMPOSSIBLE * given:
-            spec = replace(spec, sigma_mag_gauss=None)
-            notes.append(f"{words}: it was left out; check its unit, or the sensor")
-        elif key == "sigma_mag_gauss" and scatter > NOISE_AGREES * given:
-            notes.append(f"{words}: check its unit; what the spec does not explain is a mismatch")
-    return spec, notes
 
 
 def _replay_samples(

@@ -10,7 +10,8 @@ import pytest
 from ahrsd.diagnosis.external_simulation import align
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import AhrsdError, RecordingError
-from ahrsd.offline.diagnose import check_spec_noise, load_spec, load_track
+from ahrsd.offline.diagnose import load_spec, load_track
+from ahrsd.offline.track import check_spec_noise
 from ahrsd.recording.table import write_table
 from ahrsd.simulation import ScenarioSettings, simulate
 
