@@ -61,9 +61,11 @@ def command(
     from ahrsd.diagnosis.answer.text import answer_lines
     from ahrsd.offline.diagnose import diagnose_recording
 
-    refuse_unwritable(json_path)
+    read = (real, simulation, spec)
+    refuse_unwritable(json_path, read)
     if folder is not None:
-        make_folder(folder, ("report.html", "diagnosis.rrd", "diagnosis.json", "model.json"))
+        names = ("report.html", "diagnosis.rrd", "diagnosis.json", "model.json")
+        make_folder(folder, names, read)
     keep_heap()
     with byte_progress(real) as progress:
         found = diagnose_recording(
