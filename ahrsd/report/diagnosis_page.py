@@ -387,10 +387,10 @@ def _contribution(found: Diagnosis, one: Finding) -> Picture | None:
 
 def _unexplained(found: Diagnosis) -> list[tuple[str, str]]:
     left = found.unexplained
-    if left.where is None or not (left.detected or left.ordinary):
+    if not (left.detected or left.ordinary):
         return []
-    rows = [("where", where_text(left.where))]
-    if left.where.direction is not None:
+    rows = [] if left.where is None else [("where", where_text(left.where))]
+    if left.where is not None and left.where.direction is not None:
         rows.append(("along", direction_text(left.where.direction)))
     if left.size is not None:
         rows.append(("size", size_text(left.size, left.unit)))

@@ -140,6 +140,17 @@ def test_report_page_distinguishes_ordinary_residual_from_unknown(tmp_path):
     assert "Remaining residual, ordinary" not in said
 
 
+@pytest.mark.parametrize("within", [True, False])
+def test_page_has_the_components_of_a_residual_that_is_at_no_place(tmp_path, within):
+    page, found = tmp_path / "report.html", diagnosis_of(remaining(80e-3, within=within))
+    placeless = replace(found, unexplained=replace(found.unexplained, where=None))
+    write_diagnosis_report(page, placeless, "ahrsd diagnose walk.csv")
+    said = page.read_text(encoding="utf-8")
+    assert ("Unknown, here" in said) != within
+    for line in component_lines(found.unexplained.ordinary):
+        assert line in said
+
+
 def test_page_marks_only_an_agreement_as_good(tmp_path):
     """Undecided, or unlike its simulations in a statistic, is neither good nor bad."""
     page, agreeing = tmp_path / "report.html", diagnosis_of(remaining(8e-3))
