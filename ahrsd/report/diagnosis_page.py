@@ -29,6 +29,7 @@ from ahrsd.diagnosis.answer.text import (
     headline,
     ordinary_residual,
     ordinary_text,
+    residual_is_drawn,
     sensitivity_text,
     setting_text,
     size_text,
@@ -276,6 +277,11 @@ _BY_NAME = (
     "How much every effect alone would explain; findings in blue. The line is the evidence that a "
     "finding needs.",
 )
+#: added below what is drawn before and after if a residual remains
+_WITH_RESIDUAL = (
+    'What remains without a name is in the model "after" as a free time series; the repaired model '
+    "in model.json does not have it."
+)
 #: added below the spectrum where the blue curve is the worse one
 _WORSE_SPECTRUM = (
     "Here it is farther from 1 after than before: the findings explain the readings in their "
@@ -338,6 +344,7 @@ def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
             (_STATISTICS.get(name, name.replace("_", " ")), check)
             for name, check in found.posterior_predictive.items()
         ],
+        with_residual=_WITH_RESIDUAL if residual_is_drawn(found) else "",
         baseline=_baseline(found),
         command=command,
     )
@@ -446,16 +453,21 @@ def _pictures(found: Diagnosis) -> list[Picture]:
     if drawn is None:
         return []
 
-    worse = spectrum_is_worse(drawn)
+    worse, remains = spectrum_is_worse(drawn), residual_is_drawn(found)
     shots = [
-        (partial(residual, found, drawn), *_OVER_TIME),
+        (partial(residual, found, drawn), *_longer(_OVER_TIME, remains, _WITH_RESIDUAL)),
         (partial(spectrum, drawn), *_longer(_BY_FREQUENCY, worse, _WORSE_SPECTRUM)),
     ]
     if drawn.evidence:
         longer = grey_ones_are_longer(found, drawn)
         shots.append((partial(evidence, found, drawn), *_longer(_BY_NAME, longer, _LOST)))
     if found.regime_map:
-        shots.append((partial(regime_map, found.regime_map), *_BY_CONDITION))
+        shots.append(
+            (
+                partial(regime_map, found.regime_map),
+                *_longer(_BY_CONDITION, remains, _WITH_RESIDUAL),
+            )
+        )
     if found.validation is not None and found.findings:
         shots.append((partial(validation, found.validation), *_NOT_FITTED))
     if drawn.courses:

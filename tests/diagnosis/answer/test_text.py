@@ -151,6 +151,22 @@ def test_page_has_the_components_of_a_residual_that_is_at_no_place(tmp_path, wit
         assert line in said
 
 
+@pytest.mark.parametrize("size", [8e-3, 80e-3, None])
+def test_checks_of_a_model_with_a_free_residual_say_so(tmp_path, size):
+    """What is simulated with the model file does not have that residual."""
+    found = diagnosis_of(remaining(size or 0.0, within=size == 8e-3))
+    if size is None:
+        found = replace(found, unexplained=Unexplained(False), mismatch=False)
+    check = Check(1.0, (0.5, 2.0), inside_before=False, inside_after=True)
+    found = replace(found, posterior_predictive={"line": check})
+    said = next(line for line in answer_lines(found) if line.startswith("checks:"))
+    free = "" if size is None else " with the remaining residual as a free time series"
+    assert said == f"checks: 1 statistics; the repaired model{free} passes all of them"
+    write_diagnosis_report(tmp_path / "report.html", found, "ahrsd diagnose walk.csv")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert ("the repaired model in model.json does not have it" in page) == (size is not None)
+
+
 def test_page_marks_only_an_agreement_as_good(tmp_path):
     """Undecided, or unlike its simulations in a statistic, is neither good nor bad."""
     page, agreeing = tmp_path / "report.html", diagnosis_of(remaining(8e-3))
