@@ -6,6 +6,7 @@ or absent (docs: README, "Reference").
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import traceback
@@ -16,13 +17,14 @@ import click
 from ahrsd import __version__
 from ahrsd.cli import LazyGroup
 from ahrsd.daemon import logs
-from ahrsd.errors import EXIT_DONE, EXIT_INTERNAL, AhrsdError
+from ahrsd.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_USAGE, AhrsdError
 from ahrsd.printable import LINE, printable
 
 # Before numpy is loaded. The matrices here are small: further threads spin on a busy machine and
 # change the last digits from run to run.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+_FULL = (errno.ENOSPC, errno.EDQUOT)  # of the disk to which stdout goes
 _INTERRUPTED = 130  # 128 + SIGINT, as every shell reports it
 
 
@@ -86,6 +88,12 @@ def main(arguments: list[str] | None = None) -> None:
         except BrokenPipeError:
             _detach_stdout()
             sys.exit(EXIT_DONE)
+        except OSError as error:
+            if error.errno not in _FULL:
+                raise
+            _detach_stdout()
+            click.echo(f"ahrsd: cannot write: {error.strerror}; make room for it", err=True)
+            sys.exit(EXIT_USAGE)
         sys.exit(EXIT_DONE)
 
 

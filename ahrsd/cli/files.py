@@ -25,10 +25,20 @@ from ahrsd.errors import AhrsdError
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
-def _parsed(_context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> object:
+_COLUMNS_AS_GIVEN = "ahrsd.columns"
+
+
+def _parsed(context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> object:
     from ahrsd.recording.column_names import parse_columns
 
+    context.meta[_COLUMNS_AS_GIVEN] = texts
     return parse_columns(texts)
+
+
+def columns_as_given() -> tuple[str, ...]:
+    """The texts of `--columns` of the command that runs."""
+    given: tuple[str, ...] = click.get_current_context().meta.get(_COLUMNS_AS_GIVEN, ())
+    return given
 
 
 def columns_option(command: _Command) -> _Command:
@@ -46,16 +56,19 @@ def columns_option(command: _Command) -> _Command:
 # -- Files that it writes --------------------------------------------------------------------------
 
 
-def refuse_unwritable(target: str | Path | None) -> None:
-    """Raise AhrsdError before any work is done for a file that cannot be written.
+def refuse_unwritable(target: str | Path | None, inputs: Iterable[Path | None] = ()) -> None:
+    """Raise AhrsdError before any work is done for a file that cannot be written, or is an input.
 
     One that exists and is going to be replaced is told on stderr.
+    inputs: what the command reads: a recording cannot be made again
     """
     if target is None or str(target) == "-":
         return
     path = Path(target)
     if path.is_dir():
         raise AhrsdError(f"{path}: is a folder; name a file")
+    if path.exists() and any(one and one.exists() and path.samefile(one) for one in inputs):
+        raise AhrsdError(f"{path}: is what this command reads; give another name")
     if not path.parent.is_dir():
         raise AhrsdError(f"{path}: {path.parent} is no folder; make it first")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
@@ -71,14 +84,15 @@ def refuse_unwritable(target: str | Path | None) -> None:
         click.echo(f"{path}: exists and will be replaced", err=True)
 
 
-def make_folder(folder: Path, names: Iterable[str]) -> None:
+def make_folder(folder: Path, names: Iterable[str], inputs: Iterable[Path | None] = ()) -> None:
     """The folder of a `--report`, and every file in it as `refuse_unwritable` looks at it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise AhrsdError(f"{folder}: cannot be made: {error.strerror}") from error
+    read = tuple(inputs)
     for name in names:
-        refuse_unwritable(folder / name)
+        refuse_unwritable(folder / name, read)
 
 
 def write_text(target: Path, text: str) -> None:

@@ -391,6 +391,11 @@ OVERLAP_S = 20.0
 SAME_MOTION = 0.8
 #: Standard deviations: if all parameters differ by less, two effects are the same.  Source: chosen.
 SAME_SIGMAS = 4.0
+#: Deviation of the difference of what two effects add over time, as a share of what one adds, below
+#: which they act at the same times, beyond the uncertainty of their sizes; the same of the time
+#: series of two unknown causes, which a free process draws.  Source: chosen; a step in the middle
+#: of 200 s that comes 3 s later differs by 0.25.
+SAME_COURSE, SAME_UNKNOWN = 0.25, 0.5
 
 # --- the calibration -----------------------------------------------------------------------------
 #: Prior standard deviations of the 11 parameters: 5 of soft iron about the identity, 3 of hard iron

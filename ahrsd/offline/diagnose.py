@@ -21,7 +21,7 @@ from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, from_text
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
-from ahrsd.offline.track import check_track, track_of
+from ahrsd.offline.track import check_spec_noise, check_track, track_of
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import TABLE_ROWS, on_one_thread
@@ -164,18 +164,20 @@ def diagnose_recording(
     """
     known, unused = (Spec(), []) if spec is None else load_spec(spec)
     track, notes = load_track(real, rate_hz, progress, spec=known, columns=columns)
-    notes = [*unused, *notes]
+    known, noise_notes = check_spec_noise(track, known)
+    notes = [*unused, *notes, *noise_notes]
     if simulation is None:
         found = _diagnose_track(real, track, known)
         return replace(found, notes=(*notes, *found.notes))
-    simulated, _ = load_track(simulation, rate_hz, spec=known)
+    simulated, simulation_notes = load_track(simulation, rate_hz, spec=known)
+    notes += [f"of the simulation: {note}" for note in simulation_notes]
     try:
         overlap = align(track, simulated)
     except ValueError as error:
         raise RecordingError(simulation, str(error), "bring a simulation of this motion") from None
     found = _diagnose_track(real, overlap.real, known)
     own = _diagnose_track(simulation, overlap.simulated, Spec())
-    difference = remove_common_findings(found, own)
+    difference = remove_common_findings(found, own, overlap.other_axes)
     return replace(difference, notes=(*notes, *overlap.notes, *difference.notes))
 
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ahrsd.diagnosis.columns import roles
+from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.repaired_model import forward, injection
 from ahrsd.diagnosis.repaired_model.injection import inject_terms, readings_of, terms_json
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
@@ -31,9 +32,20 @@ def add_effects(
         columns = injection.columns_for(effects, experiment.samples.time_s, seed)
         readings = readings_of(experiment, columns)
         terms = [one.term(readings) for one in requests]
+        for term in terms:
+            _check_onset(term, readings.time_s)
     except ValueError as error:
         raise AhrsdError(f"--effect: {error}") from None
     return inject_terms(experiment, readings, terms), terms_json(terms)
+
+
+def _check_onset(term: Term, time_s: Array) -> None:
+    """ValueError where the effect would begin before or after all samples."""
+    onset_s, last_s = term.setting.get("onset_s"), float(time_s[-1])
+    if isinstance(onset_s, int | float) and not time_s[0] <= onset_s <= last_s:
+        raise ValueError(
+            f"{term.identifier}: onset_s is {onset_s:g}, the recording ends at {last_s:.6g} s"
+        )
 
 
 def simulate_along_motion(

@@ -22,12 +22,14 @@ from ahrsd.diagnosis.answer.diagnosis import (
     Validation,
 )
 from ahrsd.diagnosis.answer.text import (
+    agrees,
     component_lines,
     direction_text,
     evidence_text,
     headline,
     ordinary_residual,
     ordinary_text,
+    residual_is_drawn,
     sensitivity_text,
     setting_text,
     size_text,
@@ -275,6 +277,11 @@ _BY_NAME = (
     "How much every effect alone would explain; findings in blue. The line is the evidence that a "
     "finding needs.",
 )
+#: added below what is drawn before and after if a residual remains
+_WITH_RESIDUAL = (
+    'What remains without a name is in the model "after" as a free time series; the repaired model '
+    "in model.json does not have it."
+)
 #: added below the spectrum where the blue curve is the worse one
 _WORSE_SPECTRUM = (
     "Here it is farther from 1 after than before: the findings explain the readings in their "
@@ -325,6 +332,7 @@ def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
         title=f"Diagnosis of {found.recording}",
         found=found,
         verdict=verdict(found),
+        agrees=agrees(found),
         findings=[_finding(found, one) for one in found.findings],
         unexplained=_unexplained(found),
         ordinary=None if ordinary is None else ordinary_text(ordinary),
@@ -336,6 +344,7 @@ def write_diagnosis_report(path: Path, found: Diagnosis, command: str) -> None:
             (_STATISTICS.get(name, name.replace("_", " ")), check)
             for name, check in found.posterior_predictive.items()
         ],
+        with_residual=_WITH_RESIDUAL if residual_is_drawn(found) else "",
         baseline=_baseline(found),
         command=command,
     )
@@ -385,10 +394,10 @@ def _contribution(found: Diagnosis, one: Finding) -> Picture | None:
 
 def _unexplained(found: Diagnosis) -> list[tuple[str, str]]:
     left = found.unexplained
-    if left.where is None or not (left.detected or left.ordinary):
+    if not (left.detected or left.ordinary):
         return []
-    rows = [("where", where_text(left.where))]
-    if left.where.direction is not None:
+    rows = [] if left.where is None else [("where", where_text(left.where))]
+    if left.where is not None and left.where.direction is not None:
         rows.append(("along", direction_text(left.where.direction)))
     if left.size is not None:
         rows.append(("size", size_text(left.size, left.unit)))
@@ -404,6 +413,11 @@ def _unexplained(found: Diagnosis) -> list[tuple[str, str]]:
         )
         for s in left.follows
     ]
+    if left.priors is not None:
+        rows.append(("evidence", evidence_text(left.priors)))
+    if left.heldout is not None:
+        gain = f"{left.heldout.nll_gain_per_sample:+.4f} nats per sample"
+        rows.append(("on data not fitted", f"{gain} with a free time series in its place"))
     return rows
 
 
@@ -439,16 +453,21 @@ def _pictures(found: Diagnosis) -> list[Picture]:
     if drawn is None:
         return []
 
-    worse = spectrum_is_worse(drawn)
+    worse, remains = spectrum_is_worse(drawn), residual_is_drawn(found)
     shots = [
-        (partial(residual, found, drawn), *_OVER_TIME),
+        (partial(residual, found, drawn), *_longer(_OVER_TIME, remains, _WITH_RESIDUAL)),
         (partial(spectrum, drawn), *_longer(_BY_FREQUENCY, worse, _WORSE_SPECTRUM)),
     ]
     if drawn.evidence:
         longer = grey_ones_are_longer(found, drawn)
         shots.append((partial(evidence, found, drawn), *_longer(_BY_NAME, longer, _LOST)))
     if found.regime_map:
-        shots.append((partial(regime_map, found.regime_map), *_BY_CONDITION))
+        shots.append(
+            (
+                partial(regime_map, found.regime_map),
+                *_longer(_BY_CONDITION, remains, _WITH_RESIDUAL),
+            )
+        )
     if found.validation is not None and found.findings:
         shots.append((partial(validation, found.validation), *_NOT_FITTED))
     if drawn.courses:

@@ -305,10 +305,17 @@ class Disturbances:
 
 
 def disturbed(experiment: Experiment, wanted: Disturbances, rng: np.random.Generator) -> Experiment:
-    """The experiment with what is wanted added; the very same object where nothing is."""
+    """The experiment with what is wanted added; the very same object where nothing is.
+
+    ValueError where something would come before or after all samples.
+    """
     if wanted == Disturbances():
         return experiment
     time_s = experiment.samples.time_s - experiment.samples.time_s[0]
+    for name in ("magnet_at_s", "step_at_s", "gap_at_s"):
+        at_s = getattr(wanted, name)
+        if at_s is not None and not 0.0 <= at_s <= time_s[-1]:
+            raise ValueError(f"{name} is {at_s:g}: the recording lasts {time_s[-1]:.6g} s")
     raw = experiment.samples.raw_b_gauss.copy()
     truth = experiment.truth
     if wanted.outlier_fraction > 0:

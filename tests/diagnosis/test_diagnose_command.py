@@ -11,6 +11,7 @@ from ahrsd.diagnosis.external_simulation import align
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.offline.diagnose import load_spec, load_track
+from ahrsd.offline.track import check_spec_noise
 from ahrsd.recording.table import write_table
 from ahrsd.simulation import ScenarioSettings, simulate
 
@@ -77,6 +78,24 @@ def test_current_is_found_and_all_files_are_written(run, saved, clean, tmp_path,
     again = tmp_path / "again.csv"
     model = ("--model", str(folder / "model.json"), "--along", str(path))
     assert run("simulate", *model, "-o", str(again)) == 0
+
+
+def test_report_of_wrong_axes_leaves_no_model_of_another_recording(run, saved, clean, tmp_path):
+    folder, spec = tmp_path / "report", tmp_path / "my spec.json"
+    folder.mkdir()
+    (folder / "model.json").write_text("of another recording")
+    spec.write_text('{"rate_hz": 25}')
+    wrong = saved({**clean, "gyro_x_rad_s": -clean["gyro_x_rad_s"]}, "wrong.csv")
+    options = ("--spec", str(spec), "--columns", "time=time_s:s")
+    assert run("diagnose", str(wrong), *options, "--report", str(folder)) == 0
+    assert json.loads((folder / "diagnosis.json").read_text())["findings"][0]["effect"] == (
+        "frame_error"
+    )
+    assert not (folder / "model.json").exists()
+    made_by = (
+        "diagnose wrong.csv --spec &#39;my spec.json&#39; --columns time=time_s:s --report report"
+    )
+    assert made_by in (folder / "report.html").read_text()
 
 
 @pytest.mark.slow
@@ -238,6 +257,25 @@ def test_spec_rate_that_differs_from_the_time_stamps_is_noted(saved, clean, rati
     _, notes = load_track(saved(clean), spec=Spec(rate_hz=ratio * rate_hz))
     assert len([note for note in notes if "the stamps are used" in note]) == lines
     assert not any("--rate" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("spec", "used", "words"),
+    [
+        (Spec(sigma_mag_gauss=1e-3, sigma_gyro_rad_s=1e-5), True, None),
+        (Spec(sigma_mag_gauss=0.05), True, "check its unit; only noise that is slow"),
+        (Spec(sigma_mag_gauss=1e-4), True, "what the spec does not explain is a mismatch"),
+        (Spec(sigma_mag_gauss=1e-5), False, "it was left out; check its unit, or the sensor"),
+        (Spec(field_gauss=0.5), True, "the spec's field_gauss changes nothing"),
+        (Spec(sigma_gyro_rad_s=0.05), True, "the spec says sigma_gyro_rad_s = 0.05, but"),
+    ],
+)
+def test_spec_noise_that_the_readings_contradict_is_noted(saved, clean, spec, used, words):
+    track, _ = load_track(saved(clean))
+    left, notes = check_spec_noise(track, spec)
+    assert left == (spec if used else Spec())
+    assert len(notes) == (words is not None)
+    assert all(words in note for note in notes)
 
 
 def test_missing_recording_is_refused(tmp_path):

@@ -70,14 +70,15 @@ def command(
     from ahrsd.offline.diagnose import load_model
     from ahrsd.report.summary import estimate_lines
 
-    refuse_unwritable(json_path)
-    refuse_unwritable(figure_path)
+    read = (recording, model_path, path)
+    refuse_unwritable(json_path, read)
+    refuse_unwritable(figure_path, read)
     if figure_path is not None and method != _ALL:
         raise AhrsdError("--figure compares the methods: give --method all with it")
     config = _placed(load_config(path) if path else Config(), position, date)
     if folder is not None:
         _refuse_page(folder)
-        make_folder(folder, ("report.html", "calibration.json"))
+        make_folder(folder, ("report.html", "calibration.json"), read)
     model = None if model_path is None else load_model(model_path)
     with byte_progress(recording) as progress:
         result = calibrate(

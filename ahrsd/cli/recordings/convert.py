@@ -54,9 +54,7 @@ def command(
         raise AhrsdError("nothing to do: give -o OUT.parquet, or --list to see what FILE holds")
     if output.suffix != ".parquet":
         raise AhrsdError(f"-o {output}: the table is written as Parquet; name it *.parquet")
-    if output.exists() and recording.exists() and output.samefile(recording):
-        raise AhrsdError(f"-o {output}: is the recording itself; give another name")
-    refuse_unwritable(str(output))
+    refuse_unwritable(output, [recording])
     with byte_progress(recording) as progress:
         table = convert_recording(recording, Choice(topics, compass, columns), rate_hz, progress)
     save(table, output)

@@ -59,10 +59,13 @@ def command(
     field; dead reckoning. "Before" is what the device has in its registers. Exit 1 where the
     calibration is worse than that.
     """
-    refuse_unwritable(json_path)
-    refuse_unwritable(figure_path)
+    read = (recording, calibration_path)
+    refuse_unwritable(json_path, read)
+    refuse_unwritable(figure_path, read)
     if folder is not None:
-        json_path, figure_path = _into(folder, json_path, figure_path)
+        make_folder(folder, ("evaluation.json", "evaluation.png"), read)
+        json_path = json_path or str(folder / "evaluation.json")
+        figure_path = figure_path or folder / "evaluation.png"
     from ahrsd.evaluation import judging
     from ahrsd.offline.evaluate import evaluate
 
@@ -86,13 +89,6 @@ def command(
         )
         click.echo("\n".join(lines))
     raise SystemExit(EXIT_DONE if found[0].better else EXIT_NO)
-
-
-def _into(
-    folder: Path, json_path: str | None, figure_path: Path | None
-) -> tuple[str | None, Path | None]:
-    make_folder(folder, ("evaluation.json", "evaluation.png"))
-    return json_path or str(folder / "evaluation.json"), figure_path or folder / "evaluation.png"
 
 
 def _draw(path: Path, found: Evaluation) -> None:

@@ -45,8 +45,8 @@ def command(
     from ahrsd.report.summary import summary_json, summary_lines
     from ahrsd.viewer.sink import RerunSink
 
-    refuse_unwritable(json_path)
-    refuse_unwritable(rerun_path)
+    refuse_unwritable(json_path, (recording, path))
+    refuse_unwritable(rerun_path, (recording, path))
     config = load_config(path) if path else Config()
     viewer = None if rerun_path is None else RerunSink(rerun_path, wait=True)
     try:

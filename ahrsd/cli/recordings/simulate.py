@@ -70,7 +70,9 @@ def command(**options: object) -> None:
     that an effect needs (a motor's current, a temperature, ...) are invented and written as well.
     """
     wanted = _Options(**cast("dict[str, Any]", options))
-    refuse_unwritable(wanted.output)
+    read = (wanted.gyro_path, wanted.model, wanted.along_path)
+    for output in (wanted.output, wanted.truth):
+        refuse_unwritable(output, read)
     if (wanted.model is None) != (wanted.along_path is None):
         raise AhrsdError("--model and --along need each other")
     if wanted.model is not None and wanted.along_path is not None:
@@ -105,6 +107,11 @@ class _Options:
     along_path: Path | None
     columns: ColumnMap
 
+    @property
+    def truth(self) -> Path:
+        """The file with the truth, next to the recording."""
+        return Path(f"{self.output}.truth.json")
+
 
 def _simulate_scenario(wanted: _Options) -> None:
     """Write a scenario's experiment, its effects in it, and its truth beside it."""
@@ -115,8 +122,9 @@ def _simulate_scenario(wanted: _Options) -> None:
     truth: dict[str, object] = {}
     if wanted.effects:
         experiment, truth["effects"] = add_effects(experiment, wanted.effects, wanted.seed)
+    wanted.truth.unlink(missing_ok=True)  # the last recording's is never next to this one
     write_experiment(wanted.output, experiment)
-    write_json(f"{wanted.output}.truth.json", {**truth_json(experiment, made_from), **truth})
+    write_json(str(wanted.truth), {**truth_json(experiment, made_from), **truth})
     count, name = len(experiment), experiment.name
     click.echo(f"{wanted.output}: {counted(count, 'sample')} of {name}; truth next to it")
 
@@ -192,6 +200,7 @@ def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None
     columns, refused = simulate_along_motion(model, recording, read, seed)
     for note in [*notes, *refused]:
         click.echo(f"{recording}: {note}", err=True)
+    wanted.truth.unlink(missing_ok=True)
     write_columns(output, columns)
     truth = {
         "schema": "ahrsd.truth/1",
@@ -202,7 +211,7 @@ def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None
         "effects": terms_json(model.terms),
         "made_from": {"model": model_path.name, "along": recording.name, "seed": seed},
     }
-    write_json(f"{output}.truth.json", truth)
+    write_json(str(wanted.truth), truth)
     click.echo(
         f"{output}: {counted(len(columns['time_s']), 'sample')} of {truth['name']}; truth next to "
         "it"

@@ -69,7 +69,7 @@ def answer_lines(found: Diagnosis) -> list[str]:
     if found.posterior_predictive:
         count = len(found.posterior_predictive)
         state = f"fails {', '.join(failed)}" if failed else "passes all of them"
-        out += ["", f"checks: {count} statistics; the repaired model {state}"]
+        out += ["", f"checks: {count} statistics; {_checked(found)} {state}"]
     if found.omnibus:
         out.append(f"innovations: {_whiteness(found)}")
     return out + [f"note: {note}" for note in found.notes]
@@ -83,8 +83,21 @@ def _whiteness(found: Diagnosis) -> str:
         return "white, Gaussian and of constant variance"
     return (
         f"tests failed without the findings: {', '.join(before) or 'none'}; "
-        f"by the repaired model: {', '.join(after) or 'none'}"
+        f"by {_checked(found)}: {', '.join(after) or 'none'}"
     )
+
+
+def residual_is_drawn(found: Diagnosis) -> bool:
+    """Whether what is compared "after" the findings has the remaining residual in it.
+
+    It is drawn as a free time series; the model file, and what is simulated with it, lacks it.
+    """
+    return found.unexplained.detected or ordinary_residual(found) is not None
+
+
+def _checked(found: Diagnosis) -> str:
+    free = " with the remaining residual as a free time series" if residual_is_drawn(found) else ""
+    return f"the repaired model{free}"
 
 
 def verdict(found: Diagnosis) -> str:
@@ -112,6 +125,12 @@ def verdict(found: Diagnosis) -> str:
     text = " and ".join(parts) or "recording and simulation differ (see the notes)"
     rest = f"; the remaining residual is {ordinary_words}" if ordinary_words else ""
     return f"MISMATCH: {text} (p = {found.p_value:.1g}){rest}"
+
+
+def agrees(found: Diagnosis) -> bool:
+    """Whether the verdict is good: nothing is left out, and nothing undecided or unlike."""
+    unlike = bool(found.failed_checks) and ordinary_residual(found) is None
+    return not found.mismatch and found.undecided is None and not unlike
 
 
 def headline(finding: Finding) -> str:

@@ -33,6 +33,10 @@ _OWN_OUTPUT = re.compile(
 )
 #: largest number of characters of a displayed name
 LABEL_CHARACTERS = 48
+#: values of a column that are looked at before all of them are
+_LOOKED_AT = 8
+#: names whose role is remembered: more than a table may have
+_NAMES_REMEMBERED = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,13 +126,20 @@ def role_of(name: str, values: Array) -> str | None:
     named = _role_by_name(lower)
     if named is not None:
         return named
+    if _has_other_levels(values[:: max(len(values) // _LOOKED_AT, 1)]):  # most columns, quickly
+        return None
     known = values[np.isfinite(values)]
-    if len(known) and np.isin(known, (0.0, 1.0)).all() and known.any():
+    if len(known) and not _has_other_levels(known) and known.any():
         return "switch" if _longest_nonzero_interval(known) > priors.SWITCH_ROWS else "ping"
     return None
 
 
-@lru_cache
+def _has_other_levels(values: Array) -> bool:
+    """Whether any of the finite values is neither 0 nor 1."""
+    return bool((np.isfinite(values) & (values != 0.0) & (values != 1.0)).any())
+
+
+@lru_cache(maxsize=_NAMES_REMEMBERED)
 def _role_by_name(lower: str) -> str | None:
     return next((role for role, row in ROLES.items() if re.search(row.pattern, lower)), None)
 

@@ -237,6 +237,10 @@ class Request:
             else:
                 known = ", ".join([*names, *setting])
                 raise ValueError(f"{self.effect.identifier} has no {name}; it has {known}")
+        column = setting.get("covariate")
+        if column not in (None, *roles.SENSORS, *readings.covariates):
+            there = ", ".join(readings.covariates)
+            raise ValueError(f"{self.effect.identifier}: no column {column}; there is {there}")
         return Term(self.effect.identifier, value, np.zeros(len(names)), setting)
 
 

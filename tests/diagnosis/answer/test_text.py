@@ -9,6 +9,7 @@ import pytest
 from effect_motion import moving
 
 from ahrsd.diagnosis.answer.diagnosis import (
+    Check,
     Component,
     Diagnosis,
     Finding,
@@ -137,6 +138,49 @@ def test_report_page_distinguishes_ordinary_residual_from_unknown(tmp_path):
     assert "Unknown, here" in said
     assert WHY in said
     assert "Remaining residual, ordinary" not in said
+
+
+@pytest.mark.parametrize("within", [True, False])
+def test_page_has_the_components_of_a_residual_that_is_at_no_place(tmp_path, within):
+    page, found = tmp_path / "report.html", diagnosis_of(remaining(80e-3, within=within))
+    placeless = replace(found, unexplained=replace(found.unexplained, where=None))
+    write_diagnosis_report(page, placeless, "ahrsd diagnose walk.csv")
+    said = page.read_text(encoding="utf-8")
+    assert ("Unknown, here" in said) != within
+    for line in component_lines(found.unexplained.ordinary):
+        assert line in said
+
+
+@pytest.mark.parametrize("size", [8e-3, 80e-3, None])
+def test_checks_of_a_model_with_a_free_residual_say_so(tmp_path, size):
+    """What is simulated with the model file does not have that residual."""
+    found = diagnosis_of(remaining(size or 0.0, within=size == 8e-3))
+    if size is None:
+        found = replace(found, unexplained=Unexplained(False), mismatch=False)
+    check = Check(1.0, (0.5, 2.0), inside_before=False, inside_after=True)
+    found = replace(found, posterior_predictive={"line": check})
+    said = next(line for line in answer_lines(found) if line.startswith("checks:"))
+    free = "" if size is None else " with the remaining residual as a free time series"
+    assert said == f"checks: 1 statistics; the repaired model{free} passes all of them"
+    write_diagnosis_report(tmp_path / "report.html", found, "ahrsd diagnose walk.csv")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert ("the repaired model in model.json does not have it" in page) == (size is not None)
+
+
+def test_page_marks_only_an_agreement_as_good(tmp_path):
+    """Undecided, or unlike its simulations in a statistic, is neither good nor bad."""
+    page, agreeing = tmp_path / "report.html", diagnosis_of(remaining(8e-3))
+    plain = replace(agreeing, unexplained=Unexplained(False))
+    unlike = {"line": Check(9.0, (1.0, 2.0), inside_before=False, inside_after=False)}
+    marks = {
+        "yes": (agreeing, plain, replace(agreeing, posterior_predictive=unlike)),
+        "": (replace(plain, posterior_predictive=unlike), replace(plain, undecided="too short")),
+        "no": (replace(plain, mismatch=True), diagnosis_of(remaining(80e-3, within=False))),
+    }
+    for mark, diagnoses in marks.items():
+        for one in diagnoses:
+            write_diagnosis_report(page, one, "ahrsd diagnose walk.csv")
+            assert f'<p class="verdict {mark}">' in page.read_text(encoding="utf-8")
 
 
 def test_residual_without_a_single_component_is_reported_as_a_whole():

@@ -55,6 +55,9 @@ def test_columns_of_two_values_are_switches_or_pings():
     assert roles.role_of("x1", BITS) == "switch"
     assert roles.role_of("x1", PULSES) == "ping"
     assert roles.role_of("x1", 0 * BITS) is None
+    other = BITS.copy()
+    other[len(other) // 8 + 1] = 2.0  # one value among the many of a switch
+    assert roles.role_of("x1", other) is None
     assert roles.role_of("sonar_ping", BITS) == "ping"
     assert roles.role_of("lamp", BITS) == "switch"
 

@@ -171,3 +171,49 @@ def test_bad_use_is_refused_in_one_line(run, tmp_path, monkeypatch, capsys, argu
     assert run("simulate", "-o", "y.csv", *arguments) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "y.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--effect", "motor_current_field=covariate=foo_a"), "no column foo_a; there is motor_"),
+        (("--effect", "hard_iron_step=onset_s=500"), "onset_s is 500, the recording ends at 40 s"),
+        (("--step", "500"), "step_at_s is 500: the recording lasts 39.96 s"),
+        (("--step", "nan"), "step_at_s is nan: the recording lasts 39.96 s"),
+        (("--magnet", "-3"), "magnet_at_s is -3: the recording lasts 39.96 s"),
+        (("--gap", "41"), "gap_at_s is 41: the recording lasts 39.96 s"),
+    ],
+)
+def test_request_that_would_change_no_sample_is_refused(run, tmp_path, capsys, options, words):
+    path = tmp_path / "x.csv"
+    assert run("simulate", "mam", "-o", path, *SHORT, *options) == 2
+    assert words in capsys.readouterr().err
+    assert not path.exists()
+
+
+def test_recording_that_is_read_is_not_replaced_by_its_simulation(run, tmp_path, capsys):
+    path, model = tmp_path / "dive.csv", tmp_path / "model.json"
+    assert run("simulate", "mam", "-o", path, *SHORT) == 0
+    model.write_text("{}")
+    before = path.read_bytes()
+    (tmp_path / "link.csv").symlink_to(path)
+    for output in (path, tmp_path / "link.csv", model):
+        assert run("simulate", "--model", model, "--along", path, "-o", output) == 2
+        assert "is what this command reads; give another name" in capsys.readouterr().err
+    assert path.read_bytes() == before
+    assert model.read_text() == "{}"
+
+
+def test_truth_of_the_last_recording_does_not_stay_beside_one_that_was_cut_short(
+    run, tmp_path, monkeypatch
+):
+    path = tmp_path / "x.csv"
+    assert run("simulate", "mam", "-o", path, *SHORT, "--effect", "hard_iron_step") == 0
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ahrsd.cli.recordings.simulate.write_json", killed)
+    assert run("simulate", "mam", "-o", path, *SHORT) == 130
+    assert path.exists()
+    assert not (tmp_path / "x.csv.truth.json").exists()
