@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 import math
+from typing import Any
 
 import click
 
@@ -79,7 +80,10 @@ class Number(click.FloatRange):
     """A finite number: a range alone lets `nan` pass, which is neither below nor above."""
 
     def convert(
-        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+        self,
+        value: Any,  # noqa: ANN401 - as in click
+        param: click.Parameter | None,
+        ctx: click.Context | None,
     ) -> float:
         """See `click.ParamType`."""
         number = float(super().convert(value, param, ctx))
