@@ -186,8 +186,10 @@ STREAM = (
         "",
         0.0,
         Level.CANDIDATE,
-        meaning="times at which the device's clock went backwards",
-        advice="the device's clock went back ({v:.0f} x): it was reset; start again",
+        meaning="times at which the device's clock went backwards, but by a reset that a program "
+        "on a share asked for",
+        advice="the device's clock went back ({v:.0f} x): it was reset; check its supply, then "
+        "restart ahrsd",
     ),
     least(
         "stream_health.rate",

@@ -62,6 +62,7 @@ from drivers.vn100.messages import Reply, encode
 _PTMX = os.makedev(5, 2)
 _PTY_SLAVE_MAJORS = range(136, 144)  # Linux, Documentation/admin-guide/devices.txt
 _SHOWN = 80
+_NAMED = 3  # processes that a message names
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +187,7 @@ LISTEN_S = 0.3
 _PATIENT_S = 1.1  # where nothing may be asked: a stream of 1 Hz must be heard
 SCANNED_BAUD = (115200, 921600, 460800, 230400, 128000, 57600, 38400, 19200, 9600)
 _URL = re.compile(r"^(socket|rfc2217):/+")  # a Path has only one slash left
+_ON_NETWORK = re.compile(r"^([A-Za-z][\w+.-]*:/+|[^/]+:\d+$)")  # what only looks like one of these
 _WHOLE_URL = re.compile(r"^(socket|rfc2217)://(\[[^\]]+\]|[^:/\[\]]+):\d+/?(\?.*)?$")
 _KEEP_ALIVE = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 3, "TCP_KEEPCNT": 3}  # seconds, seconds, times
 _TELNET_POLL_S = 0.005
@@ -206,7 +208,9 @@ class PortBusy(PortError):
     """Somebody else has the port; `holders` are those that can be seen."""
 
     def __init__(self, path: str, others: tuple[Holder, ...]) -> None:
-        who = ", ".join(map(str, others)) or "a process that cannot be seen from here"
+        who = ", ".join(map(str, others[:_NAMED])) or "a process that cannot be seen from here"
+        if more := len(others[_NAMED:]):
+            who += f" and {more} more"
         super().__init__(f"{path} is in use by {who}: stop it first")
         self.holders = others
 
@@ -572,6 +576,11 @@ def _why(path: str, error: Exception) -> PortError:
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.EBUSY, errno.EAGAIN):
         return PortBusy(path, holders(path))
+    if number == errno.ENOENT and _ON_NETWORK.match(path):
+        return PortUnusable(
+            f"{path} is no port: one of a device server is socket://HOST:PORT or "
+            "rfc2217://HOST:PORT"
+        )
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
         return PortAbsent(f"{path} does not exist: is the device plugged in, is the name right?")
     if number in (errno.EACCES, errno.EPERM):

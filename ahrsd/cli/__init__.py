@@ -9,6 +9,8 @@ as an `AhrsdError`.
 from __future__ import annotations
 
 import importlib
+import math
+from typing import Any
 
 import click
 
@@ -72,6 +74,22 @@ class WholeGroup(click.Group):
             formatter.write_dl(
                 [(name, one.get_short_help_str(_WHOLE)) for name, one in commands if one]
             )
+
+
+class Number(click.FloatRange):
+    """A finite number: a range alone lets `nan` pass, which is neither below nor above."""
+
+    def convert(
+        self,
+        value: Any,  # noqa: ANN401 - as in click
+        param: click.Parameter | None,
+        ctx: click.Context | None,
+    ) -> float:
+        """See `click.ParamType`."""
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
+        return number
 
 
 class LazyGroup(click.Group):

@@ -109,7 +109,19 @@ class Section(BaseModel):
         """TOML has no paths: text becomes one where a path is wanted; `~` is the home folder."""
         name = info.field_name or ""
         wants_path = cls.model_fields[name].annotation == Path | None
-        return Path(value).expanduser() if wants_path and isinstance(value, str) else value
+        return _path(value) if wants_path and isinstance(value, str) else value
+
+
+def _path(text: str) -> Path:
+    """Raises ValueError where no file can have that name."""
+    if not text:
+        raise ValueError("is empty: write a path, or leave the key out")
+    if "\0" in text:
+        raise ValueError(f"{text!r} has a character that no path can have")
+    try:
+        return Path(text).expanduser()
+    except RuntimeError as error:
+        raise ValueError(f"{text!r}: nobody of that name has a home folder here") from error
 
 
 class DeviceSection(Section):

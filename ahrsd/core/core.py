@@ -229,7 +229,10 @@ class Core:
         if self.source.take_restart():
             newest_s = self.stream.newest_s  # unknown device: no proof of a restart
             started_s = self._host_s - (self.at_s if newest_s is None else newest_s)
-            self._on_device_reset("its time fell", self.at_s, self.clients.reset_by(started_s))
+            client = self.clients.reset_by(started_s)
+            if client:
+                self.stream.excuse_restart()
+            self._on_device_reset("its time fell", self.at_s, client)
 
     def _raise_doubt(self, reason: str, *, jumped: bool = False) -> None:
         """From now on samples may be of another device, for this reason; empty: no doubt."""

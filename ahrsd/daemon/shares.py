@@ -623,24 +623,29 @@ def _open_pty(share: ShareSection, before: str = "") -> tuple[int, str]:
 def _is_somebodys(path: Path, ours: str) -> bool:
     """Whether the name is taken by anything but a link to a pty of ours, or of a killed run."""
     try:
-        kind = path.lstat().st_mode
+        link = path.lstat()
     except OSError:
         return False  # not there, or told when the link is made
-    if not stat.S_ISLNK(kind) or not (target := str(path.readlink())).startswith("/dev/pts/"):
+    if not stat.S_ISLNK(link.st_mode) or not (target := str(path.readlink())).startswith(
+        "/dev/pts/"
+    ):
         return True
-    return target != ours and _is_port(target)
+    return target != ours and _is_port(target, link.st_mtime_ns)
 
 
-def _is_port(pty: str) -> bool:
-    """Whether it is another program's port: there, and raw.
+def _is_port(pty: str, named_ns: int) -> bool:
+    """Whether it is another program's port: there, raw, and there since before it was named.
 
-    What a killed run left is gone with it; its number may be a person's terminal by now.
+    What a killed run left is gone with it. Its number may be a person's terminal by now, a shell's
+    prompt (raw as well), or a port that this run has just opened for another share.
     """
     try:
         slave = os.open(pty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:
         return error.errno == errno.EBUSY  # a port, and somebody has it for itself
     try:
+        if os.fstat(slave).st_ctime_ns > named_ns:  # made after the link: the number came again
+            return False
         return not termios.tcgetattr(slave)[_LOCAL_FLAGS] & termios.ICANON
     except termios.error:  # gone at this moment
         return False

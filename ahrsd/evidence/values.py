@@ -24,7 +24,10 @@ CIRCLES = "drive at least two full circles in calm surroundings"
 
 @dataclass(frozen=True, slots=True)
 class HealthFacts:
-    """Health of the stream: shares of messages and samples, counts, rate."""
+    """Health of the stream: shares of messages and samples, counts, rate.
+
+    negative_dt: how often the device's time fell without a program that asked for a reset
+    """
 
     crc_error_rate: float
     drop_rate: float

@@ -6,12 +6,14 @@ by its name is no recording is counted, not opened.
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import os
 import shutil
+import stat
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -20,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from ahrsd.errors import AhrsdError
+from ahrsd.foreign_file import kind_of
 from ahrsd.printable import line, printable
 
 SUFFIXES = (
@@ -65,9 +68,17 @@ class Archive:
     root: str
     patterns: tuple[str, ...] = ()
 
-    def entries(self, left_out: Callable[[str], None] = lambda _: None) -> Iterator[ArchiveEntry]:
-        """Every recording; `left_out` is told the names of other files.  AhrsdError."""
-        listed = _remote(self.root) if is_remote(self.root) else _on_disk(Path(self.root))
+    def entries(
+        self,
+        left_out: Callable[[str], None] = lambda _: None,
+        linked: Callable[[str], None] = lambda _: None,
+    ) -> Iterator[ArchiveEntry]:
+        """Every recording.  AhrsdError.
+
+        left_out: told the names of other files; linked: told the folders that are only linked to,
+        which are not entered: they may lead round in a circle, or out of the archive
+        """
+        listed = _remote(self.root) if is_remote(self.root) else _on_disk(Path(self.root), linked)
         for entry in listed:
             name = entry.url.rpartition("/")[2]
             if entry.is_folder or self._wanted(name):
@@ -87,7 +98,7 @@ def is_remote(root: str) -> bool:
     return "://" in root
 
 
-def _on_disk(root: Path) -> Iterator[ArchiveEntry]:
+def _on_disk(root: Path, linked: Callable[[str], None]) -> Iterator[ArchiveEntry]:
     if not root.is_dir():
         what = "is no folder" if root.exists() else "does not exist"
         raise AhrsdError(f"{printable(root, 500)}: {what}; give the folder of the recordings")
@@ -105,25 +116,37 @@ def _on_disk(root: Path) -> Iterator[ArchiveEntry]:
             for one in found:
                 if one.name.startswith("."):
                     continue
-                if not one.is_dir():
-                    yield from _file(one, names)
-                elif Path(one.path, _ROS_2).exists():
+                if not stat.S_ISDIR(_mode(Path(one.path))):
+                    yield _file(one, names)
+                elif _mode(Path(one.path, _ROS_2)):
                     yield _folder(Path(one.path), names)
-                elif not one.is_symlink():
+                elif one.is_symlink():
+                    linked(one.path)
+                else:
                     waiting.append((one.path, (*names, one.name)))
 
 
-def _file(one: os.DirEntry[str], names: tuple[str, ...]) -> Iterator[ArchiveEntry]:
+def _mode(path: Path) -> int:
+    """What it is; 0 where that cannot be known, as of a link to nothing or to itself."""
+    try:
+        return path.stat().st_mode
+    except OSError:
+        return 0
+
+
+def _file(one: os.DirEntry[str], names: tuple[str, ...]) -> ArchiveEntry:
     try:
         status = one.stat()
     except OSError:  # a link to nothing: its row says what is wrong
-        yield ArchiveEntry(one.path, 0, "", names)
-        return
-    yield ArchiveEntry(one.path, status.st_size, str(status.st_mtime_ns), names, status.st_mtime)
+        return ArchiveEntry(one.path, 0, "", names)
+    return ArchiveEntry(one.path, status.st_size, str(status.st_mtime_ns), names, status.st_mtime)
 
 
 def _folder(path: Path, names: tuple[str, ...]) -> ArchiveEntry:
-    states = [part.stat() for part in path.iterdir()]
+    try:
+        states = [part.stat() for part in _files(path)]
+    except OSError:  # as above
+        return ArchiveEntry(str(path), 0, "", names, is_folder=True)
     last = max(state.st_mtime_ns for state in states)
     size = sum(state.st_size for state in states)
     return ArchiveEntry(str(path), size, str(last), names, last / 1e9, is_folder=True)
@@ -221,11 +244,21 @@ def sweep() -> None:
 
 
 def pieces(path: Path, size: int = 1 << 20) -> Iterator[bytes]:
-    """The bytes of a recording, of a folder those of its files in order.  OSError."""
-    files: Sequence[Path] = sorted(path.iterdir()) if path.is_dir() else (path,)
-    for one in files:
-        if path.is_dir():
-            yield one.name.encode() + b"\0"
+    """The bytes of a recording, of a folder those of its files in order.  OSError.
+
+    Only regular files are opened: a FIFO would be waited for without end.
+    """
+    is_folder = path.is_dir()
+    for one in _files(path) if is_folder else (path,):
+        if is_folder:
+            yield os.fsencode(one.relative_to(path)) + b"\0"
+        if kind := kind_of(one.stat().st_mode):
+            raise OSError(errno.EINVAL, f"is {kind}, not a regular file", str(one))
         with one.open("rb") as file:
             while piece := file.read(size):
                 yield piece
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files of a recording that is a folder, those of its own folders too.  OSError."""
+    return sorted(one for one in folder.rglob("*") if not one.is_dir())

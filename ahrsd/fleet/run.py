@@ -15,6 +15,7 @@ from __future__ import annotations
 import collections
 import hashlib
 import os
+import re
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
+_DIGITS = re.compile(r"[0-9]+")
 ROLES = ("vehicle", "place", "serial")  # what a level of folders may name
 _REMEDIES = {
     TOO_SLOW: "give more time: --limit 1h --retry-failed",
@@ -184,7 +186,7 @@ def _labels(entry: ArchiveEntry, orders: Orders) -> Row:
     """Whose recording it is: by its folders, or by what was said of all."""
     named = dict(zip(orders.levels, entry.folders))
     serial = named.get("serial", "")
-    digits = "".join(char for char in serial if char.isdigit())
+    digits = max(_DIGITS.findall(serial), key=len, default="")  # of vn100-100130608 the number
     return {
         "stamp": stamp(entry, orders),
         "recording": printable(entry.url, 1000),
@@ -193,7 +195,7 @@ def _labels(entry: ArchiveEntry, orders: Orders) -> Row:
         "options": orders.options,
         "vehicle": orders.vehicle or _text(named.get("vehicle")),
         "place": orders.place or _text(named.get("place")),
-        "serial_number": int(digits) if digits and len(digits) < 19 else None,
+        "serial_number": int(digits) if 0 < len(digits) < 19 else None,
         "tries": 1,
     }
 
@@ -251,12 +253,15 @@ class Task(Protocol):
 class Progress:
     """How far a run is.
 
-    left_out: files that by their name are no recordings, by suffix; before: recordings with a row
+    left_out: files that by their name are no recordings, by suffix; linked: how many folders are
+    only linked to, and the first of them; before: recordings with a row
     """
 
     total: int = 0
     before: int = 0
     left_out: collections.Counter[str] = field(default_factory=collections.Counter)
+    linked: int = 0
+    first_linked: str = ""
     outcomes: collections.Counter[str] = field(default_factory=collections.Counter)
     begun_s: float = field(default_factory=time.monotonic)
 
@@ -344,9 +349,13 @@ def _planned(archive: Archive, orders: Orders, known: Known) -> Progress:
     progress = Progress()
 
     def other(name: str) -> None:
-        progress.left_out[Path(name).suffix or "without a suffix"] += 1
+        progress.left_out[printable(Path(name).suffix, 20) or "without a suffix"] += 1
 
-    for entry in archive.entries(other):
+    def link(path: str) -> None:
+        progress.linked += 1
+        progress.first_linked = progress.first_linked or printable(path, 500)
+
+    for entry in archive.entries(other, link):
         progress.total += 1
         progress.before += known.holds(stamp(entry, orders))
     progress.total -= progress.before

@@ -219,7 +219,7 @@ class Stream:
         self._watch = RateWatch()
         self._parts = Parts()
         self._given_s: float | None = None
-        self._given_steps, self._given_step_s = 0, 0.0
+        self._given_steps, self._given_step_s, self._excused = 0, 0.0, 0
 
     @property
     def gaps(self) -> list[Gap]:
@@ -230,6 +230,10 @@ class Stream:
     def restarts(self) -> int:
         """How often the device's time fell."""
         return self._timeline.restarts
+
+    def excuse_restart(self) -> None:
+        """A program asked for the newest restart: it is no sign of a device in trouble."""
+        self._excused += 1
 
     @property
     def newest_s(self) -> float | None:
@@ -607,7 +611,7 @@ class Stream:
             crc_error_rate=facts.damaged / total,
             drop_rate=max(1.0 - facts.samples / max(facts.expected, 1.0), 0.0),
             saturated=facts.unusable,
-            negative_dt=self.restarts,
+            negative_dt=self.restarts - self._excused,
             rate_hz=facts.rate_hz,
         )
 

@@ -17,7 +17,7 @@ from ahrsd import __version__
 from ahrsd.cli import COMMANDS
 from ahrsd.config.config import Config, load_config
 from ahrsd.daemon import logs
-from ahrsd.errors import ConfigError, DeviceError, JournalError, RecordingError
+from ahrsd.errors import EXIT_USAGE, ConfigError, DeviceError, JournalError, RecordingError
 
 
 @pytest.fixture
@@ -267,3 +267,30 @@ class TestLogs:
             root.handlers[:], root.level = before
             for name in ("ahrsd", "drivers"):
                 logging.getLogger(name).setLevel(logging.NOTSET)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["demo", "--seconds", "nan"],
+        ["demo", "--speed", "nan"],
+        ["demo", "--seed", "-1"],
+        ["emulate", "--seed", "-1"],
+        ["replay", "x.mcap", "--speed", "inf"],
+        ["capture", "/dev/nowhere", "-o", "x.mcap", "--seconds", "nan"],
+        ["evaluate", "x.mcap", "--calibration", "x.json", "--min-speed", "nan"],
+        ["simulate", "mam", "-o", "x.csv", "--magnet", "nan"],
+        ["simulate", "mam", "-o", "x.csv", "--step", "-1"],
+        ["simulate", "mam", "-o", "x.csv", "--gap", "inf"],
+    ],
+)
+def test_impossible_number_is_refused_and_named(run, capsys, words):
+    assert run(*words) == EXIT_USAGE
+    assert f"Invalid value for '{words[-2]}': {words[-1]}" in capsys.readouterr().err
+
+
+def test_link_of_an_emulated_device_that_cannot_be_made_is_one_line(run, tmp_path, capsys):
+    link = tmp_path / "nowhere" / "vn100"
+    assert run("emulate", "--link", str(link)) == EXIT_USAGE
+    told = capsys.readouterr().err
+    assert told == f"ahrsd: --link {link}: cannot be made: No such file or directory\n"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from types import SimpleNamespace
 
 import pytest
 
 from ahrsd.errors import AhrsdError
-from ahrsd.fleet.archive import Archive, ArchiveEntry, local_file
+from ahrsd.fleet.archive import Archive, ArchiveEntry, local_file, pieces
 
 FILES = ("rov1/harbour/a.mcap", "rov1/b.csv.gz", "c.ULG", "rov2/d.vnraw")
 OTHERS = ("readme.md", "rov1/b.csv.gz.truth.json", "rov1/b.gps.csv.gz", "rov2/.hidden.csv")
@@ -51,6 +52,44 @@ def test_ros_2_folder_is_one_recording(archive):
     assert f"{bag}/bag_0.db3" not in found
     assert found[str(bag)].size_bytes == 6
     assert found[str(bag)].folders == ("rov3",)
+
+
+@pytest.mark.parametrize("what", ["a dangling link", "a link to itself", "a file of a subfolder"])
+def test_ros_2_folder_is_listed_whatever_is_in_it(archive, what):
+    bag = archive / "rov3" / "bag"
+    (bag / "parts").mkdir(parents=True)
+    (bag / "metadata.yaml").write_text("x")
+    if what == "a file of a subfolder":
+        (bag / "parts" / "bag_0.db3").write_bytes(b"12345")
+    else:
+        (bag / "bag_0.db3").symlink_to("nowhere" if what == "a dangling link" else "bag_0.db3")
+    found = {entry.url: entry for entry in Archive(str(archive)).entries()}
+    assert found[str(bag)].is_folder
+    if what == "a file of a subfolder":
+        assert found[str(bag)].size_bytes == 6
+        assert b"".join(pieces(bag)) == b"metadata.yaml\0xparts/bag_0.db3\x0012345"
+    else:
+        with pytest.raises(OSError, match=r"No such file|Too many levels"):
+            list(pieces(bag))
+
+
+def test_link_to_itself_is_an_entry_and_linked_folders_are_reported(archive):
+    (archive / "loop.csv").symlink_to("loop.csv")
+    (archive / "round").symlink_to("round")
+    (archive / "rov9").symlink_to(archive / "rov1")
+    left_out, linked = [], []
+    entries = list(Archive(str(archive)).entries(left_out.append, linked.append))
+    assert names(entries, archive) == sorted([*FILES, "loop.csv"])
+    assert "round" in left_out
+    assert linked == [str(archive / "rov9")]
+
+
+def test_what_is_no_regular_file_is_not_opened(archive):
+    os.mkfifo(archive / "pipe.csv")
+    (archive / "zero.csv").symlink_to("/dev/zero")
+    for name, kind in (("pipe.csv", "a FIFO"), ("zero.csv", "a device")):
+        with pytest.raises(OSError, match=f"is {kind}, not a regular file"):
+            next(pieces(archive / name))
 
 
 def test_fsspec_lists_and_reads_the_same_files(archive):

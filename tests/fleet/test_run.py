@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -143,6 +144,24 @@ def test_repaired_file_has_its_own_row(archive, tmp_path):
     assert dict(ran(small, tmp_path / "out", BARE).outcomes) == {"refused": 1}
     with FleetRows(Store(tmp_path / "out")) as asked:
         assert asked.counts()["recordings"] == 2
+
+
+def test_odd_entries_are_rows_and_the_number_of_a_folder_is_the_serial_number(tmp_path):
+    folder = tmp_path / "archive" / "vn100-100130608 (2)"
+    folder.mkdir(parents=True)
+    os.mkfifo(folder / "pipe.csv")
+    (folder / "bag").mkdir()
+    (folder / "bag" / "metadata.yaml").touch()
+    (folder / "bag" / "bag_0.db3").symlink_to("nowhere")
+    (tmp_path / "archive" / "more").symlink_to(folder)
+    done = ran(tmp_path / "archive", tmp_path / "out", BARE, levels=("serial",))
+    assert (done.linked, done.first_linked) == (1, str(tmp_path / "archive" / "more"))
+    found = rows(tmp_path / "out")
+    assert {name: (one["outcome"], one["error"]) for name, one in found.items()} == {
+        "pipe.csv": ("unreadable", "is a FIFO, not a regular file"),
+        "bag": ("unreadable", "No such file or directory"),
+    }
+    assert {one["serial_number"] for one in found.values()} == {100130608}
 
 
 @pytest.mark.slow

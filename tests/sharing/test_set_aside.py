@@ -195,6 +195,23 @@ def test_trial_restarts_after_a_client_reset(binary, saved_s):
     assert not binary or run.until("CONFIRMED", 20.0), run.notes  # a text stream tells no time
 
 
+@pytest.mark.parametrize("by", ["a client", "a client behind a save", "nobody"])
+def test_only_a_restart_that_no_client_requested_counts_against_the_stream(by):
+    """Gate stream_health.time: no calibration qualifies in a run with such a restart."""
+    run = CabledRun(two_units(binary=True), shares=SHARES)
+    run.run(5.0)
+    if by == "nobody":
+        run.cable.unit.restart()
+    else:
+        if by == "a client behind a save":
+            save(run)
+            run.run(1.5)
+        reset(run)
+    run.run(5.0)
+    assert run.core.stream.restarts == 1
+    assert run.core.stream.health().negative_dt == (by == "nobody")
+
+
 def test_device_is_read_and_judged_again_before_a_write_after_a_reset():
     run = on_trial()
     save(run)

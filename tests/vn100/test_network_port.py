@@ -80,6 +80,12 @@ def test_incomplete_url_is_refused_with_the_expected_form(wrong):
         SerialPort(wrong, 115200)
 
 
+@pytest.mark.parametrize("wrong", ["tcp://10.0.0.7:4001", Path("http://a"), "10.0.0.7:4001"])
+def test_what_only_looks_like_a_device_server_is_told_how_one_is_written(wrong):
+    with pytest.raises(PortUnusable, match="is socket://HOST:PORT or rfc2217://HOST:PORT"):
+        SerialPort(wrong, 115200)
+
+
 @pytest.mark.parametrize(
     ("given", "text"),
     [

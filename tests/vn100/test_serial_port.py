@@ -23,6 +23,7 @@ from patience import PATIENCE_S
 from drivers import serial_port
 from drivers.serial_port import (
     BaudNotFound,
+    Holder,
     PortAbsent,
     PortBusy,
     PortForbidden,
@@ -112,6 +113,14 @@ def test_an_absent_port_is_one_clear_line():
         SerialPort("/dev/ttyVN100-absent", 115200)
     assert "/dev/ttyVN100-absent does not exist" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_port_of_many_names_the_first_three():
+    others = tuple(Holder(number, "gpsd") for number in range(1, 6))
+    assert str(PortBusy("/dev/x", others)) == (
+        "/dev/x is in use by process 1 (gpsd), process 2 (gpsd), process 3 (gpsd) and 2 more: "
+        "stop it first"
+    )
 
 
 def test_a_file_is_no_serial_port(tmp_path):

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import click
 
+from ahrsd.cli import Number
 from ahrsd.cli.device.access import PORT, describe, driver_errors, open_port, read_all
 from ahrsd.cli.files import refuse_unwritable, write_json
 from ahrsd.daemon import host_clock
@@ -71,7 +72,7 @@ class _Session:
 @click.option("-o", "--output", "path", required=True, type=click.Path(path_type=Path),
               help="File to write, *.mcap; it must not exist.")  # fmt: skip
 @click.option("--passive", is_flag=True, help="Send no byte; the registers stay unknown.")
-@click.option("--seconds", type=click.FloatRange(0.0, min_open=True), help="Stop after this long.")
+@click.option("--seconds", type=Number(0.0, min_open=True), help="Stop after this long.")
 @click.option("--baud", type=int, help="The port's rate; without it, each rate is tried.")
 @click.option("--json", "json_path", help="Summary as JSON into this file, - for stdout.")
 def command(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import click
 
+from ahrsd.cli import Number
 from ahrsd.errors import EXIT_DONE, EXIT_NO, EXIT_USAGE, DeviceError
 
 
@@ -33,17 +34,21 @@ def _program(name: str) -> str:
 )
 @click.option(
     "--seconds",
-    type=click.FloatRange(60.0),
+    type=Number(60.0),
     default=2400.0,
     show_default=True,
     help="Longest device time.",
 )
 @click.option(
-    "--seed", type=int, default=0, show_default=True, help="Chooses hidden truth, motion and noise."
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Chooses hidden truth, motion and noise.",
 )
 @click.option(
     "--speed",
-    type=click.FloatRange(1.0, 100.0),
+    type=Number(1.0, 100.0),
     default=20.0,
     show_default=True,
     help="Device seconds per second.",

@@ -52,7 +52,13 @@ def _device(setup: Setup, effects: Sequence[str]) -> Emulator:
     "--scenario", default="rov", show_default=True, help="Which device, and how it moves."
 )
 @click.option("--motion", default="", help="Motion, instead of the scenario's.")
-@click.option("--seed", default=0, show_default=True, help="Chooses truth, motion and noise.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Chooses truth, motion and noise.",
+)
 @click.option("--fault", "faults", multiple=True, help="name[=parameter][@start[+duration]].")
 @click.option(
     "--effect",
@@ -115,7 +121,12 @@ def emulate(
             check_baud=not any_baud,
             report=lambda line: click.echo(line, err=True),
         )
-    except (ValueError, OSError) as error:
+    except FileExistsError as error:
+        raise AhrsdError(str(error)) from None
+    except OSError as error:
+        what = "a pseudo-terminal" if link is None else f"--link {link}"
+        raise AhrsdError(f"{what}: cannot be made: {error.strerror or error}") from None
+    except ValueError as error:
         raise AhrsdError(str(error)) from None
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: server.request_stop())

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ahrsd.cli import Number
 from ahrsd.cli.files import columns_option, make_folder, refuse_unwritable, write_json
 from ahrsd.cli.long_work import byte_progress
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError
@@ -35,7 +36,7 @@ _MODELS = ("wmm", "igrf")
 @click.option("--tilt", type=click.Choice(_TILTS), default="auto", show_default=True,
               help="Which way is up: gravity steadied by the gyro, each sample's accelerometer, or "
               "the device's own roll and pitch.")  # fmt: skip
-@click.option("--min-speed", "least_speed_m_s", type=click.FloatRange(0.1), default=4.0,
+@click.option("--min-speed", "least_speed_m_s", type=Number(0.1), default=4.0,
               show_default=True, help="The course is used above this speed. [m/s]")  # fmt: skip
 @click.option(
     "--rate", "rate_hz", type=float, help="Messages per second, if messages have no time."

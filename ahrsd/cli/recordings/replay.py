@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ahrsd.cli import Number
 from ahrsd.cli.files import columns_option, refuse_unwritable, write_json
 from ahrsd.cli.long_work import byte_progress
 from ahrsd.config.config import Config, load_config
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     "--rate", "rate_hz", type=float, help="Messages per second, if messages have no time."
 )
 @columns_option
-@click.option("--speed", type=click.FloatRange(0.0), default=0.0,
+@click.option("--speed", type=Number(0.0), default=0.0,
               help="0: as fast as it goes (default); 1: real time.")  # fmt: skip
 @click.option("--json", "json_path", help="Summary as JSON into this file, - for stdout.")
 @click.option("--rerun", "rerun_path", type=click.Path(path_type=Path), help="Write an .rrd file.")

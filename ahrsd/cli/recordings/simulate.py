@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
+from ahrsd.cli import Number
 from ahrsd.cli.files import columns_option, refuse_unwritable, write_json
 from ahrsd.errors import EXIT_DONE, AhrsdError
 from ahrsd.printable import counted
@@ -28,7 +29,9 @@ _MOST_SAMPLES = 1e7
     "-o", "--output", type=click.Path(path_type=Path), required=True, help="File to write."
 )
 @click.option("--motion", type=click.Choice(["slow", "rov"]), default="slow", show_default=True)
-@click.option("--seed", default=0, show_default=True, help="Chooses motion and noise.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Chooses motion and noise."
+)
 @click.option("--seconds", default=400.0, show_default=True, help="Length.")
 @click.option("--rate", "rate_hz", default=25.0, show_default=True, help="Samples per second.")
 @click.option("--noise-mag", "mag_mg", default=1.0, show_default=True, help="mG per sample.")
@@ -43,9 +46,9 @@ _MOST_SAMPLES = 1e7
     help="Gyro table, for SCENARIO recorded.",
 )
 @click.option("--outliers", default=0.0, help="Fraction of samples that are 100 mG off.")
-@click.option("--magnet", "magnet_at_s", type=float, help="A magnet passes at this second.")
-@click.option("--step", "step_at_s", type=float, help="The hard iron steps by 30 mG here.")
-@click.option("--gap", "gap_at_s", type=float, help="Two seconds without samples from here.")
+@click.option("--magnet", "magnet_at_s", type=Number(0.0), help="A magnet passes at this second.")
+@click.option("--step", "step_at_s", type=Number(0.0), help="The hard iron steps by 30 mG here.")
+@click.option("--gap", "gap_at_s", type=Number(0.0), help="Two seconds without samples from here.")
 @click.option(
     "--effect",
     "effects",

@@ -24,6 +24,7 @@ import numpy as np
 from drivers.vn100.emulator.physics import Dipole, Disturbance, IronStep
 
 ONCE_DEFAULT_S = 10.0
+_RATE = "per "  # units of probabilities begin so
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,9 +130,12 @@ def parse_fault(schedule: str) -> Fault:
     if kind is None:
         raise ValueError(f"no fault {name!r}; there are {', '.join(FAULTS)}")
     begins_s = 0.0 if kind.duration_s == math.inf else ONCE_DEFAULT_S
+    size = kind.parameter if parameter is None else _number(parameter, "parameter", schedule)
+    if kind.unit.startswith(_RATE) and size > 1.0:
+        raise ValueError(f"fault {schedule!r}: parameter is a probability, at most 1")
     return Fault(
         name,
-        kind.parameter if parameter is None else _number(parameter, "parameter", schedule),
+        size,
         begins_s if start is None else _number(start, "start", schedule),
         kind.duration_s if duration is None else _number(duration, "duration", schedule),
     )

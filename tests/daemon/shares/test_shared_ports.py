@@ -226,6 +226,21 @@ def test_link_to_a_live_pty_is_kept_only_if_it_is_a_raw_port(tmp_path, raw):
     os.close(master)
 
 
+def test_link_of_a_killed_run_whose_number_came_again_is_replaced(tmp_path):
+    """The pty of that number is another program's raw port by now, and younger than the link."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    path = tmp_path / "vn100"
+    path.symlink_to(os.ttyname(slave))
+    before_s = os.fstat(slave).st_ctime - 60.0
+    os.utime(path, (before_s, before_s), follow_symlinks=False)
+    ports = SharedPorts([ShareSection(pty=path)], print, time.monotonic_ns)
+    assert str(path.readlink()) != os.ttyname(slave)
+    ports.close()
+    os.close(slave)
+    os.close(master)
+
+
 def test_name_taken_during_the_run_is_reported_and_other_ports_continue(shared, caplog):
     one = shared.opened(0)
     shared.paths[0].unlink()

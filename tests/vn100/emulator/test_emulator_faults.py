@@ -31,6 +31,8 @@ def test_schedules(text, fault):
         ("byte_dorp", "no fault 'byte_dorp'; there are byte_drop, "),
         ("byte_drop@soon", "start must be a number >= 0, not 'soon'"),
         ("byte_drop=nan", "parameter must be a number >= 0, not 'nan'"),
+        ("byte_drop=2", "parameter is a probability, at most 1"),
+        ("lost_reply=1.5@3", "parameter is a probability, at most 1"),
         ("byte_drop@1+-2", "duration must be a number >= 0, not '-2'"),
         ("byte_drop@", "expected name[=parameter][@start[+duration]]"),
         ("", "expected name[=parameter][@start[+duration]]"),

@@ -139,6 +139,12 @@ def _end_lines(done: Progress, output: Path) -> list[str]:
     if done.left_out:
         names = ", ".join(f"{number} {suffix}" for suffix, number in done.left_out.most_common(5))
         lines.append(f"  left out, no recordings by their names: {names} (--match takes others)")
+    if done.linked:
+        folders = f"{counted(done.linked, 'folder', ',')} that an entry only links to"
+        lines.append(
+            f"  not entered: {folders}, such as {done.first_linked}; give what it leads to as "
+            "an archive of its own, with the same -o"
+        )
     if done.failed:
         lines.append(f"  why: ahrsd fleet ask {output} failures")
     return lines
