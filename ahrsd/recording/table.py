@@ -170,7 +170,9 @@ def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
     covariates, text_names = _covariates(table, found)
     notes += [*found.notes, *(f"column {name} is text and was left out" for name in text_names)]
     numbers = np.arange(len(table)) + first_row
+    words = {name: _few_words(table[found.covariates[name]]) for name in text_names}
     rows = _TableRows(path, values, covariates, numbers, notes, sources=found.sources)
+    rows.words = {name: few for name, few in words.items() if few is not None}
     return _checked(rows, check_units)
 
 
@@ -201,6 +203,7 @@ def _checked(columns: _TableRows, check_units: bool) -> Table:
     columns.undo_repeats()
     columns.refuse_several_sensors()
     columns.drop_impossible()
+    columns.tell_turns()
     columns.set_clock()
     if check_units:
         for limits in RANGES:
@@ -216,7 +219,8 @@ def _checked(columns: _TableRows, check_units: bool) -> Table:
 class _TableRows:
     """A table's columns on their way to samples: what is dropped here is dropped in all of them.
 
-    numbers (N,): of the rows in the file; sources: the file's columns by canonical name
+    numbers (N,): of the rows in the file; sources: the file's columns by canonical name; words:
+    text columns of few different words
     """
 
     path: Path
@@ -226,6 +230,7 @@ class _TableRows:
     notes: list[str]
     starts: tuple[int, ...] = ()
     sources: Mapping[str, Source] = field(default_factory=dict)
+    words: dict[str, _FewWords] = field(default_factory=dict)
 
     def vectors(self, names: tuple[str, str, str]) -> Array:
         """(N, 3) of three columns."""
@@ -234,6 +239,7 @@ class _TableRows:
     def _keep(self, rows: NDArray[np.bool]) -> None:
         self.values = {name: values[rows] for name, values in self.values.items()}
         self.covariates = {name: values[rows] for name, values in self.covariates.items()}
+        self.words = {name: few.rows(rows) for name, few in self.words.items()}
         self.numbers = self.numbers[rows]
 
     def hold_readings(self) -> None:
@@ -309,12 +315,14 @@ class _TableRows:
             _check_length(self.path, len(self.numbers))
 
     def refuse_several_sensors(self) -> None:
-        """Rows of several sensors that take turns, told apart by a column of few whole numbers.
+        """Rows of several sensors that take turns, told apart by a column of few words or numbers.
 
         What they read differs between them, and hardly from one row of a sensor to its next.
         """
         rows = self.vectors(MAG)
-        for name, column in self.covariates.items():
+        columns = [(name, few.of_row, few.names) for name, few in self.words.items()]
+        columns += [(name, column, None) for name, column in self.covariates.items()]
+        for name, column, names in columns:
             head = column[:_SENSORS_LOOK]
             kinds = np.unique(head[np.isfinite(head)])
             if not 2 <= len(kinds) <= _MOST_SENSORS or not np.all(kinds == np.rint(kinds)):
@@ -326,13 +334,32 @@ class _TableRows:
             own = [np.diff(rows[column == kind], axis=0) for kind in kinds]
             within = np.median(np.linalg.norm(np.vstack(own), axis=1))
             if across > _APART * within:
-                shown = ", ".join(f"{kind:g}" for kind in kinds)
+                shown = [f"{kind:g}" if names is None else names[int(kind)] for kind in kinds]
                 raise RecordingError(
                     self.path,
                     f"holds the rows of {len(kinds)} sensors in turn, by its column "
-                    f"{printable(name)} ({shown})",
+                    f"{printable(name)} ({', '.join(map(printable, shown))})",
                     "keep the rows of one of them",
                 )
+
+    def tell_turns(self) -> None:
+        """A note on a field that is the same again after a few rows, and another one in between.
+
+        Without a column that tells the sensors apart it may be one sensor near a current, too.
+        """
+        rows = self.vectors(MAG)
+        if len(rows) < MINIMUM_ROWS:
+            return
+        jump = float(np.median(np.linalg.norm(np.diff(rows, axis=0), axis=1)))
+        for count in range(2, _MOST_SENSORS + 1):
+            again = np.median(np.linalg.norm(rows[count:] - rows[:-count], axis=1))
+            if jump > _APART * again:
+                self.notes.append(
+                    f"the field jumps by {1e3 * jump:.3g} mG from row to row and is the same again "
+                    f"after {count} rows: these are the rows of {count} sensors in turn, of which "
+                    "only one may be kept, or an alternating current is near"
+                )
+                return
 
     def drop_impossible(self) -> None:
         """Rows with a reading that no such sensor can have among good ones: marks, damaged cells.
@@ -572,7 +599,11 @@ def _read_parquet(path: Path, given: ColumnMap) -> pyarrow.Table:
             source.column
             for source in _resolved(path, file.schema_arrow.names, given).sources.values()
         }
-        wanted = [name for name, kind in kinds.items() if _is_plain(kind) or name in needed]
+        wanted = [
+            name
+            for name, kind in kinds.items()
+            if _is_plain(kind) or _is_text(kind) or name in needed
+        ]
         cells = file.metadata.num_rows * len(wanted)
         refuse_beyond(path, cells, TABLE_CELLS, "numbers", "cut it in parts")
         table = file.read(columns=wanted, use_threads=False)
@@ -613,6 +644,13 @@ def _is_plain(kind: pyarrow.DataType) -> bool:
         types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)
         or types.is_temporal(kind) or types.is_decimal(kind) or types.is_null(kind)
     )  # fmt: skip
+
+
+def _is_text(kind: pyarrow.DataType) -> bool:
+    types = pyarrow.types
+    if types.is_dictionary(kind):
+        kind = kind.value_type
+    return bool(types.is_string(kind) or types.is_large_string(kind))
 
 
 def _numbers(path: Path, table: pyarrow.Table, name: str, source: Source, first_row: int) -> Array:
@@ -794,6 +832,30 @@ def _covariates(table: pyarrow.Table, found: Resolved) -> tuple[dict[str, Array]
         else:
             numeric[name] = values if source.factor == 1.0 else values * source.factor
     return numeric, text
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FewWords:
+    """A text column of few different words: of_row (N,) has the number of each row's in `names`."""
+
+    names: tuple[str, ...]
+    of_row: Array
+
+    def rows(self, kept: NDArray[np.bool]) -> _FewWords:
+        return _FewWords(self.names, self.of_row[kept])
+
+
+def _few_words(column: pyarrow.ChunkedArray) -> _FewWords | None:
+    """The words of a text column; None where they are many, or it is no text."""
+    if not _is_text(column.type):
+        return None
+    if pyarrow.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    if not 2 <= len(set(column[:_SENSORS_LOOK].to_pylist()) - {None}) <= _MOST_SENSORS:
+        return None
+    number: dict[str | None, int] = {}
+    of_row = [number.setdefault(word, len(number)) for word in column.to_pylist()]
+    return _FewWords(tuple("" if w is None else w for w in number), np.array(of_row, np.float64))
 
 
 def _check_length(path: Path, rows: int) -> None:

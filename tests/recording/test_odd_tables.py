@@ -325,16 +325,45 @@ def test_coarse_readings_at_rest_are_no_hold(tmp_path):
     assert not any("new reading" in note or "each is used once" in note for note in table.notes)
 
 
-def test_alternating_sensors_are_separated_by_their_column(tmp_path):
+def two_in_turn() -> Cells:
+    """Rows of two sensors with another hard iron, in turn."""
     other = {**sensor(COUNT, RATE_HZ, seed=5)}
     other["mag"] = other["mag"] + 0.1
     first, second = cells(), cells(other)
-    both = {
+    return {
         name: [v for pair in zip(first[name], second[name], strict=True) for v in pair]
         for name in NAMES
     }
-    with pytest.raises(RecordingError, match=r"rows of 2 sensors in turn, by its column id \(1, 2"):
-        read(tmp_path, text({**both, "id": ["1", "2"] * COUNT}))
+
+
+@pytest.mark.parametrize("kinds", [["1", "2"], ["imu_left", "imu_right"]])
+def test_alternating_sensors_are_separated_by_their_column(tmp_path, kinds):
+    shown = ", ".join(kinds)
+    refused = rf"rows of 2 sensors in turn, by its column id \({shown}\)"
+    with pytest.raises(RecordingError, match=refused):
+        read(tmp_path, text({**two_in_turn(), "id": kinds * COUNT}))
+
+
+def test_alternating_sensors_are_separated_by_words_of_a_parquet_table(tmp_path):
+    columns = {name: [float(cell) for cell in column] for name, column in two_in_turn().items()}
+    table = pyarrow.table({**columns, "frame_id": ["port", "starboard"] * COUNT})
+    pyarrow.parquet.write_table(table, tmp_path / "t.parquet")
+    with pytest.raises(RecordingError, match=r"column frame_id \(port, starboard\)"):
+        read_table(tmp_path / "t.parquet")
+
+
+def test_alternating_sensors_without_a_column_for_them_are_noted(tmp_path):
+    both = two_in_turn()
+    both["time_s"] = [f"{0.5 * k / RATE_HZ:.6f}" for k in range(2 * COUNT)]
+    (note,) = [one for one in read(tmp_path, text(both)).notes if "in turn" in one]
+    assert "is the same again after 2 rows: these are the rows of 2 sensors in turn" in note
+    assert not any("in turn" in one for one in read(tmp_path, text(cells())).notes)
+
+
+def test_words_in_turn_beside_one_sensor_are_left_out(tmp_path):
+    table = read(tmp_path, text(cells() | {"lamp": ["on", "off"] * 400}))
+    are_the_readings(table)
+    assert table.notes == ("column lamp is text and was left out",)
 
 
 @pytest.mark.parametrize("levels", [["0"] * 400 + ["1"] * 400, ["0", "1"] * 400])
