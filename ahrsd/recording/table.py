@@ -53,6 +53,7 @@ from ahrsd.recording.column_names import (
     other_unit,
     resolve,
 )
+from ahrsd.recording.foreign.sensors import Sensors, SensorSeries, by_readings
 from ahrsd.recording.limits import (
     SPAN_S,
     TABLE_BYTES,
@@ -173,6 +174,7 @@ def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
     words = {name: _few_words(table[found.covariates[name]]) for name in text_names}
     rows = _TableRows(path, values, covariates, numbers, notes, sources=found.sources)
     rows.words = {name: few for name, few in words.items() if few is not None}
+    rows.refuse_missing()
     return _checked(rows, check_units)
 
 
@@ -197,6 +199,8 @@ def table_of(path: Path, columns: dict[str, Array], notes: list[str]) -> Table:
 
 def _checked(columns: _TableRows, check_units: bool) -> Table:
     path = columns.path
+    if columns.hold_one_sensor_each():
+        columns.join_sensors()
     columns.hold_readings()
     columns.draw_rates()
     columns.drop_doubles()
@@ -241,6 +245,66 @@ class _TableRows:
         self.covariates = {name: values[rows] for name, values in self.covariates.items()}
         self.words = {name: few.rows(rows) for name, few in self.words.items()}
         self.numbers = self.numbers[rows]
+
+    def hold_one_sensor_each(self) -> bool:
+        """Whether rows with a field and no rates, and such with rates and no field, are usual."""
+        mag, gyro = (np.isfinite(self.vectors(names)).all(axis=1) for names in (MAG, GYRO))
+        alone = ((mag & ~gyro, mag), (gyro & ~mag, gyro))
+        return all(
+            0 < _SPARSE_SHARE * np.count_nonzero(all_of) <= np.count_nonzero(without_other)
+            for without_other, all_of in alone
+        )
+
+    def refuse_missing(self) -> None:
+        """Raise RecordingError at the first cell of a needed column that is no number."""
+        one_each = self.hold_one_sensor_each()
+        for name, values in self.values.items():
+            wrong = np.flatnonzero(~np.isfinite(values))
+            slower = one_each or _SPARSE_SHARE * len(values) <= len(wrong) < len(values)
+            if len(wrong) and (name == TIME or not slower):
+                column = self.sources.get(name, Source(name)).column
+                raise RecordingError(
+                    self.path,
+                    f"row {self.numbers[wrong[0]]}, column {printable(column)}: empty, nan or "
+                    f"infinite ({counted(len(wrong), 'row')} in all)",
+                    "leave such rows out; a missing row is a gap, which is understood",
+                )
+
+    def join_sensors(self) -> None:
+        """Rows of one sensor each become one row per reading of the magnetometer."""
+        series = {"mag": self._series(self.vectors(MAG)), "gyro": self._series(self.vectors(GYRO))}
+        if all(name in self.covariates for name in ACCEL):
+            force = np.column_stack([self.covariates[name] for name in ACCEL])
+            series["accel"] = self._series(force)
+        more = {
+            name: self._series(values[:, None])
+            for name, values in self.covariates.items()
+            if name not in ACCEL
+        }
+        rows: NDArray[np.bool] = np.asarray(np.isfinite(self.vectors(MAG)).all(axis=1))
+        order = np.argsort(self.values[TIME][rows], kind="stable")
+        stamps_s, numbers = series["mag"].time_s[order], self.numbers[rows][order]
+        self.notes.append(
+            f"each row holds one sensor: {np.count_nonzero(rows)} of {len(rows)} the "
+            f"magnetometer, {len(series['gyro'].time_s)} the gyro; one row per reading of the "
+            "magnetometer is used"
+        )
+        angles = frozenset(name for name in more if name.endswith("_deg"))
+        found = Sensors(accel=series.get("accel"), more=more, angles=angles)
+        joined = by_readings(self.path, series["mag"], series["gyro"], found, self.notes)
+        self.values = {TIME: joined.time_s}
+        self.covariates = dict(joined.more)
+        for kind, names in (("mag", MAG), ("gyro", GYRO), ("accel", ACCEL)):
+            if kind in joined.vectors:
+                into = self.covariates if kind == "accel" else self.values
+                into |= dict(zip(names, joined.vectors[kind].T, strict=True))
+        self.numbers = numbers[np.searchsorted(stamps_s, joined.time_s)]
+        self.words = {}
+
+    def _series(self, values: Array) -> SensorSeries:
+        """Readings (N, k) of one sensor, in the rows that have one, on a clock that counts on."""
+        rows = np.isfinite(values).all(axis=1)
+        return SensorSeries(unwrapped(self.values[TIME][rows])[0], values[rows])
 
     def hold_readings(self) -> None:
         """Rows between the readings of a slower magnetometer repeat the last one."""
@@ -320,9 +384,8 @@ class _TableRows:
         What they read differs between them, and hardly from one row of a sensor to its next.
         """
         rows = self.vectors(MAG)
-        columns = [(name, few.of_row, few.names) for name, few in self.words.items()]
-        columns += [(name, column, None) for name, column in self.covariates.items()]
-        for name, column, names in columns:
+        columns = {name: few.of_row for name, few in self.words.items()} | self.covariates
+        for name, column in columns.items():
             head = column[:_SENSORS_LOOK]
             kinds = np.unique(head[np.isfinite(head)])
             if not 2 <= len(kinds) <= _MOST_SENSORS or not np.all(kinds == np.rint(kinds)):
@@ -334,7 +397,8 @@ class _TableRows:
             own = [np.diff(rows[column == kind], axis=0) for kind in kinds]
             within = np.median(np.linalg.norm(np.vstack(own), axis=1))
             if across > _APART * within:
-                shown = [f"{kind:g}" if names is None else names[int(kind)] for kind in kinds]
+                few = self.words.get(name)
+                shown = [f"{kind:g}" if few is None else few.names[int(kind)] for kind in kinds]
                 raise RecordingError(
                     self.path,
                     f"holds the rows of {len(kinds)} sensors in turn, by its column "
@@ -654,7 +718,7 @@ def _is_text(kind: pyarrow.DataType) -> bool:
 
 
 def _numbers(path: Path, table: pyarrow.Table, name: str, source: Source, first_row: int) -> Array:
-    """A required column.  Raises RecordingError at its first cell that is no finite number."""
+    """A required column, nan where a cell is empty.  Raises RecordingError where it is text."""
     column = table[source.column]
     values = _seconds(column) if name == TIME else None
     factor = 1.0 if values is not None else source.factor
@@ -662,15 +726,6 @@ def _numbers(path: Path, table: pyarrow.Table, name: str, source: Source, first_
         values = _as_floats(column, from_first=name == TIME and source.factor != 1.0)
     if values is None:
         _refuse_text(path, column, source.column, first_row)
-    wrong = np.flatnonzero(~np.isfinite(values))
-    sparse = name in (*MAG, *GYRO) and _SPARSE_SHARE * len(values) <= len(wrong) < len(values)
-    if len(wrong) and not sparse:
-        raise RecordingError(
-            path,
-            f"row {wrong[0] + first_row}, column {printable(source.column)}: empty, nan or "
-            f"infinite ({counted(len(wrong), 'row')} in all)",
-            "leave such rows out; a missing row is a gap, which is understood",
-        )
     return values if factor == 1.0 else values * factor
 
 

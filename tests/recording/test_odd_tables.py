@@ -360,6 +360,60 @@ def test_alternating_sensors_without_a_column_for_them_are_noted(tmp_path):
     assert not any("in turn" in one for one in read(tmp_path, text(cells())).notes)
 
 
+def one_sensor_each(fast: dict[str, np.ndarray], slow: dict[str, np.ndarray]) -> Cells:
+    """Rows of a gyro with its accelerometer, and of a magnetometer, as tables joined by time."""
+    rows = [
+        (t, ["", "", "", *(f"{v:.9g}" for v in (*g, *a))])
+        for t, g, a in zip(fast["time_s"], fast["gyro"], fast["accel"], strict=True)
+    ]
+    rows += [
+        (t, [*(f"{v:.9g}" for v in m), *[""] * 6])
+        for t, m in zip(slow["time_s"], slow["mag"], strict=True)
+    ]
+    rows.sort(key=lambda row: row[0])
+    columns = zip(*(cells for _, cells in rows), strict=True)
+    named = dict(zip((*MAG, *GYRO, *ACCEL), map(list, columns), strict=True))
+    return {TIME: [f"{t:.9g}" for t, _ in rows], **named}
+
+
+def test_rows_of_one_sensor_each_are_one_row_per_reading_of_the_magnetometer(tmp_path):
+    fast = sensor(4000, 100.0)
+    slow = {name: values[::5] for name, values in fast.items()}
+    table = read(tmp_path, text(one_sensor_each(fast, slow)))
+    np.testing.assert_allclose(table.rows.time_s, slow["time_s"], atol=1e-6)
+    np.testing.assert_allclose(table.rows.raw_b_gauss, slow["mag"], atol=1e-6)
+    inner = fast["gyro"][1:].reshape(-1)[: 3 * 3995].reshape(799, 5, 3)  # of (t[k-1], t[k]]
+    ends = 0.5 * (fast["gyro"][:-5:5] - fast["gyro"][5::5])
+    np.testing.assert_allclose(
+        table.rows.gyro_b_rad_s[1:], inner.mean(axis=1) + 0.2 * ends, atol=1e-6
+    )
+    assert table.starts == (0,)
+    assert table.notes[0].startswith("each row holds one sensor: 800 of 4800 the magnetometer")
+
+
+def test_times_of_rows_of_one_sensor_each_stay(tmp_path):
+    """A reading that follows another sensor's at once was not stamped by a host in a bunch."""
+    slow = {**DATA, "time_s": DATA["time_s"] + 0.001}
+    table = read(tmp_path, text(one_sensor_each(DATA, slow)))
+    np.testing.assert_allclose(table.rows.time_s, slow["time_s"], atol=1e-6)
+    assert not any("host" in note for note in table.notes)
+
+
+def test_rows_of_one_sensor_each_need_their_time(tmp_path):
+    columns = one_sensor_each(DATA, DATA)
+    columns[TIME][7] = ""
+    with pytest.raises(RecordingError, match="row 9, column time_s: empty"):
+        read(tmp_path, text(columns))
+
+
+def test_a_clock_set_back_amid_rows_of_one_sensor_each_is_refused(tmp_path):
+    columns = one_sensor_each(DATA, DATA)
+    times = [float(cell) for cell in columns[TIME]]
+    columns[TIME] = [f"{t - 5.0 * (k >= 800):.9g}" for k, t in enumerate(times)]
+    with pytest.raises(RecordingError, match=r"the magnetometer: its time goes back by 4.95 s"):
+        read(tmp_path, text(columns))
+
+
 def test_words_in_turn_beside_one_sensor_are_left_out(tmp_path):
     table = read(tmp_path, text(cells() | {"lamp": ["on", "off"] * 400}))
     are_the_readings(table)

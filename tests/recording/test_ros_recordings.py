@@ -60,6 +60,17 @@ def test_it_calibrates_to_the_truth(tmp_path):
     np.testing.assert_allclose(estimate.gyro_bias_rad_s, BIAS, atol=3e-4)
 
 
+def test_headers_of_a_clock_that_was_set_back_are_refused(tmp_path):
+    data = sensor()
+    messages = [
+        (topic, kind, ns, fields | {"stamp_ns": ns - (10_007_000_000 if ns > ns_of(15.0) else 0)})
+        for topic, kind, ns, fields in [*imu(data), *magnetic(data)]
+    ]
+    path = ros_files.save(tmp_path, "mcap", messages)
+    with pytest.raises(RecordingError, match=r"time goes back by 9.957 s after 301 readings"):
+        open_recording(path)
+
+
 def test_format_is_recognised_by_content(tmp_path, container):
     data = sensor()
     path = ros_files.save(tmp_path, container, [*imu(data), *magnetic(data)])

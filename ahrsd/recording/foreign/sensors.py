@@ -116,25 +116,47 @@ def merged(path: object, found: Sensors, columns: ColumnMap = NO_MAP) -> Merged:
             f"holds no {' and no '.join(missing)}",
             "`ahrsd convert FILE --list` says what it holds; record the magnetometer and the gyro",
         )
-    mag = _tidy(path, found.mag, _called("magnetometer", found, "mag"), notes)
-    gyro = _tidy(path, found.gyro, _called("gyro", found, "gyro"), notes)
-    mag = _overlapping(path, _fresh(mag, notes), gyro)
-    out = {TIME: mag.time_s - mag.time_s[0]}
-    out |= _scaled(path, "mag", mag.values, found, columns, facts)
-    out |= _scaled(path, "gyro", _at_steps(mag.time_s, gyro, "gyro", notes), found, columns, facts)
-    if found.accel is not None and len(found.accel.time_s) >= FEWEST:
-        accel = _tidy(path, found.accel, _called("accelerometer", found, "accel"), notes)
-        force = _at_steps(mag.time_s, accel, "accelerometer", notes)
-        out |= _scaled(path, "accel", force, found, columns, facts)
-    for name, stream in found.more.items():
-        values = _covariate(mag.time_s, stream, name in found.angles)
-        if values is not None:
-            out[name] = values
+    rows = by_readings(path, found.mag, found.gyro, found, notes)
+    out = {TIME: rows.time_s - rows.time_s[0]}
+    for kind, values in rows.vectors.items():
+        out |= _scaled(path, kind, values, found, columns, facts)
+    out |= rows.more
     facts.setdefault("frame", "the sensor's own axes, as recorded")
     if (up := _upward(out)) is not None:
         facts["frame"] += f"; {up}"
-    facts["start"] = f"{mag.time_s[0]:.9f} s on that clock is 0 in time_s"
+    facts["start"] = f"{rows.time_s[0]:.9f} s on that clock is 0 in time_s"
     return Merged(out, notes, facts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ByReadings:
+    """One row per reading of the magnetometer: time_s (N,), vectors (N, 3) by kind, more (N,)."""
+
+    time_s: Array
+    vectors: dict[str, Array]
+    more: dict[str, Array]
+
+
+def by_readings(
+    path: object, mag: SensorSeries, gyro: SensorSeries, found: Sensors, notes: list[str]
+) -> ByReadings:
+    """The sensors of `found`, in its units, at the readings of its magnetometer.
+
+    notes: what was done is added. Raises RecordingError.
+    """
+    mag = _tidy(path, mag, _called("magnetometer", found, "mag"), notes)
+    gyro = _tidy(path, gyro, _called("gyro", found, "gyro"), notes)
+    mag = _overlapping(path, _fresh(mag, notes), gyro)
+    vectors = {"mag": mag.values, "gyro": _at_steps(mag.time_s, gyro, "gyro", notes)}
+    if found.accel is not None and len(found.accel.time_s) >= FEWEST:
+        accel = _tidy(path, found.accel, _called("accelerometer", found, "accel"), notes)
+        vectors["accel"] = _at_steps(mag.time_s, accel, "accelerometer", notes)
+    more = {
+        name: values
+        for name, stream in found.more.items()
+        if (values := _covariate(mag.time_s, stream, name in found.angles)) is not None
+    }
+    return ByReadings(mag.time_s, vectors, more)
 
 
 def positions(
@@ -184,6 +206,7 @@ def _tidy(path: object, stream: SensorSeries, name: str, notes: list[str]) -> Se
         )
     time_s, values = stream.time_s[known], stream.values[known]
     if np.any(np.diff(time_s) < 0.0):
+        _refuse_clock_set_back(path, time_s, name)
         order = np.argsort(time_s, kind="stable")
         notes.append(f"{name}: its readings are out of order, sorted by time")
         time_s, values = time_s[order], values[order]
@@ -205,6 +228,26 @@ def _tidy(path: object, stream: SensorSeries, name: str, notes: list[str]) -> Se
             "record longer",
         )
     return SensorSeries(time_s, values)
+
+
+def _refuse_clock_set_back(path: object, time_s: Array, name: str) -> None:
+    """Readings that lie behind an earlier one for long are no late ones: the clock was set back.
+
+    Sorted by time, readings of two times would be mixed.
+    """
+    newest = np.maximum.accumulate(time_s)
+    edges = np.diff(np.concatenate([[False], time_s < newest, [False]]).astype(np.int8))
+    begins, ends = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+    longest = int(np.argmax(ends - begins))
+    if ends[longest] - begins[longest] < FEWEST:
+        return
+    at = int(begins[longest])
+    raise RecordingError(
+        path,
+        f"{name}: its time goes back by {newest[at] - time_s[at]:.4g} s after {at} readings: the "
+        "clock was set, or the recording repeats itself",
+        "cut it in parts there",
+    )
 
 
 def _fresh(mag: SensorSeries, notes: list[str]) -> SensorSeries:
