@@ -89,6 +89,51 @@ def test_optical_frame_may_have_any_yaw_and_z_up(vehicle, perfect, world):
     assert found.headings[0].figures.before.rms_deg > 5.0
 
 
+@pytest.mark.parametrize(
+    ("convention", "words"),
+    [
+        (lambda q: q * [-1.0, -1.0, -1.0, 1.0], "turns the other way than the gyro says"),
+        (lambda q: q[:, [1, 2, 3, 0]], "turn"),  # the scalar in another place
+        (
+            lambda q: (
+                Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+                * Rotation.from_quat(q)
+                * Rotation.from_euler("x", 180, degrees=True)
+            ).as_quat(),
+            "turns the other way than the gyro says",
+        ),  # of axes x forward, y left, z up
+    ],
+)
+def test_an_attitude_of_another_convention_is_left_out(vehicle, perfect, convention, words):
+    q = convention(Rotation.from_matrix(vehicle.R_nb).as_quat())
+    names = ("ref_qx", "ref_qy", "ref_qz", "ref_qw")
+    track = with_columns(vehicle, **dict(zip(names, q.T, strict=True)))
+    found = judge("r", track, perfect, [optical_reference(track)])
+    assert found.headings == ()
+    assert found.better  # by the field, not by a reference that means something else
+    (told,) = [text for text in found.warnings if text.startswith("optical attitude ")]
+    assert words in told
+    assert told.endswith("it is left out")
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "words"),
+    [
+        ("h_deg", -57.29577951308232, "turns the other way than the gyro says: a heading is posi"),
+        ("h_deg", 1.0, "it is in another unit"),
+        ("h_deg", 57.29577951308232, None),
+        ("h_rad", 1.0, None),
+    ],
+)
+def test_a_heading_of_another_convention_is_left_out(vehicle, perfect, column, factor, words):
+    track = with_columns(vehicle, **{column: factor * np.unwrap(vehicle.heading_rad)})
+    found = judge("r", track, perfect, [column_reference(track, column)])
+    assert len(found.headings) == (words is None)
+    told = [text for text in found.warnings if "left out" in text]
+    assert len(told) == (words is not None)
+    assert all(words in text for text in told)
+
+
 def test_optical_attitude_works_when_the_x_axis_is_vertical(vehicle, perfect):
     """The error is that of the field's direction about the vertical, independent of the x axis."""
     noses_up = Rotation.from_matrix(vehicle.R_nb) * Rotation.from_euler("y", 89.9, degrees=True)
