@@ -89,7 +89,7 @@ def fixes_from_degrees(time_s: Array, lat_deg: Array, lon_deg: Array, source: st
     """Fixes of a receiver. EvaluationError, naming `source`, if the arrays are not positions in
     degrees.
     """
-    known = np.isfinite(time_s) & np.isfinite(lat_deg) & np.isfinite(lon_deg)
+    known = np.isfinite(time_s) & is_place(lat_deg, lon_deg)
     time_s, lat_deg, lon_deg = time_s[known], lat_deg[known], lon_deg[known]
     if len(time_s) < _LEAST_FIXES:
         raise EvaluationError(
@@ -104,6 +104,12 @@ def fixes_from_degrees(time_s: Array, lat_deg: Array, lon_deg: Array, source: st
     east = np.unwrap(np.radians(lon_deg))
     east_m = (east - east[0]) * _EARTH_M * np.cos(np.radians(lat_deg[0]))
     return Fixes(time_s, north, east_m, "GPS")
+
+
+def is_place(lat_deg: Array, lon_deg: Array) -> NDArray[np.bool]:
+    """(N,) which positions are any; receivers without a fix write 0, 0 or nothing."""
+    known = np.isfinite(lat_deg) & np.isfinite(lon_deg)
+    return np.asarray(known & ((lat_deg != 0.0) | (lon_deg != 0.0)))
 
 
 def fixes_of_track(track: EvaluationTrack) -> Fixes | None:
@@ -204,10 +210,8 @@ def column_reference(track: EvaluationTrack, name: str) -> HeadingReference:
 _WINDOW_S = 1.0  # over which both turn, and twice the half width of a mean on top
 _LEAST_TURN_RAD, _MOST_TURN_RAD = 0.1, 2.5  # by the gyro, of windows that tell something
 _FEWEST_TURNS, _MOST_TURNS = 20, 2000
-_OTHER_WAY, _UNLIKE = (
-    -0.5,
-    0.3,
-)  # correlations below and within which it is no heading of this craft
+#: correlations below and within which it is no heading of this craft
+_OTHER_WAY, _UNLIKE = -0.5, 0.3
 _OTHER_UNIT = 0.1  # of the gyro's turn; in rad where deg are wanted it is 0.017
 _CONVENTION = "a heading is positive to the right (north over east), in the unit of its name"
 _ATTITUDE_CONVENTION = "ref_q{w,x,y,z} turns the sensor's own axes into the world's, scalar first"
@@ -227,8 +231,8 @@ def turning_fault(track: EvaluationTrack, reference: HeadingReference, up_b: Arr
     if np.count_nonzero(told) < _FEWEST_TURNS:
         return None
     a, b = gyro_rad[told], own_rad[told]
-    alike = float(a @ b / np.sqrt((a @ a) * max(b @ b, 1e-12)))
-    ratio = float(a @ b / (a @ a))
+    both, gyro, own = float(a @ b), float(a @ a), float(b @ b)
+    alike, ratio = both / np.sqrt(gyro * own) if own > 0.0 else 0.0, both / gyro
     convention = _CONVENTION if reference.up_b is None else _ATTITUDE_CONVENTION
     if alike < _OTHER_WAY:
         return f"turns the other way than the gyro says: {convention}"
@@ -266,11 +270,11 @@ def _gyro_turns(
     with np.errstate(invalid="ignore", divide="ignore"):
         up_0 = up_0 / np.linalg.norm(up_0, axis=1, keepdims=True)
     x = [R_0b[k][:, :, 0] for k in (first, last)]
-    level = [one - up_0 * np.sum(one * up_0, axis=1, keepdims=True) for one in x]
+    level = [one - up_0 * np.einsum("kj,kj->k", one, up_0)[:, None] for one in x]
     right = -np.sum(np.cross(level[0], level[1]) * up_0, axis=1)
     turn = np.arctan2(right, np.sum(level[0] * level[1], axis=1))
-    sizes = [np.linalg.norm(one, axis=1) for one in level]
-    return np.where(np.minimum(*sizes) > _LEVEL_ENOUGH, turn, np.nan)
+    least = np.min([np.linalg.norm(one, axis=1) for one in level], axis=0)
+    return np.where(least > _LEVEL_ENOUGH, turn, np.nan)
 
 
 # -- Errors against a reference --------------------------------------------------------------------

@@ -59,6 +59,18 @@ def test_offset_of_true_heading_to_gps_course_is_slip_and_declination(vehicle, p
     assert found.better
 
 
+def test_fixes_at_0_0_are_none():
+    """As receivers write them that have no fix."""
+    time_s = np.arange(40.0)
+    lat = np.where(time_s < 5.0, 0.0, 50.0 + 1e-4 * time_s)
+    lon = np.where(time_s < 5.0, 0.0, 8.0)
+    found = fixes_from_degrees(time_s, lat, lon, "g")
+    assert len(found.time_s) == 35
+    assert found.north_m[-1] == pytest.approx(np.radians(34e-4) * 6.371e6, abs=0.01)
+    with pytest.raises(EvaluationError, match="g: 0 fixes with time and position"):
+        fixes_from_degrees(time_s, 0.0 * lat, 0.0 * lon, "g")
+
+
 def test_hard_iron_error_on_a_level_turn_has_the_textbook_form(vehicle):
     """A hard iron b ahead changes the heading by atan(b sin / (H + b cos))."""
     heading = np.linspace(-np.pi, np.pi, 721)[:-1]
