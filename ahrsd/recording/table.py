@@ -199,6 +199,7 @@ def table_of(path: Path, columns: dict[str, Array], notes: list[str]) -> Table:
 
 def _checked(columns: _TableRows, check_units: bool) -> Table:
     path = columns.path
+    columns.drop_zero_fields()
     if columns.hold_one_sensor_each():
         columns.join_sensors()
     columns.hold_readings()
@@ -245,6 +246,25 @@ class _TableRows:
         self.covariates = {name: values[rows] for name, values in self.covariates.items()}
         self.words = {name: few.rows(rows) for name, few in self.words.items()}
         self.numbers = self.numbers[rows]
+
+    def drop_zero_fields(self) -> None:
+        """A field of exactly 0 on all axes is none: a reading that failed, or has not come yet.
+
+        Where they come evenly they are the rows between the readings of a slower magnetometer.
+        """
+        none: NDArray[np.bool] = np.asarray((self.vectors(MAG) == 0.0).all(axis=1))
+        count = int(np.count_nonzero(none))
+        if count in (0, len(none)):
+            return
+        if _hold_of(~none) is not None:
+            self.values |= {name: np.where(none, np.nan, self.values[name]) for name in MAG}
+            return
+        self.notes.append(
+            f"left out because the magnetometer reads 0 0 0, which is no field: "
+            f"{counted(count, 'row')}, first row {self.numbers[np.argmax(none)]}"
+        )
+        self._keep(~none)
+        _check_length(self.path, len(self.numbers))
 
     def hold_one_sensor_each(self) -> bool:
         """Whether rows with a field and no rates, and such with rates and no field, are usual."""

@@ -437,6 +437,30 @@ def test_impossible_readings_are_left_out(tmp_path, mark):
     assert "because of an impossible reading: 3 rows, first row 102" in table.notes[0]
 
 
+def test_a_field_of_zeros_is_left_out(tmp_path):
+    """What a driver writes where a reading failed."""
+    columns = cells()
+    for name in MAG:
+        columns[name][100:140] = ["0"] * 40
+    table = read(tmp_path, text(columns))
+    assert len(table.rows) == COUNT - 40
+    assert table.starts == (0, 100)
+    assert table.notes == (
+        "left out because the magnetometer reads 0 0 0, which is no field: 40 rows, first row 102",
+    )
+
+
+@pytest.mark.parametrize("every", [4, 10])
+def test_zeros_between_the_readings_of_a_slower_magnetometer_are_none(tmp_path, every):
+    columns = cells()
+    for name in MAG:
+        columns[name] = [cell if k % every == 0 else "0.0" for k, cell in enumerate(columns[name])]
+    table = read(tmp_path, text(columns))
+    assert len(table.rows) == COUNT
+    assert f"a reading in {COUNT // every} of {COUNT} rows" in table.notes[0]
+    np.testing.assert_allclose(table.rows.raw_b_gauss, held(DATA["mag"], every), atol=1e-6)
+
+
 # -- other files -----------------------------------------------------------------------------------
 
 
