@@ -142,10 +142,10 @@ def test_covariates_have_their_documented_names(tmp_path):
     np.testing.assert_allclose(columns["position_east_m"], 0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("unit", ["G", "uT", "mG"])
+@pytest.mark.parametrize("unit", ["G", "mT", "uT", "mG"])
 def test_field_not_in_tesla_is_reported_and_read_with_the_option(tmp_path, unit):
     data = sensor()
-    factor = {"G": 1.0, "uT": 100.0, "mG": 1000.0}[unit]
+    factor = {"G": 1.0, "mT": 0.1, "uT": 100.0, "mG": 1000.0}[unit]
     path = ros_files.save(tmp_path, "mcap", [*imu(data), *magnetic(data, factor=factor)])
     with pytest.raises(RecordingError, match="it looks like") as refused:
         open_recording(path)

@@ -25,7 +25,7 @@ STILL = 0.1  # of another gyro's rates, below which the two did not make the sam
 _FASTER = 1.5  # times the magnetometer's rate, from which on means over its steps are taken
 _FRESH = 0.67  # share of new readings below which the magnetometer is logged faster than it reads
 #: units of a magnetometer with their factor to gauss, and what a vector's size may be in gauss
-_MAG_UNITS = {"T": 1e4, "gauss": 1.0, "mG": 1e-3, "uT": 1e-2, "nT": 1e-5}
+_MAG_UNITS = {"T": 1e4, "mT": 10.0, "gauss": 1.0, "mG": 1e-3, "uT": 1e-2, "nT": 1e-5}
 _MAG_SIZES = ((0.2, 0.8), (0.05, 3.0))  # of the Earth's field; with much iron about it
 _FASTEST_RAD_S = 20.0  # which nothing turns in the median
 _LARGEST = 1e9  # what no sensor reads in any unit
