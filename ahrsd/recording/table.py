@@ -53,7 +53,7 @@ from ahrsd.recording.column_names import (
     other_unit,
     resolve,
 )
-from ahrsd.recording.foreign.sensors import Sensors, SensorSeries, by_readings
+from ahrsd.recording.foreign.sensors import Sensors, SensorSeries, by_readings, upward
 from ahrsd.recording.limits import (
     SPAN_S,
     TABLE_BYTES,
@@ -217,6 +217,7 @@ def _checked(columns: _TableRows, check_units: bool) -> Table:
                 raise RecordingError(path, *wrong)
     accel = columns.acceleration()
     _check_length(path, len(accel))
+    columns.tell_upward(accel)
     return columns.table(accel)
 
 
@@ -569,6 +570,16 @@ class _TableRows:
                 self.notes.append(f"the acceleration was in {unit}: taken as m/s^2")
                 return accel * factor
         return accel
+
+    def tell_upward(self, accel: Array) -> None:
+        """A note on axes that are not those of the device, whose registers are for its own."""
+        found = upward(dict(zip(ACCEL, accel.T, strict=True))) or ""
+        if found.endswith("z points up"):
+            self.notes.append(
+                f"{found}: these axes are not x forward, y right, z down, or the acceleration has "
+                "the other sign; a calibration is for the axes of the recording, and in others "
+                "its numbers are wrong"
+            )
 
     def _without_holes(self, accel: Array) -> Array:
         known: NDArray[np.bool] = np.asarray(np.isfinite(accel).all(axis=1))

@@ -461,6 +461,14 @@ def test_zeros_between_the_readings_of_a_slower_magnetometer_are_none(tmp_path, 
     np.testing.assert_allclose(table.rows.raw_b_gauss, held(DATA["mag"], every), atol=1e-6)
 
 
+@pytest.mark.parametrize(("sign", "told"), [(1.0, True), (-1.0, False)])
+def test_axes_whose_z_points_up_are_told(tmp_path, sign, told):
+    """A calibration of such a table is not one in the axes of a VN-100."""
+    level = np.tile([0.1, -0.2, sign * 9.8], (COUNT, 1))
+    table = read(tmp_path, text(cells({**DATA, "accel": level})))
+    assert [note[:27] for note in table.notes] == ["by gravity its z points up:"] * told
+
+
 # -- other files -----------------------------------------------------------------------------------
 
 

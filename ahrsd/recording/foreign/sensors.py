@@ -122,7 +122,7 @@ def merged(path: object, found: Sensors, columns: ColumnMap = NO_MAP) -> Merged:
         out |= _scaled(path, kind, values, found, columns, facts)
     out |= rows.more
     facts.setdefault("frame", "the sensor's own axes, as recorded")
-    if (up := _upward(out)) is not None:
+    if (up := upward(out)) is not None:
         facts["frame"] += f"; {up}"
     facts["start"] = f"{rows.time_s[0]:.9f} s on that clock is 0 in time_s"
     return Merged(out, notes, facts)
@@ -395,7 +395,7 @@ def _option(kind: str, unit: str) -> str:
     return f"say so: --columns {pairs}"
 
 
-def _upward(columns: Mapping[str, Array]) -> str | None:
+def upward(columns: Mapping[str, Array]) -> str | None:
     """Which axis points up by gravity, where one does in the mean."""
     if ACCEL[0] not in columns:
         return None
