@@ -74,7 +74,7 @@ def calibration_json(
         | _found(estimate, heading or HeadingErrors())
         | {
             "registers": written,
-            "warnings": said,
+            "warnings": list(dict.fromkeys(said)),
         }
     )
 

@@ -252,7 +252,8 @@ def stuck(raw_b_gauss: Array) -> str:
     for axis, values in zip("xyz", raw_b_gauss.T, strict=True):
         for limit in (values.min(), values.max()):
             if np.mean(values == limit) > _STUCK:
-                return f"readings of {axis} stick at {limit:.4g} gauss: saturated"
+                why = "saturated" if limit else "the magnetometer gave none"
+                return f"readings of {axis} stick at {limit:.4g} gauss: {why}"
     return ""
 
 

@@ -511,9 +511,10 @@ def has_motion(data: chain.EpochData, bias_rad_s: Array) -> bool:
         .reshape(count, _SMOOTHED_STEPS, 3)
         .mean(axis=1)
     )
-    relative = principal_deviation(field) / float(
-        np.median(np.linalg.norm(data.field_b_gauss, axis=1))
-    )
+    size_gauss = float(np.median(np.linalg.norm(data.field_b_gauss, axis=1)))
+    if not size_gauss > 0.0:  # a magnetometer that fell silent tells nothing
+        return False
+    relative = principal_deviation(field) / size_gauss
     angle = data.angle_b_rad[1:]
     path = np.cumsum(angle - bias_rad_s * data.dt_s[1:, None], axis=0)
     if relative > _LEAST_SWEEP and principal_deviation(path) > _LEAST_PATH * relative:

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ahrsd import so3
 from ahrsd.evaluation.track import EvaluationError, EvaluationTrack
 from ahrsd.heading import tilt_compensated_heading, wrapped
 from ahrsd.samples import Array
@@ -88,7 +89,7 @@ def fixes_from_degrees(time_s: Array, lat_deg: Array, lon_deg: Array, source: st
     """Fixes of a receiver. EvaluationError, naming `source`, if the arrays are not positions in
     degrees.
     """
-    known = np.isfinite(time_s) & np.isfinite(lat_deg) & np.isfinite(lon_deg)
+    known = np.isfinite(time_s) & is_place(lat_deg, lon_deg)
     time_s, lat_deg, lon_deg = time_s[known], lat_deg[known], lon_deg[known]
     if len(time_s) < _LEAST_FIXES:
         raise EvaluationError(
@@ -103,6 +104,12 @@ def fixes_from_degrees(time_s: Array, lat_deg: Array, lon_deg: Array, source: st
     east = np.unwrap(np.radians(lon_deg))
     east_m = (east - east[0]) * _EARTH_M * np.cos(np.radians(lat_deg[0]))
     return Fixes(time_s, north, east_m, "GPS")
+
+
+def is_place(lat_deg: Array, lon_deg: Array) -> NDArray[np.bool]:
+    """(N,) which positions are any; receivers without a fix write 0, 0 or nothing."""
+    known = np.isfinite(lat_deg) & np.isfinite(lon_deg)
+    return np.asarray(known & ((lat_deg != 0.0) | (lon_deg != 0.0)))
 
 
 def fixes_of_track(track: EvaluationTrack) -> Fixes | None:
@@ -195,6 +202,79 @@ def column_reference(track: EvaluationTrack, name: str) -> HeadingReference:
     return HeadingReference(
         f"column {name}", not device, track.time_s[known], values[known], detail=detail
     )
+
+
+# -- Whether a reference turns as the gyro does ----------------------------------------------------
+
+
+_WINDOW_S = 1.0  # over which both turn, and twice the half width of a mean on top
+_LEAST_TURN_RAD, _MOST_TURN_RAD = 0.1, 2.5  # by the gyro, of windows that tell something
+_FEWEST_TURNS, _MOST_TURNS = 20, 2000
+#: correlations below and within which it is no heading of this craft
+_OTHER_WAY, _UNLIKE = -0.5, 0.3
+_OTHER_UNIT = 0.1  # of the gyro's turn; in rad where deg are wanted it is 0.017
+_CONVENTION = "a heading is positive to the right (north over east), in the unit of its name"
+_ATTITUDE_CONVENTION = "ref_q{w,x,y,z} turns the sensor's own axes into the world's, scalar first"
+
+
+def turning_fault(track: EvaluationTrack, reference: HeadingReference, up_b: Array) -> str | None:
+    """What a reference is not, by its turns within a second against the gyro's; None: nothing.
+
+    up_b (N, 3): the vertical that its headings are compared with. Without turns nothing is told.
+    """
+    starts, ends = _windows(track, reference)
+    at = np.clip(np.searchsorted(track.time_s, reference.time_s), 0, len(track) - 1)
+    gyro_rad = _gyro_turns(track, up_b, at[starts], at[ends])
+    own_rad = wrapped(reference.heading_rad[ends] - reference.heading_rad[starts])
+    size = np.abs(gyro_rad)
+    told = (size > _LEAST_TURN_RAD) & (size < _MOST_TURN_RAD) & np.isfinite(own_rad)
+    if np.count_nonzero(told) < _FEWEST_TURNS:
+        return None
+    a, b = gyro_rad[told], own_rad[told]
+    both, gyro, own = float(a @ b), float(a @ a), float(b @ b)
+    alike, ratio = both / np.sqrt(gyro * own) if own > 0.0 else 0.0, both / gyro
+    convention = _CONVENTION if reference.up_b is None else _ATTITUDE_CONVENTION
+    if alike < _OTHER_WAY:
+        return f"turns the other way than the gyro says: {convention}"
+    if alike > _UNLIKE and ratio < _OTHER_UNIT:
+        return f"turns {1.0 / ratio:.3g} times less than the gyro says: it is in another unit"
+    if abs(alike) < _UNLIKE:
+        return f"does not turn as the gyro says: {convention}, on the recording's clock"
+    return None
+
+
+def _windows(
+    track: EvaluationTrack, reference: HeadingReference
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First and last instant of each window of the reference, none across a gap of the track."""
+    time_s = reference.time_s
+    length_s = _WINDOW_S + 2.0 * reference.half_width_s
+    starts = np.arange(0, len(time_s), max(len(time_s) // _MOST_TURNS, 1))
+    ends = np.minimum(np.searchsorted(time_s, time_s[starts] + length_s), len(time_s) - 1)
+    begins = track.time_s[list(track.starts)]
+    piece = np.searchsorted(begins, time_s, side="right")
+    span_s = time_s[ends] - time_s[starts]
+    inside = (time_s[starts] >= track.time_s[0]) & (time_s[ends] <= track.time_s[-1])
+    kept = inside & (span_s > 0.0) & (span_s < 2.0 * length_s) & (piece[starts] == piece[ends])
+    return starts[kept], ends[kept]
+
+
+def _gyro_turns(
+    track: EvaluationTrack, up_b: Array, first: NDArray[np.intp], last: NDArray[np.intp]
+) -> Array:
+    """(K,) how far x turns to the right about the vertical from one sample to another, rad; nan
+    where it points up or down."""
+    dt_s = np.diff(track.time_s, prepend=track.time_s[0])
+    R_0b = so3.products(so3.exp(track.gyro_b_rad_s * dt_s[:, None]))
+    up_0 = np.einsum("kij,kj->ki", R_0b[first], up_b[first])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        up_0 = up_0 / np.linalg.norm(up_0, axis=1, keepdims=True)
+    x = [R_0b[k][:, :, 0] for k in (first, last)]
+    level = [one - up_0 * np.einsum("kj,kj->k", one, up_0)[:, None] for one in x]
+    right = -np.sum(np.cross(level[0], level[1]) * up_0, axis=1)
+    turn = np.arctan2(right, np.sum(level[0] * level[1], axis=1))
+    least = np.min([np.linalg.norm(one, axis=1) for one in level], axis=0)
+    return np.where(least > _LEVEL_ENOUGH, turn, np.nan)
 
 
 # -- Errors against a reference --------------------------------------------------------------------

@@ -24,6 +24,7 @@ from ahrsd.evaluation.heading import (
     heading_figures,
     reckoning_figures,
     rms_difference,
+    turning_fault,
     velocity_of,
 )
 from ahrsd.evaluation.track import EvaluationError, EvaluationTrack, Tilt, up_directions
@@ -160,6 +161,9 @@ def judge(
     for reference in references:
         up = up_b if reference.up_b is None else reference.up_b
         if up is None:
+            continue
+        if (fault := turning_fault(track, reference, up)) is not None:
+            warnings.append(f"{reference.name} {fault}; it is left out")
             continue
         compare_with_reference = partial(
             heading_figures, track.time_s, up_b=up, reference=reference

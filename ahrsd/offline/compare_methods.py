@@ -98,7 +98,7 @@ def our_row(result: BatchResult, *, held_out: bool = True) -> ComparisonRow:
         estimate.hard_iron_gauss,
         estimate.gyro_bias_rad_s,
         result.converged,
-        "" if result.converged else f"not converged: {reasons}",
+        "" if result.converged else f"not converged: {reasons.removeprefix('not converged: ')}",
         spread_of([_blocks(result)], answers),
         _held_out_spread(result, OURS) if held_out else None,
     )

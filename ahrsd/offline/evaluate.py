@@ -34,6 +34,7 @@ from ahrsd.evaluation.heading import (
     device_heading,
     fixes_from_degrees,
     fixes_of_track,
+    is_place,
     optical_reference,
 )
 from ahrsd.events import SamplesSeen
@@ -209,8 +210,7 @@ def read_fixes(path: Path) -> tuple[Fixes, str]:
     lat, lon = (columns[name] for name in _GPS_PLACE)
     fixes = fixes_from_degrees(columns[time], lat, lon, f"GPS ({path.name})")
     alt = columns.get("alt_m", np.zeros(len(lat)))
-    place = np.column_stack([lat, lon, np.nan_to_num(alt)])
-    place = place[np.isfinite(place).all(axis=1)]
+    place = np.column_stack([lat, lon, np.nan_to_num(alt)])[is_place(lat, lon)]
     return fixes, ",".join(f"{value:.6f}" for value in place[len(place) // 2])
 
 

@@ -183,6 +183,7 @@ _WITH_UNIT = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")
 _NUMBER = "NUMBER"
 _COUNTS = re.compile(r"(?i)(counts?|lsb|raw|adc)$")
 _WORDS = {"time": "time|stamp", "mag": "mag|field", "gyro": "gyr|ang|rate|omega", "accel": "acc"}
+_ANGLE = re.compile("(?:angle|euler)(?!.*(?:rate|vel|speed))")  # which is no rate
 #: what stands before the axis in names of two letters: mx, b_y, w[2], a.z
 _LETTERS = {"mag": "[mbh]", "gyro": "[gw]", "accel": "a"}
 _SDK_MARKS = {"TimeStartup", "TimeGps", "UncompMagX", "AngularRateX"}
@@ -342,7 +343,8 @@ def _is_axis(kind: str, axis: str, low: str) -> bool:
     place = rf"(^|[^a-z]){axis}([^a-z]|$)|{axis}$|[\[_.]{'xyz'.index(axis)}\]?$"
     letter = rf"^{_LETTERS[kind]}[_.\[]?({axis}|{'xyz'.index(axis)})\]?$"
     worded = re.search(_WORDS[kind], low) and re.search(place, low)
-    return bool(worded or re.search(letter, low))
+    angle = kind == "gyro" and _ANGLE.search(low)
+    return bool((worded and not angle) or re.search(letter, low))
 
 
 def _remedy(missing: Sequence[str], names: Sequence[str], used: set[str]) -> str:

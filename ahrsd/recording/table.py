@@ -53,6 +53,7 @@ from ahrsd.recording.column_names import (
     other_unit,
     resolve,
 )
+from ahrsd.recording.foreign.sensors import Sensors, SensorSeries, by_readings, upward
 from ahrsd.recording.limits import (
     SPAN_S,
     TABLE_BYTES,
@@ -170,7 +171,10 @@ def _read(path: Path, check_units: bool, given: ColumnMap) -> Table:
     covariates, text_names = _covariates(table, found)
     notes += [*found.notes, *(f"column {name} is text and was left out" for name in text_names)]
     numbers = np.arange(len(table)) + first_row
+    words = {name: _few_words(table[found.covariates[name]]) for name in text_names}
     rows = _TableRows(path, values, covariates, numbers, notes, sources=found.sources)
+    rows.words = {name: few for name, few in words.items() if few is not None}
+    rows.refuse_missing()
     return _checked(rows, check_units)
 
 
@@ -195,12 +199,16 @@ def table_of(path: Path, columns: dict[str, Array], notes: list[str]) -> Table:
 
 def _checked(columns: _TableRows, check_units: bool) -> Table:
     path = columns.path
+    columns.drop_zero_fields()
+    if columns.hold_one_sensor_each():
+        columns.join_sensors()
     columns.hold_readings()
     columns.draw_rates()
     columns.drop_doubles()
     columns.undo_repeats()
     columns.refuse_several_sensors()
     columns.drop_impossible()
+    columns.tell_turns()
     columns.set_clock()
     if check_units:
         for limits in RANGES:
@@ -209,6 +217,7 @@ def _checked(columns: _TableRows, check_units: bool) -> Table:
                 raise RecordingError(path, *wrong)
     accel = columns.acceleration()
     _check_length(path, len(accel))
+    columns.tell_upward(accel)
     return columns.table(accel)
 
 
@@ -216,7 +225,8 @@ def _checked(columns: _TableRows, check_units: bool) -> Table:
 class _TableRows:
     """A table's columns on their way to samples: what is dropped here is dropped in all of them.
 
-    numbers (N,): of the rows in the file; sources: the file's columns by canonical name
+    numbers (N,): of the rows in the file; sources: the file's columns by canonical name; words:
+    text columns of few different words
     """
 
     path: Path
@@ -226,6 +236,7 @@ class _TableRows:
     notes: list[str]
     starts: tuple[int, ...] = ()
     sources: Mapping[str, Source] = field(default_factory=dict)
+    words: dict[str, _FewWords] = field(default_factory=dict)
 
     def vectors(self, names: tuple[str, str, str]) -> Array:
         """(N, 3) of three columns."""
@@ -234,7 +245,87 @@ class _TableRows:
     def _keep(self, rows: NDArray[np.bool]) -> None:
         self.values = {name: values[rows] for name, values in self.values.items()}
         self.covariates = {name: values[rows] for name, values in self.covariates.items()}
+        self.words = {name: few.rows(rows) for name, few in self.words.items()}
         self.numbers = self.numbers[rows]
+
+    def drop_zero_fields(self) -> None:
+        """A field of exactly 0 on all axes is none: a reading that failed, or has not come yet.
+
+        Where they come evenly they are the rows between the readings of a slower magnetometer.
+        """
+        none: NDArray[np.bool] = np.asarray((self.vectors(MAG) == 0.0).all(axis=1))
+        count = int(np.count_nonzero(none))
+        if count in (0, len(none)):
+            return
+        if _hold_of(~none) is not None:
+            self.values |= {name: np.where(none, np.nan, self.values[name]) for name in MAG}
+            return
+        self.notes.append(
+            f"left out because the magnetometer reads 0 0 0, which is no field: "
+            f"{counted(count, 'row')}, first row {self.numbers[np.argmax(none)]}"
+        )
+        self._keep(~none)
+        _check_length(self.path, len(self.numbers))
+
+    def hold_one_sensor_each(self) -> bool:
+        """Whether rows with a field and no rates, and such with rates and no field, are usual."""
+        mag, gyro = (np.isfinite(self.vectors(names)).all(axis=1) for names in (MAG, GYRO))
+        alone = ((mag & ~gyro, mag), (gyro & ~mag, gyro))
+        return all(
+            0 < _SPARSE_SHARE * np.count_nonzero(all_of) <= np.count_nonzero(without_other)
+            for without_other, all_of in alone
+        )
+
+    def refuse_missing(self) -> None:
+        """Raise RecordingError at the first cell of a needed column that is no number."""
+        one_each = self.hold_one_sensor_each()
+        for name, values in self.values.items():
+            wrong = np.flatnonzero(~np.isfinite(values))
+            slower = one_each or _SPARSE_SHARE * len(values) <= len(wrong) < len(values)
+            if len(wrong) and (name == TIME or not slower):
+                column = self.sources.get(name, Source(name)).column
+                raise RecordingError(
+                    self.path,
+                    f"row {self.numbers[wrong[0]]}, column {printable(column)}: empty, nan or "
+                    f"infinite ({counted(len(wrong), 'row')} in all)",
+                    "leave such rows out; a missing row is a gap, which is understood",
+                )
+
+    def join_sensors(self) -> None:
+        """Rows of one sensor each become one row per reading of the magnetometer."""
+        series = {"mag": self._series(self.vectors(MAG)), "gyro": self._series(self.vectors(GYRO))}
+        if all(name in self.covariates for name in ACCEL):
+            force = np.column_stack([self.covariates[name] for name in ACCEL])
+            series["accel"] = self._series(force)
+        more = {
+            name: self._series(values[:, None])
+            for name, values in self.covariates.items()
+            if name not in ACCEL
+        }
+        rows: NDArray[np.bool] = np.asarray(np.isfinite(self.vectors(MAG)).all(axis=1))
+        order = np.argsort(self.values[TIME][rows], kind="stable")
+        stamps_s, numbers = series["mag"].time_s[order], self.numbers[rows][order]
+        self.notes.append(
+            f"each row holds one sensor: {np.count_nonzero(rows)} of {len(rows)} the "
+            f"magnetometer, {len(series['gyro'].time_s)} the gyro; one row per reading of the "
+            "magnetometer is used"
+        )
+        angles = frozenset(name for name in more if name.endswith("_deg"))
+        found = Sensors(accel=series.get("accel"), more=more, angles=angles)
+        joined = by_readings(self.path, series["mag"], series["gyro"], found, self.notes)
+        self.values = {TIME: joined.time_s}
+        self.covariates = dict(joined.more)
+        for kind, names in (("mag", MAG), ("gyro", GYRO), ("accel", ACCEL)):
+            if kind in joined.vectors:
+                into = self.covariates if kind == "accel" else self.values
+                into |= dict(zip(names, joined.vectors[kind].T, strict=True))
+        self.numbers = numbers[np.searchsorted(stamps_s, joined.time_s)]
+        self.words = {}
+
+    def _series(self, values: Array) -> SensorSeries:
+        """Readings (N, k) of one sensor, in the rows that have one, on a clock that counts on."""
+        rows = np.isfinite(values).all(axis=1)
+        return SensorSeries(unwrapped(self.values[TIME][rows])[0], values[rows])
 
     def hold_readings(self) -> None:
         """Rows between the readings of a slower magnetometer repeat the last one."""
@@ -309,12 +400,13 @@ class _TableRows:
             _check_length(self.path, len(self.numbers))
 
     def refuse_several_sensors(self) -> None:
-        """Rows of several sensors that take turns, told apart by a column of few whole numbers.
+        """Rows of several sensors that take turns, told apart by a column of few words or numbers.
 
         What they read differs between them, and hardly from one row of a sensor to its next.
         """
         rows = self.vectors(MAG)
-        for name, column in self.covariates.items():
+        columns = {name: few.of_row for name, few in self.words.items()} | self.covariates
+        for name, column in columns.items():
             head = column[:_SENSORS_LOOK]
             kinds = np.unique(head[np.isfinite(head)])
             if not 2 <= len(kinds) <= _MOST_SENSORS or not np.all(kinds == np.rint(kinds)):
@@ -326,13 +418,33 @@ class _TableRows:
             own = [np.diff(rows[column == kind], axis=0) for kind in kinds]
             within = np.median(np.linalg.norm(np.vstack(own), axis=1))
             if across > _APART * within:
-                shown = ", ".join(f"{kind:g}" for kind in kinds)
+                few = self.words.get(name)
+                shown = [f"{kind:g}" if few is None else few.names[int(kind)] for kind in kinds]
                 raise RecordingError(
                     self.path,
                     f"holds the rows of {len(kinds)} sensors in turn, by its column "
-                    f"{printable(name)} ({shown})",
+                    f"{printable(name)} ({', '.join(map(printable, shown))})",
                     "keep the rows of one of them",
                 )
+
+    def tell_turns(self) -> None:
+        """A note on a field that is the same again after a few rows, and another one in between.
+
+        Without a column that tells the sensors apart it may be one sensor near a current, too.
+        """
+        rows = self.vectors(MAG)
+        if len(rows) < MINIMUM_ROWS:
+            return
+        jump = float(np.median(np.linalg.norm(np.diff(rows, axis=0), axis=1)))
+        for count in range(2, _MOST_SENSORS + 1):
+            again = np.median(np.linalg.norm(rows[count:] - rows[:-count], axis=1))
+            if jump > _APART * again:
+                self.notes.append(
+                    f"the field jumps by {1e3 * jump:.3g} mG from row to row and is the same again "
+                    f"after {count} rows: these are the rows of {count} sensors in turn, of which "
+                    "only one may be kept, or an alternating current is near"
+                )
+                return
 
     def drop_impossible(self) -> None:
         """Rows with a reading that no such sensor can have among good ones: marks, damaged cells.
@@ -459,6 +571,16 @@ class _TableRows:
                 return accel * factor
         return accel
 
+    def tell_upward(self, accel: Array) -> None:
+        """A note on axes that are not those of the device, whose registers are for its own."""
+        found = upward(dict(zip(ACCEL, accel.T, strict=True))) or ""
+        if found.endswith("z points up"):
+            self.notes.append(
+                f"{found}: these axes are not x forward, y right, z down, or the acceleration has "
+                "the other sign; a calibration is for the axes of the recording, and in others "
+                "its numbers are wrong"
+            )
+
     def _without_holes(self, accel: Array) -> Array:
         known: NDArray[np.bool] = np.asarray(np.isfinite(accel).all(axis=1))
         count = int(np.count_nonzero(~known))
@@ -572,7 +694,11 @@ def _read_parquet(path: Path, given: ColumnMap) -> pyarrow.Table:
             source.column
             for source in _resolved(path, file.schema_arrow.names, given).sources.values()
         }
-        wanted = [name for name, kind in kinds.items() if _is_plain(kind) or name in needed]
+        wanted = [
+            name
+            for name, kind in kinds.items()
+            if _is_plain(kind) or _is_text(kind) or name in needed
+        ]
         cells = file.metadata.num_rows * len(wanted)
         refuse_beyond(path, cells, TABLE_CELLS, "numbers", "cut it in parts")
         table = file.read(columns=wanted, use_threads=False)
@@ -615,8 +741,15 @@ def _is_plain(kind: pyarrow.DataType) -> bool:
     )  # fmt: skip
 
 
+def _is_text(kind: pyarrow.DataType) -> bool:
+    types = pyarrow.types
+    if types.is_dictionary(kind):
+        kind = kind.value_type
+    return bool(types.is_string(kind) or types.is_large_string(kind))
+
+
 def _numbers(path: Path, table: pyarrow.Table, name: str, source: Source, first_row: int) -> Array:
-    """A required column.  Raises RecordingError at its first cell that is no finite number."""
+    """A required column, nan where a cell is empty.  Raises RecordingError where it is text."""
     column = table[source.column]
     values = _seconds(column) if name == TIME else None
     factor = 1.0 if values is not None else source.factor
@@ -624,15 +757,6 @@ def _numbers(path: Path, table: pyarrow.Table, name: str, source: Source, first_
         values = _as_floats(column, from_first=name == TIME and source.factor != 1.0)
     if values is None:
         _refuse_text(path, column, source.column, first_row)
-    wrong = np.flatnonzero(~np.isfinite(values))
-    sparse = name in (*MAG, *GYRO) and _SPARSE_SHARE * len(values) <= len(wrong) < len(values)
-    if len(wrong) and not sparse:
-        raise RecordingError(
-            path,
-            f"row {wrong[0] + first_row}, column {printable(source.column)}: empty, nan or "
-            f"infinite ({counted(len(wrong), 'row')} in all)",
-            "leave such rows out; a missing row is a gap, which is understood",
-        )
     return values if factor == 1.0 else values * factor
 
 
@@ -794,6 +918,30 @@ def _covariates(table: pyarrow.Table, found: Resolved) -> tuple[dict[str, Array]
         else:
             numeric[name] = values if source.factor == 1.0 else values * source.factor
     return numeric, text
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FewWords:
+    """A text column of few different words: of_row (N,) has the number of each row's in `names`."""
+
+    names: tuple[str, ...]
+    of_row: Array
+
+    def rows(self, kept: NDArray[np.bool]) -> _FewWords:
+        return _FewWords(self.names, self.of_row[kept])
+
+
+def _few_words(column: pyarrow.ChunkedArray) -> _FewWords | None:
+    """The words of a text column; None where they are many, or it is no text."""
+    if not _is_text(column.type):
+        return None
+    if pyarrow.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    if not 2 <= len(set(column[:_SENSORS_LOOK].to_pylist()) - {None}) <= _MOST_SENSORS:
+        return None
+    number: dict[str | None, int] = {}
+    of_row = [number.setdefault(word, len(number)) for word in column.to_pylist()]
+    return _FewWords(tuple("" if w is None else w for w in number), np.array(of_row, np.float64))
 
 
 def _check_length(path: Path, rows: int) -> None:

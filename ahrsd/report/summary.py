@@ -32,6 +32,8 @@ _TABLE_IS_RAW = (
     "top of what registers 23, 26 and 84 did to it"
 )
 _NAMES = (*(f"hard iron {a}" for a in "xyz"), *(f"gyro bias {a}" for a in "xyz"))
+#: of a sensor whose own scale is off by 40 %; on Earth the field has 0.22 to 0.67 gauss
+_FIELD_GAUSS = (0.22 / 1.4, 0.67 * 1.4)
 _DIGITS = 6  # of times in the summary: microseconds
 
 
@@ -216,12 +218,14 @@ class BatchResult:
     def all_warnings(self) -> list[str]:
         """Warnings of recording and stream."""
         turned = None if self.wrong else self.misalignment  # of axes, units or times that are wrong
-        return [
+        said = [
             *(f"{words}: put this right and calibrate again" for words in self._wrong_besides),
+            *(_not_of_the_earth(self.estimate) if self.estimate is not None else ()),
             *warnings_of(self.core, self.warnings),
             *(self.estimate.warnings if self.estimate is not None else ()),
             *([] if turned is None or not turned.significant else [_misalignment_text(turned)]),
         ]
+        return list(dict.fromkeys(said))
 
     @property
     def _wrong_besides(self) -> tuple[str, ...]:
@@ -264,6 +268,20 @@ class BatchResult:
             write_report(path, report)
         except OSError as error:
             raise AhrsdError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _not_of_the_earth(estimate: Estimate) -> list[str]:
+    """A field that no place on Earth has, as the sensor itself measures it: another unit."""
+    size = float(estimate.field_gauss * np.cbrt(np.linalg.det(estimate.soft_iron)))
+    least, most = _FIELD_GAUSS
+    if not estimate.converged or least <= size <= most:
+        return []
+    milli = f" ({10.0 * size:.2f} if it is in mT: --columns mag_x=COLUMN:mT,...)"
+    hint = milli if least <= 10.0 * size <= most else ""
+    return [
+        f"the field has {size:.3g} gauss, and on Earth it has 0.22 to 0.67: the magnetometer's "
+        f"unit is not gauss{hint}, or its scale is wrong; the hard iron is wrong by the same factor"
+    ]
 
 
 def _misalignment_text(turned: Misalignment) -> str:

@@ -79,6 +79,13 @@ def test_motion_is_recognised_by_rotation(amplitude, expected):
     assert has_motion(epoch(amplitude, 1e-3, n=512), np.zeros(3)) is expected
 
 
+def test_no_field_at_all_is_not_motion():
+    """A magnetometer that reads 0 0 0 while the vehicle turns."""
+    data = epoch(0.5, 1e-3, n=512)
+    data.field_b_gauss[:] = 0.0
+    assert has_motion(data, np.zeros(3)) is False
+
+
 def test_wandering_field_at_rest_is_not_motion():
     data = epoch(0.0, 1e-3, n=512)
     data.field_b_gauss[:, 2] += np.linspace(0, 0.05, 512)

@@ -59,6 +59,18 @@ def test_offset_of_true_heading_to_gps_course_is_slip_and_declination(vehicle, p
     assert found.better
 
 
+def test_fixes_at_0_0_are_none():
+    """As receivers write them that have no fix."""
+    time_s = np.arange(40.0)
+    lat = np.where(time_s < 5.0, 0.0, 50.0 + 1e-4 * time_s)
+    lon = np.where(time_s < 5.0, 0.0, 8.0)
+    found = fixes_from_degrees(time_s, lat, lon, "g")
+    assert len(found.time_s) == 35
+    assert found.north_m[-1] == pytest.approx(np.radians(34e-4) * 6.371e6, abs=0.01)
+    with pytest.raises(EvaluationError, match="g: 0 fixes with time and position"):
+        fixes_from_degrees(time_s, 0.0 * lat, 0.0 * lon, "g")
+
+
 def test_hard_iron_error_on_a_level_turn_has_the_textbook_form(vehicle):
     """A hard iron b ahead changes the heading by atan(b sin / (H + b cos))."""
     heading = np.linspace(-np.pi, np.pi, 721)[:-1]
@@ -87,6 +99,51 @@ def test_optical_frame_may_have_any_yaw_and_z_up(vehicle, perfect, world):
     assert found.headings[0].tilt == "reference"
     assert found.headings[0].figures.after.worst_deg < 1e-6
     assert found.headings[0].figures.before.rms_deg > 5.0
+
+
+@pytest.mark.parametrize(
+    ("convention", "words"),
+    [
+        (lambda q: q * [-1.0, -1.0, -1.0, 1.0], "turns the other way than the gyro says"),
+        (lambda q: q[:, [1, 2, 3, 0]], "turn"),  # the scalar in another place
+        (
+            lambda q: (
+                Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+                * Rotation.from_quat(q)
+                * Rotation.from_euler("x", 180, degrees=True)
+            ).as_quat(),
+            "turns the other way than the gyro says",
+        ),  # of axes x forward, y left, z up
+    ],
+)
+def test_an_attitude_of_another_convention_is_left_out(vehicle, perfect, convention, words):
+    q = convention(Rotation.from_matrix(vehicle.R_nb).as_quat())
+    names = ("ref_qx", "ref_qy", "ref_qz", "ref_qw")
+    track = with_columns(vehicle, **dict(zip(names, q.T, strict=True)))
+    found = judge("r", track, perfect, [optical_reference(track)])
+    assert found.headings == ()
+    assert found.better  # by the field, not by a reference that means something else
+    (told,) = [text for text in found.warnings if text.startswith("optical attitude ")]
+    assert words in told
+    assert told.endswith("it is left out")
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "words"),
+    [
+        ("h_deg", -57.29577951308232, "turns the other way than the gyro says: a heading is posi"),
+        ("h_deg", 1.0, "it is in another unit"),
+        ("h_deg", 57.29577951308232, None),
+        ("h_rad", 1.0, None),
+    ],
+)
+def test_a_heading_of_another_convention_is_left_out(vehicle, perfect, column, factor, words):
+    track = with_columns(vehicle, **{column: factor * np.unwrap(vehicle.heading_rad)})
+    found = judge("r", track, perfect, [column_reference(track, column)])
+    assert len(found.headings) == (words is None)
+    told = [text for text in found.warnings if "left out" in text]
+    assert len(told) == (words is not None)
+    assert all(words in text for text in told)
 
 
 def test_optical_attitude_works_when_the_x_axis_is_vertical(vehicle, perfect):

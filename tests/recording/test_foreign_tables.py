@@ -22,7 +22,16 @@ from ahrsd.config.config import Config
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.inputs import Received
 from ahrsd.offline.calibrate import calibrate
-from ahrsd.recording.column_names import ACCEL, GYRO, MAG, REQUIRED, TIME, parse_columns
+from ahrsd.recording.column_names import (
+    ACCEL,
+    GYRO,
+    MAG,
+    REQUIRED,
+    TIME,
+    ColumnError,
+    parse_columns,
+    resolve,
+)
 from ahrsd.recording.opening import open_recording
 from ahrsd.recording.table import read_table
 from ahrsd.recording.text_table import is_table_text
@@ -51,6 +60,20 @@ def sensor(count: int = COUNT, rate_hz: float = RATE_HZ, seed: int = 1) -> dict[
         **dict(zip(GYRO, gyro.T, strict=True)),
         **dict(zip(ACCEL, force.T, strict=True)),
     }
+
+
+@pytest.mark.parametrize(
+    ("angle", "rate", "option"),
+    [
+        ("Angle {} (deg)", "AngularRate_{}", "gyro_x=AngularRate_X,gyro_y=AngularRate_Y"),
+        ("Euler angle {}", "Angle rate {} (raw)", "gyro_x=Angle rate X (raw):NUMBER,gyro_y="),
+    ],
+)
+def test_an_angle_is_not_offered_as_a_rate(angle, rate, option):
+    names = [TIME, *MAG, *(angle.format(a) for a in "XYZ"), *(rate.format(a) for a in "XYZ")]
+    with pytest.raises(ColumnError) as caught:
+        resolve(names)
+    assert f"--columns {option}" in caught.value.remedy
 
 
 @pytest.mark.parametrize(

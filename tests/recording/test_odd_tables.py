@@ -325,16 +325,99 @@ def test_coarse_readings_at_rest_are_no_hold(tmp_path):
     assert not any("new reading" in note or "each is used once" in note for note in table.notes)
 
 
-def test_alternating_sensors_are_separated_by_their_column(tmp_path):
+def two_in_turn() -> Cells:
+    """Rows of two sensors with another hard iron, in turn."""
     other = {**sensor(COUNT, RATE_HZ, seed=5)}
     other["mag"] = other["mag"] + 0.1
     first, second = cells(), cells(other)
-    both = {
+    return {
         name: [v for pair in zip(first[name], second[name], strict=True) for v in pair]
         for name in NAMES
     }
-    with pytest.raises(RecordingError, match=r"rows of 2 sensors in turn, by its column id \(1, 2"):
-        read(tmp_path, text({**both, "id": ["1", "2"] * COUNT}))
+
+
+@pytest.mark.parametrize("kinds", [["1", "2"], ["imu_left", "imu_right"]])
+def test_alternating_sensors_are_separated_by_their_column(tmp_path, kinds):
+    shown = ", ".join(kinds)
+    refused = rf"rows of 2 sensors in turn, by its column id \({shown}\)"
+    with pytest.raises(RecordingError, match=refused):
+        read(tmp_path, text({**two_in_turn(), "id": kinds * COUNT}))
+
+
+def test_alternating_sensors_are_separated_by_words_of_a_parquet_table(tmp_path):
+    columns = {name: [float(cell) for cell in column] for name, column in two_in_turn().items()}
+    table = pyarrow.table({**columns, "frame_id": ["port", "starboard"] * COUNT})
+    pyarrow.parquet.write_table(table, tmp_path / "t.parquet")
+    with pytest.raises(RecordingError, match=r"column frame_id \(port, starboard\)"):
+        read_table(tmp_path / "t.parquet")
+
+
+def test_alternating_sensors_without_a_column_for_them_are_noted(tmp_path):
+    both = two_in_turn()
+    both["time_s"] = [f"{0.5 * k / RATE_HZ:.6f}" for k in range(2 * COUNT)]
+    (note,) = [one for one in read(tmp_path, text(both)).notes if "in turn" in one]
+    assert "is the same again after 2 rows: these are the rows of 2 sensors in turn" in note
+    assert not any("in turn" in one for one in read(tmp_path, text(cells())).notes)
+
+
+def one_sensor_each(fast: dict[str, np.ndarray], slow: dict[str, np.ndarray]) -> Cells:
+    """Rows of a gyro with its accelerometer, and of a magnetometer, as tables joined by time."""
+    rows = [
+        (t, ["", "", "", *(f"{v:.9g}" for v in (*g, *a))])
+        for t, g, a in zip(fast["time_s"], fast["gyro"], fast["accel"], strict=True)
+    ]
+    rows += [
+        (t, [*(f"{v:.9g}" for v in m), *[""] * 6])
+        for t, m in zip(slow["time_s"], slow["mag"], strict=True)
+    ]
+    rows.sort(key=lambda row: row[0])
+    columns = zip(*(cells for _, cells in rows), strict=True)
+    named = dict(zip((*MAG, *GYRO, *ACCEL), map(list, columns), strict=True))
+    return {TIME: [f"{t:.9g}" for t, _ in rows], **named}
+
+
+def test_rows_of_one_sensor_each_are_one_row_per_reading_of_the_magnetometer(tmp_path):
+    fast = sensor(4000, 100.0)
+    slow = {name: values[::5] for name, values in fast.items()}
+    table = read(tmp_path, text(one_sensor_each(fast, slow)))
+    np.testing.assert_allclose(table.rows.time_s, slow["time_s"], atol=1e-6)
+    np.testing.assert_allclose(table.rows.raw_b_gauss, slow["mag"], atol=1e-6)
+    inner = fast["gyro"][1:].reshape(-1)[: 3 * 3995].reshape(799, 5, 3)  # of (t[k-1], t[k]]
+    ends = 0.5 * (fast["gyro"][:-5:5] - fast["gyro"][5::5])
+    np.testing.assert_allclose(
+        table.rows.gyro_b_rad_s[1:], inner.mean(axis=1) + 0.2 * ends, atol=1e-6
+    )
+    assert table.starts == (0,)
+    assert table.notes[0].startswith("each row holds one sensor: 800 of 4800 the magnetometer")
+
+
+def test_times_of_rows_of_one_sensor_each_stay(tmp_path):
+    """A reading that follows another sensor's at once was not stamped by a host in a bunch."""
+    slow = {**DATA, "time_s": DATA["time_s"] + 0.001}
+    table = read(tmp_path, text(one_sensor_each(DATA, slow)))
+    np.testing.assert_allclose(table.rows.time_s, slow["time_s"], atol=1e-6)
+    assert not any("host" in note for note in table.notes)
+
+
+def test_rows_of_one_sensor_each_need_their_time(tmp_path):
+    columns = one_sensor_each(DATA, DATA)
+    columns[TIME][7] = ""
+    with pytest.raises(RecordingError, match="row 9, column time_s: empty"):
+        read(tmp_path, text(columns))
+
+
+def test_a_clock_set_back_amid_rows_of_one_sensor_each_is_refused(tmp_path):
+    columns = one_sensor_each(DATA, DATA)
+    times = [float(cell) for cell in columns[TIME]]
+    columns[TIME] = [f"{t - 5.0 * (k >= 800):.9g}" for k, t in enumerate(times)]
+    with pytest.raises(RecordingError, match=r"the magnetometer: its time goes back by 4.95 s"):
+        read(tmp_path, text(columns))
+
+
+def test_words_in_turn_beside_one_sensor_are_left_out(tmp_path):
+    table = read(tmp_path, text(cells() | {"lamp": ["on", "off"] * 400}))
+    are_the_readings(table)
+    assert table.notes == ("column lamp is text and was left out",)
 
 
 @pytest.mark.parametrize("levels", [["0"] * 400 + ["1"] * 400, ["0", "1"] * 400])
@@ -352,6 +435,38 @@ def test_impossible_readings_are_left_out(tmp_path, mark):
     assert len(table.rows) == COUNT - 3
     assert table.starts == (0, 100)
     assert "because of an impossible reading: 3 rows, first row 102" in table.notes[0]
+
+
+def test_a_field_of_zeros_is_left_out(tmp_path):
+    """What a driver writes where a reading failed."""
+    columns = cells()
+    for name in MAG:
+        columns[name][100:140] = ["0"] * 40
+    table = read(tmp_path, text(columns))
+    assert len(table.rows) == COUNT - 40
+    assert table.starts == (0, 100)
+    assert table.notes == (
+        "left out because the magnetometer reads 0 0 0, which is no field: 40 rows, first row 102",
+    )
+
+
+@pytest.mark.parametrize("every", [4, 10])
+def test_zeros_between_the_readings_of_a_slower_magnetometer_are_none(tmp_path, every):
+    columns = cells()
+    for name in MAG:
+        columns[name] = [cell if k % every == 0 else "0.0" for k, cell in enumerate(columns[name])]
+    table = read(tmp_path, text(columns))
+    assert len(table.rows) == COUNT
+    assert f"a reading in {COUNT // every} of {COUNT} rows" in table.notes[0]
+    np.testing.assert_allclose(table.rows.raw_b_gauss, held(DATA["mag"], every), atol=1e-6)
+
+
+@pytest.mark.parametrize(("sign", "told"), [(1.0, True), (-1.0, False)])
+def test_axes_whose_z_points_up_are_told(tmp_path, sign, told):
+    """A calibration of such a table is not one in the axes of a VN-100."""
+    level = np.tile([0.1, -0.2, sign * 9.8], (COUNT, 1))
+    table = read(tmp_path, text(cells({**DATA, "accel": level})))
+    assert [note[:27] for note in table.notes] == ["by gravity its z points up:"] * told
 
 
 # -- other files -----------------------------------------------------------------------------------

@@ -60,6 +60,17 @@ def test_it_calibrates_to_the_truth(tmp_path):
     np.testing.assert_allclose(estimate.gyro_bias_rad_s, BIAS, atol=3e-4)
 
 
+def test_headers_of_a_clock_that_was_set_back_are_refused(tmp_path):
+    data = sensor()
+    messages = [
+        (topic, kind, ns, fields | {"stamp_ns": ns - (10_007_000_000 if ns > ns_of(15.0) else 0)})
+        for topic, kind, ns, fields in [*imu(data), *magnetic(data)]
+    ]
+    path = ros_files.save(tmp_path, "mcap", messages)
+    with pytest.raises(RecordingError, match=r"time goes back by 9.957 s after 301 readings"):
+        open_recording(path)
+
+
 def test_format_is_recognised_by_content(tmp_path, container):
     data = sensor()
     path = ros_files.save(tmp_path, container, [*imu(data), *magnetic(data)])
@@ -131,10 +142,10 @@ def test_covariates_have_their_documented_names(tmp_path):
     np.testing.assert_allclose(columns["position_east_m"], 0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("unit", ["G", "uT", "mG"])
+@pytest.mark.parametrize("unit", ["G", "mT", "uT", "mG"])
 def test_field_not_in_tesla_is_reported_and_read_with_the_option(tmp_path, unit):
     data = sensor()
-    factor = {"G": 1.0, "uT": 100.0, "mG": 1000.0}[unit]
+    factor = {"G": 1.0, "mT": 0.1, "uT": 100.0, "mG": 1000.0}[unit]
     path = ros_files.save(tmp_path, "mcap", [*imu(data), *magnetic(data, factor=factor)])
     with pytest.raises(RecordingError, match="it looks like") as refused:
         open_recording(path)

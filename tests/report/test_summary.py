@@ -17,6 +17,7 @@ from ahrsd.gates import GATES, Level, guards_a_write
 from ahrsd.report.contents import ReportData
 from ahrsd.report.page import write_report
 from ahrsd.report.summary import (
+    BatchResult,
     estimate_lines,
     gate_lines,
     summary_json,
@@ -37,6 +38,41 @@ def core() -> Core:
     for item in inputs([emitted(build(Setup("tumble", seed=4, output="binary")), 20.0)]):
         core.handle(item)
     return core
+
+
+@pytest.mark.parametrize(
+    ("scale", "known", "words"),
+    [
+        (0.1, False, "the field has 0.049 gauss, and on Earth it has 0.22 to 0.67: the "
+                     "magnetometer's unit is not gauss (0.49 if it is in mT: --columns"),
+        (0.1, True, "the field has 0.049 gauss"),
+        (2.04, False, "the field has 1 gauss"),
+        (1.0, False, None),
+        (1.3, True, None),
+    ],
+)  # fmt: skip
+def test_a_field_that_is_not_of_the_earth_is_told(core, scale, known, words):
+    """As the sensor measures it, also where the world model has scaled the soft iron."""
+    found = core.calibrator.estimate
+    size = 0.49 * scale
+    soft_iron = np.eye(3) * (scale if known else 1.0)
+    found = replace(
+        found, converged=True, soft_iron=soft_iron, field_gauss=0.49 if known else size,
+        field_known=known,
+    )  # fmt: skip
+    result = BatchResult("a.csv", core, found, (), ())
+    told = [text for text in result.all_warnings() if text.startswith("the field has")]
+    assert len(told) == (words is not None)
+    assert all(text.startswith(words) for text in told)
+    assert [text for text in result.json("magyc")["warnings"] if text in told] == told
+
+
+def test_a_warning_is_said_once(core):
+    twice = "the residual follows the attitude: 11 mG"
+    found = replace(core.calibrator.estimate, warnings=(twice,))
+    result = BatchResult("a.csv", core, found, (), (twice,))
+    assert result.all_warnings().count(twice) == 1
+    assert result.json("magyc")["warnings"].count(twice) == 1
 
 
 def test_a_summary_of_a_stream(core):

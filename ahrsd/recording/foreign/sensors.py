@@ -25,7 +25,7 @@ STILL = 0.1  # of another gyro's rates, below which the two did not make the sam
 _FASTER = 1.5  # times the magnetometer's rate, from which on means over its steps are taken
 _FRESH = 0.67  # share of new readings below which the magnetometer is logged faster than it reads
 #: units of a magnetometer with their factor to gauss, and what a vector's size may be in gauss
-_MAG_UNITS = {"T": 1e4, "gauss": 1.0, "mG": 1e-3, "uT": 1e-2, "nT": 1e-5}
+_MAG_UNITS = {"T": 1e4, "mT": 10.0, "gauss": 1.0, "mG": 1e-3, "uT": 1e-2, "nT": 1e-5}
 _MAG_SIZES = ((0.2, 0.8), (0.05, 3.0))  # of the Earth's field; with much iron about it
 _FASTEST_RAD_S = 20.0  # which nothing turns in the median
 _LARGEST = 1e9  # what no sensor reads in any unit
@@ -116,25 +116,47 @@ def merged(path: object, found: Sensors, columns: ColumnMap = NO_MAP) -> Merged:
             f"holds no {' and no '.join(missing)}",
             "`ahrsd convert FILE --list` says what it holds; record the magnetometer and the gyro",
         )
-    mag = _tidy(path, found.mag, _called("magnetometer", found, "mag"), notes)
-    gyro = _tidy(path, found.gyro, _called("gyro", found, "gyro"), notes)
+    rows = by_readings(path, found.mag, found.gyro, found, notes)
+    out = {TIME: rows.time_s - rows.time_s[0]}
+    for kind, values in rows.vectors.items():
+        out |= _scaled(path, kind, values, found, columns, facts)
+    out |= rows.more
+    facts.setdefault("frame", "the sensor's own axes, as recorded")
+    if (up := upward(out)) is not None:
+        facts["frame"] += f"; {up}"
+    facts["start"] = f"{rows.time_s[0]:.9f} s on that clock is 0 in time_s"
+    return Merged(out, notes, facts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ByReadings:
+    """One row per reading of the magnetometer: time_s (N,), vectors (N, 3) by kind, more (N,)."""
+
+    time_s: Array
+    vectors: dict[str, Array]
+    more: dict[str, Array]
+
+
+def by_readings(
+    path: object, mag: SensorSeries, gyro: SensorSeries, found: Sensors, notes: list[str]
+) -> ByReadings:
+    """The sensors of `found`, in its units, at the readings of its magnetometer.
+
+    notes: what was done is added. Raises RecordingError.
+    """
+    mag = _tidy(path, mag, _called("magnetometer", found, "mag"), notes)
+    gyro = _tidy(path, gyro, _called("gyro", found, "gyro"), notes)
     mag = _overlapping(path, _fresh(mag, notes), gyro)
-    out = {TIME: mag.time_s - mag.time_s[0]}
-    out |= _scaled(path, "mag", mag.values, found, columns, facts)
-    out |= _scaled(path, "gyro", _at_steps(mag.time_s, gyro, "gyro", notes), found, columns, facts)
+    vectors = {"mag": mag.values, "gyro": _at_steps(mag.time_s, gyro, "gyro", notes)}
     if found.accel is not None and len(found.accel.time_s) >= FEWEST:
         accel = _tidy(path, found.accel, _called("accelerometer", found, "accel"), notes)
-        force = _at_steps(mag.time_s, accel, "accelerometer", notes)
-        out |= _scaled(path, "accel", force, found, columns, facts)
-    for name, stream in found.more.items():
-        values = _covariate(mag.time_s, stream, name in found.angles)
-        if values is not None:
-            out[name] = values
-    facts.setdefault("frame", "the sensor's own axes, as recorded")
-    if (up := _upward(out)) is not None:
-        facts["frame"] += f"; {up}"
-    facts["start"] = f"{mag.time_s[0]:.9f} s on that clock is 0 in time_s"
-    return Merged(out, notes, facts)
+        vectors["accel"] = _at_steps(mag.time_s, accel, "accelerometer", notes)
+    more = {
+        name: values
+        for name, stream in found.more.items()
+        if (values := _covariate(mag.time_s, stream, name in found.angles)) is not None
+    }
+    return ByReadings(mag.time_s, vectors, more)
 
 
 def positions(
@@ -184,6 +206,7 @@ def _tidy(path: object, stream: SensorSeries, name: str, notes: list[str]) -> Se
         )
     time_s, values = stream.time_s[known], stream.values[known]
     if np.any(np.diff(time_s) < 0.0):
+        _refuse_clock_set_back(path, time_s, name)
         order = np.argsort(time_s, kind="stable")
         notes.append(f"{name}: its readings are out of order, sorted by time")
         time_s, values = time_s[order], values[order]
@@ -205,6 +228,26 @@ def _tidy(path: object, stream: SensorSeries, name: str, notes: list[str]) -> Se
             "record longer",
         )
     return SensorSeries(time_s, values)
+
+
+def _refuse_clock_set_back(path: object, time_s: Array, name: str) -> None:
+    """Readings that lie behind an earlier one for long are no late ones: the clock was set back.
+
+    Sorted by time, readings of two times would be mixed.
+    """
+    newest = np.maximum.accumulate(time_s)
+    edges = np.diff(np.concatenate([[False], time_s < newest, [False]]).astype(np.int8))
+    begins, ends = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+    longest = int(np.argmax(ends - begins))
+    if ends[longest] - begins[longest] < FEWEST:
+        return
+    at = int(begins[longest])
+    raise RecordingError(
+        path,
+        f"{name}: its time goes back by {newest[at] - time_s[at]:.4g} s after {at} readings: the "
+        "clock was set, or the recording repeats itself",
+        "cut it in parts there",
+    )
 
 
 def _fresh(mag: SensorSeries, notes: list[str]) -> SensorSeries:
@@ -352,7 +395,7 @@ def _option(kind: str, unit: str) -> str:
     return f"say so: --columns {pairs}"
 
 
-def _upward(columns: Mapping[str, Array]) -> str | None:
+def upward(columns: Mapping[str, Array]) -> str | None:
     """Which axis points up by gravity, where one does in the mean."""
     if ACCEL[0] not in columns:
         return None
