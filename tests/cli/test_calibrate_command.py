@@ -216,7 +216,7 @@ def test_unwritable_folder_is_reported_before_any_work(run, capsys, command):
 
 def test_unwritable_viewer_file_is_reported(run, tmp_path, capsys, monkeypatch):
     path = FOLDER / "tumble_binary_restart.vnbin.gz"
-    monkeypatch.setattr("ahrsd.cli.recordings.replay.refuse_unwritable", lambda target: None)
+    monkeypatch.setattr("ahrsd.cli.recordings.replay.refuse_unwritable", lambda *_: None)
     assert run("replay", path, "--rerun", tmp_path / "none" / "run.rrd") == 2
     assert (
         capsys.readouterr()
