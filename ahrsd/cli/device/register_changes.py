@@ -337,7 +337,7 @@ def calibrated(
     body = _calibration(path)
     new, in_force = (_registers_in(path, body, key) for key in ("registers", "registers_in_force"))
     try:
-        refuse_unsafe({**in_force, **new})
+        refuse_unsafe(new)
         for number, values in new.items():
             format_command(number, values)
     except (UnwritableError, RegisterValueError) as error:

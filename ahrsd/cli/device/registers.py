@@ -55,6 +55,7 @@ from ahrsd.daemon.operator_inbox import NoAnswerInTime, OperatorBox, OperatorFol
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, DeviceError, JournalError
 from ahrsd.printable import counted
 from ahrsd.telemetry.unix_socket import DaemonConnection, default_socket_path
+from ahrsd.writeback.composition import UnwritableError, refuse_unsafe
 from ahrsd.writeback.journal_history import JournalHistory, RecordKind, find_record_of_other_device
 from drivers.vn100.commands import (
     Identity,
@@ -322,6 +323,8 @@ def write(
 ) -> None:
     """Write register ID of the device on PORT; VALUES in the manual's order, blanks or commas.
 
+    Of registers 23, 25 and 84, values that no sensor can need are refused.
+
     With --from the registers of a calibration: it must have converged, its numbers must be within
     the daemon's limits, and the device must be the one that was recorded and still hold the values
     that were in force then.
@@ -338,7 +341,8 @@ def write(
     try:
         wanted = {number: parse(number, tokens)}
         format_command(number, wanted[number])
-    except RegisterValueError as error:
+        refuse_unsafe(wanted)
+    except (RegisterValueError, UnwritableError) as error:
         raise click.BadParameter(str(error), param_hint="VALUES") from error
     state = _state(state_directory)
     _change(port, baud, lambda *_: (wanted, {"reason": "write"}), state, None, yes=yes, save=save)
