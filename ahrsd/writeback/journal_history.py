@@ -276,6 +276,7 @@ TIMES_KEPT: Final = 1000  # far more than any budget allows in a day
 
 BY_HAND: Final = "HAND_PREPARED"  # a write of the registers command
 BY_HAND_DONE: Final = "HAND_VERIFIED"  # its good end; at a bad one, `restored` says how it ended
+BY_HAND_SAVE: Final = "HAND_FLASH_SENT"  # its save to flash, about to be sent
 
 
 _TOUCHED_RAM: Final = (RecordKind.RAM_VERIFIED, RecordKind.RAM_FAILED, RecordKind.ROLLBACK)
@@ -324,6 +325,7 @@ class JournalHistory:
 
     open:      the transaction that no record has ended; `last`, `last_at`: its newest record
     newest_at: the time of the newest record of any kind
+    flashes_at, flashes: saves to flash by ahrsd, also by hand; `flashes` with those of clients
     rollbacks: since the last proven write or unlock; each means that a calibration was bad
     holds:     what the device must hold after the newest transaction, if known
     values:    registers with old and new values of writes, including those by hand
@@ -357,12 +359,17 @@ class JournalHistory:
                 history = history.with_record(RecordKind(record.kind), record.facts)
             elif record.kind == BY_HAND:
                 history = history._with_write_of_others(record.facts)._with_by_hand(record.facts)
+            elif record.kind == BY_HAND_SAVE:
+                at = Stamp.of(record.facts)
+                history = replace(history._with_flash(at), newest_at=at)
             elif record.kind == BY_HAND_DONE or record.facts.get("restored"):
                 history = replace(history, by_hand=None)
         return history
 
     def with_record(self, kind: RecordKind, facts: Mapping[str, Any]) -> JournalHistory:
         """The history after one more record."""
+        if kind is RecordKind.CLIENT_SAVED:
+            return replace(self, flashes=self.flashes + 1)
         if kind in OF_OTHERS:
             return self
         at = Stamp.of(facts)
@@ -432,14 +439,18 @@ class JournalHistory:
         left = {n: v for n, v in (self.holds or {}).items() if str(n) not in written}
         return replace(self, holds=left or None)
 
+    def _with_flash(self, at: Stamp) -> JournalHistory:
+        """With one more save to flash."""
+        flashes_at = (*self.flashes_at, at)[-TIMES_KEPT:]
+        return replace(self, flashes_at=flashes_at, flashes=self.flashes + 1)
+
     def _with_counts(self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp) -> JournalHistory:
         """With budgets and rollbacks updated."""
         changes: dict[str, Any] = {}
         if kind in _TOUCHED_RAM and self.last is RecordKind.PREPARED:
             changes["ram_writes_at"] = (*self.ram_writes_at, at)[-TIMES_KEPT:]
         if kind is RecordKind.FLASH_SENT:
-            changes["flashes_at"] = (*self.flashes_at, at)[-TIMES_KEPT:]
-            changes["flashes"] = self.flashes + 1
+            return self._with_flash(at)
         if kind is RecordKind.PROVEN:
             changes["rollbacks"] = 0
         if (
