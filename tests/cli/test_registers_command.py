@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import pytest
 
-from ahrsd.cli.device.register_changes import apply, gate
-from ahrsd.daemon.journal import Journal, journal_path
-from ahrsd.errors import DeviceError
+from ahrsd.cli.device.register_changes import apply, gate, save_to_flash
+from ahrsd.daemon.journal import Journal, Record, journal_path
+from ahrsd.errors import DeviceError, JournalError
 from drivers.serial_port import SerialPort
 from drivers.vn100.commands import identify
 from drivers.vn100.device import Device
@@ -264,9 +264,46 @@ def test_another_unit_is_neither_written_nor_put_back(emulated, tmp_path):
         device = Device(port, gate({23}, save=False))
         judged = replace(device.run(identify()), serial=SERIAL + 1)
         journal = Journal.open(tmp_path / "j.jsonl")
-        with pytest.raises(DeviceError, match=f"{SERIAL}, not {SERIAL + 1}; NOT put back"):
+        with pytest.raises(DeviceError, match=f"another.*NOT put back.*{SERIAL}, not {SERIAL + 1}"):
             apply(device, journal, judged, {23: NEW_VALUES})
         assert ram(emulator) == FACTORY
+
+
+class FullDisk(Journal):
+    """A journal that cannot take records of one kind."""
+
+    kind = ""
+
+    def append(self, kind: str, **facts: object) -> Record:
+        if kind == self.kind:
+            raise JournalError("the disk is full")
+        return super().append(kind, **facts)
+
+
+@pytest.mark.parametrize(
+    ("kind", "said", "holds"),
+    [
+        ("HAND_PREPARED", "^the disk is full", FACTORY),
+        ("HAND_VERIFIED", "^the new values are in RAM, written and verified; not rec", NEW_VALUES),
+        ("HAND_FAILED", "; the old values are back; not recorded: the disk is full", FACTORY),
+        ("HAND_FLASH_SENT", "^not saved to flash: the new values are in RAM only; not", NEW_VALUES),
+        ("HAND_FLASH_ACKED", "^saved to flash; not recorded: the disk is full", NEW_VALUES),
+    ],
+)
+def test_full_disk_behind_a_write_does_not_hide_what_was_done(
+    emulated, tmp_path, kind, said, holds
+):
+    faults = ("refused_write",) if kind == "HAND_FAILED" else ()
+    with emulated(faults=faults) as (emulator, path), SerialPort(path, 115200) as port:
+        device = Device(port, gate({23}, save=True))
+        identity = device.run(identify())
+        journal = FullDisk(tmp_path / "j.jsonl", [], 0, b"", lambda: "")
+        journal.kind = kind
+        with pytest.raises(JournalError, match=said):
+            record = apply(device, journal, identity, {23: NEW_VALUES})
+            save_to_flash(device, journal, identity, record)
+        assert ram(emulator) == holds
+        assert emulator.counters["saves"] == (kind == "HAND_FLASH_ACKED")
 
 
 def test_save_without_an_answer_is_told_as_unknown(run, emulated, tmp_path, capsys):
