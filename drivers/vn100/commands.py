@@ -651,6 +651,22 @@ def identify_surely() -> Procedure[Identity]:
     return identity
 
 
+def read_twice(ids: Iterable[int]) -> Procedure[dict[int, Values]]:
+    """Registers whose values will be put back; raises Unsteady where two readings differ."""
+    values = yield from read_registers(ids)
+    return (yield from _read_again(values, values))
+
+
+def _read_again(values: Mapping[int, Values], ids: Iterable[int]) -> Procedure[dict[int, Values]]:
+    """Those of `ids` once more; raises Unsteady where that differs from `values`."""
+    again: dict[int, Values] = {}
+    for number in ids:
+        again[number] = yield from read(number)
+        if not same(number, values[number], again[number]):
+            raise Unsteady(f"register {number} reads {values[number]}, then {again[number]}")
+    return again
+
+
 def read_surely(identity: Identity, twice: Iterable[int]) -> Procedure[dict[int, Values]]:
     """The configuration of this device, and at the end it still is this device that answers.
 
@@ -660,10 +676,9 @@ def read_surely(identity: Identity, twice: Iterable[int]) -> Procedure[dict[int,
     RegisterValueError.
     """
     values = yield from read_configuration(identity.profile)
-    for number in (n for n in twice if n in values):
-        again = yield from read(number)
-        if not same(number, values[number], again):
-            raise Unsteady(f"register {number} reads {values[number]}, then {again}")
+    for number, again in (
+        yield from _read_again(values, (n for n in twice if n in values))
+    ).items():
         if number in SESSION_SETTINGS:
             format_command(number, again, held=True)
     if (unit := (yield from read_unit())) != identity.unit:

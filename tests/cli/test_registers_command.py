@@ -12,7 +12,7 @@ from ahrsd.cli.device.register_changes import apply, gate, save_to_flash
 from ahrsd.daemon.journal import Journal, Record, journal_path
 from ahrsd.errors import DeviceError, JournalError
 from drivers.serial_port import SerialPort
-from drivers.vn100.commands import identify
+from drivers.vn100.commands import Read, Unsteady, identify
 from drivers.vn100.device import Device
 
 SERIAL = 100130608
@@ -267,6 +267,38 @@ def test_another_unit_is_neither_written_nor_put_back(emulated, tmp_path):
         with pytest.raises(DeviceError, match=f"another.*NOT put back.*{SERIAL}, not {SERIAL + 1}"):
             apply(device, journal, judged, {23: NEW_VALUES})
         assert ram(emulator) == FACTORY
+
+
+class FirstReadingAltered(Device):
+    """Of what is read of register 23, the first reading is altered on its way."""
+
+    altered = False
+
+    def run(self, procedure, timeout_s=60.0):
+        return super().run(self._alter(procedure), timeout_s)
+
+    def _alter(self, procedure):
+        reply = None
+        try:
+            while True:
+                command = procedure.send(reply)
+                reply = yield command
+                if command == Read(23) and not self.altered:
+                    self.altered = True
+                    reply = replace(reply, tokens=("2", *reply.tokens[1:]))
+        except StopIteration as end:
+            return end.value
+
+
+def test_altered_reading_is_never_put_back(emulated, tmp_path):
+    """What the journal calls old is what `rollback` writes."""
+    with emulated() as (emulator, path), SerialPort(path, 115200) as port:
+        device = FirstReadingAltered(port, gate({23}, save=False))
+        journal, identity = Journal.open(tmp_path / "j.jsonl"), device.run(identify())
+        with pytest.raises(Unsteady, match=r"register 23 reads \(2.0, .*, then \(1.0, "):
+            apply(device, journal, identity, {23: NEW_VALUES})
+        assert ram(emulator) == FACTORY
+    assert journal.records() == []
 
 
 class FullDisk(Journal):

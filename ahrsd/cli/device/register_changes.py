@@ -44,6 +44,7 @@ from drivers.vn100.commands import (
     read,
     read_present,
     read_registers,
+    read_twice,
     restore,
     save_settings_of,
     write_verified,
@@ -145,9 +146,10 @@ def apply(
     """Write and verify `changes` in RAM; returns the record that `rollback` goes back to.
 
     why: facts for the journal: `reason`, and for a rollback `undoes`, the number of the change.
-    Raises JournalError before anything is sent, DeviceError with the outcome of putting back.
+    Raises JournalError or Unsteady before anything is written, DeviceError with the outcome of
+    putting back.
     """
-    old = device.run(read_registers(changes))
+    old = device.run(read_twice(changes))
     prepared = _append(
         journal,
         "HAND_PREPARED",

@@ -60,6 +60,7 @@ from ahrsd.writeback.journal_history import JournalHistory, RecordKind, find_rec
 from drivers.vn100.commands import (
     Identity,
     identify,
+    identify_surely,
     missing,
     read_configuration,
     read_present,
@@ -448,7 +449,7 @@ def _change(
     """Read, show, and with `yes` journal, write, verify and tell how to go back."""
     permitted: set[int] = set()
     with open_device(port, baud, gate(permitted, save=save and yes)) as device:
-        identity = device.run(identify())
+        identity = device.run(identify_surely())
         journal = Journal.open(journal_file or journal_path(state, identity.serial))
         if other := find_record_of_other_device(journal.records(), identity.serial):
             raise JournalError(f"{journal.path}: {other}; nothing was written")
