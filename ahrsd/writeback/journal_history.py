@@ -277,6 +277,7 @@ TIMES_KEPT: Final = 1000  # far more than any budget allows in a day
 BY_HAND: Final = "HAND_PREPARED"  # a write of the registers command
 BY_HAND_DONE: Final = "HAND_VERIFIED"  # its good end; at a bad one, `restored` says how it ended
 BY_HAND_SAVE: Final = "HAND_FLASH_SENT"  # its save to flash, about to be sent
+BY_HAND_SAVED: Final = "HAND_FLASH_ACKED"  # and the good end of that
 
 
 _TOUCHED_RAM: Final = (RecordKind.RAM_VERIFIED, RecordKind.RAM_FAILED, RecordKind.ROLLBACK)
@@ -330,6 +331,7 @@ class JournalHistory:
     holds:     what the device must hold after the newest transaction, if known
     values:    registers with old and new values of writes, including those by hand
     trials:    registers with new values of writes that were neither saved nor kept by a person
+    by_hand:   old and new values of a write by hand, or of its save, that has no end
     broken:    the kind of a record that could not be parsed; then nothing may be written
     """
 
@@ -353,16 +355,17 @@ class JournalHistory:
     @staticmethod
     def of(records: Iterable[JournalRecord]) -> JournalHistory:
         """The history of these records, oldest first."""
-        history = JournalHistory()
+        history, by_hand = JournalHistory(), None
         for record in records:
             if record.kind in RecordKind.__members__:
                 history = history.with_record(RecordKind(record.kind), record.facts)
             elif record.kind == BY_HAND:
                 history = history._with_write_of_others(record.facts)._with_by_hand(record.facts)
-            elif record.kind == BY_HAND_SAVE:
+                by_hand = history.by_hand
+            elif record.kind == BY_HAND_SAVE:  # if that breaks off, the flash may hold some of each
                 at = Stamp.of(record.facts)
-                history = replace(history._with_flash(at), newest_at=at)
-            elif record.kind == BY_HAND_DONE or record.facts.get("restored"):
+                history = replace(history._with_flash(at), newest_at=at, by_hand=by_hand)
+            elif record.kind in (BY_HAND_DONE, BY_HAND_SAVED) or record.facts.get("restored"):
                 history = replace(history, by_hand=None)
         return history
 
