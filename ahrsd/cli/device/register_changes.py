@@ -15,7 +15,7 @@ The daemon's own kinds (`writeback.reconcile`) promise more, gates and a trial, 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,6 +51,7 @@ from drivers.vn100.commands import (
 )
 from drivers.vn100.device import Device
 from drivers.vn100.errors import DriverError
+from drivers.vn100.register_codec import OUT_OF_RANGE
 from drivers.vn100.registers import (
     REGISTERS,
     SESSION_SETTINGS,
@@ -342,6 +343,17 @@ class Sources:
             names = ", ".join(path.name for path in paths)
             raise JournalError(f"{self.state}: several journals ({names}); say which by --journal")
         return register_values(find(Journal.open(paths[0]), int(number)), which or "old")
+
+
+def typed(number: int, tokens: Sequence[str]) -> Changes:
+    """What a person typed.  Raises RegisterValueError, also for what no sensor can need."""
+    wanted = {number: parse(number, tokens)}
+    format_command(number, wanted[number])
+    try:
+        refuse_unsafe(wanted)
+    except UnwritableError as error:
+        raise RegisterValueError(str(error), OUT_OF_RANGE) from error
+    return wanted
 
 
 def calibrated(

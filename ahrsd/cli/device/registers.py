@@ -39,6 +39,7 @@ from ahrsd.cli.device.register_changes import (
     refuse_unproven_save,
     save_to_flash,
     to_write,
+    typed,
 )
 from ahrsd.cli.files import refuse_unwritable, write_text
 from ahrsd.config.config import default_state_directory
@@ -55,7 +56,6 @@ from ahrsd.daemon.operator_inbox import NoAnswerInTime, OperatorBox, OperatorFol
 from ahrsd.errors import EXIT_DONE, EXIT_NO, AhrsdError, DeviceError, JournalError
 from ahrsd.printable import counted
 from ahrsd.telemetry.unix_socket import DaemonConnection, default_socket_path
-from ahrsd.writeback.composition import UnwritableError, refuse_unsafe
 from ahrsd.writeback.journal_history import JournalHistory, RecordKind, find_record_of_other_device
 from drivers.vn100.commands import (
     Identity,
@@ -73,8 +73,6 @@ from drivers.vn100.registers import (
     ROTATION,
     RegisterValueError,
     Values,
-    format_command,
-    parse,
 )
 
 # -- Lock and unlock -------------------------------------------------------------------------------
@@ -340,10 +338,8 @@ def write(
         raise click.UsageError("give ID and VALUES, or --from FILE")
     tokens = [token for value in values for token in value.split(",") if token]
     try:
-        wanted = {number: parse(number, tokens)}
-        format_command(number, wanted[number])
-        refuse_unsafe(wanted)
-    except (RegisterValueError, UnwritableError) as error:
+        wanted = typed(number, tokens)
+    except RegisterValueError as error:
         raise click.BadParameter(str(error), param_hint="VALUES") from error
     state = _state(state_directory)
     _change(port, baud, lambda *_: (wanted, {"reason": "write"}), state, None, yes=yes, save=save)
