@@ -571,9 +571,9 @@ class BudgetSection(Section):
     ram_writes_per_day: int = Field(default=_POLICY.ram_writes_per_day, ge=0, le=1000)
     """Writes of RAM. [1/day]"""
     flash_writes_per_day: int = Field(default=_POLICY.flash_writes_per_day, ge=0, le=100)
-    """Writes of flash. [1/day]"""
+    """Writes of flash by ahrsd, those by hand included. [1/day]"""
     flash_writes_lifetime: int = Field(default=_POLICY.flash_writes_lifetime, ge=0, le=10_000)
-    """Writes of flash over the device's life, counted in the journal."""
+    """Writes of flash over the device's life, by the journal; those of clients included."""
     cooldown_s: float = Field(default=_POLICY.cooldown_s, ge=0.0, le=10**7)
     """No write for this long after a rollback. [s]"""
     rollbacks_to_lock: int = Field(default=_POLICY.rollbacks_to_lock, ge=1, le=100)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ahrsd.estimator import chain, locked, noise
 from ahrsd.estimator.chain import factor_and_solve_lower
-from ahrsd.estimator.epoch_data import principal_deviation, row_rates
+from ahrsd.estimator.epoch_data import SHORTEST_GAP_S, principal_deviation, row_rates
 from ahrsd.estimator.graph import (
     BORDERS,
     Y_A,
@@ -31,8 +31,6 @@ from ahrsd.estimator.graph import (
 from ahrsd.estimator.noise import DirectionCells
 from ahrsd.estimator.parameters import Kinds, possible_instruments
 from ahrsd.samples import Array
-
-_SHORTEST_GAP_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,7 +174,7 @@ def begin_epoch(
     a = graph.last
     u = chain.start_directions(chain.symmetric(graph.c[:6]), graph.c[6:], data.field_b_gauss)
     if data.measures_first and graph.until_s is not None:
-        gap_s = max(float(data.time_s[0]) - graph.until_s, _SHORTEST_GAP_S)
+        gap_s = max(float(data.time_s[0]) - graph.until_s, SHORTEST_GAP_S)
         node = graph.nodes[a + 1] = Node.at(graph.nodes[a].bias, u[0])
         graph.factors.append(gap_factor(a, graph.c, graph.nodes[a], node, 1 / (walk**2 * gap_s)))
         a += 1

@@ -247,6 +247,7 @@ class HeldReadings:
 # -- Epochs ----------------------------------------------------------------------------------------
 
 _RATE_ROWS = 33
+SHORTEST_GAP_S = 0.1
 _LONGEST_GAP_S = 60.0  # after a longer one the gyro bias may have changed
 _SPARE_STEPS = 2  # steps by which the estimated count of waiting steps may be wrong
 
@@ -272,6 +273,38 @@ def check_samples(block: SampleBlock) -> None:
     if not good.all():
         k = start + int(np.argmin(good))
         raise ValueError(f"dt_s of row {k} is not a positive step: {block.dt_s[k]}")
+
+
+class RunningTime:
+    """Device times on one line that only rises, also where the device restarted.
+
+    There the device's time falls, and how long the pause was only the host's clock says. Drifts and
+    what comes back are fitted over this time: on the device's own, a run behind a restart would lie
+    within the run before it.
+    """
+
+    def __init__(self) -> None:
+        self._newest_s = self._host_s = -np.inf  # running time and host time of the newest sample
+        self._runs: list[tuple[float, float]] = [(-np.inf, 0.0)]  # behind when, and what is added
+
+    def falls(self, block: SampleBlock) -> bool:
+        """Whether this block begins another run of the device's time."""
+        return float(block.time_s[0]) + self._runs[-1][1] <= self._newest_s
+
+    def follow(self, block: SampleBlock) -> SampleBlock:
+        """The block in running time; unchanged as long as the device's time has not fallen."""
+        if self.falls(block):
+            pause_s = float(block.host_s[0]) - self._host_s
+            begins_s = self._newest_s + (pause_s if pause_s > SHORTEST_GAP_S else SHORTEST_GAP_S)
+            self._runs.append((self._newest_s, begins_s - float(block.time_s[0])))
+        if shift_s := self._runs[-1][1]:
+            block = replace(block, time_s=block.time_s + shift_s)
+        self._newest_s, self._host_s = float(block.time_s[-1]), float(block.host_s[-1])
+        return block
+
+    def device_s(self, running_s: float) -> float:
+        """The device's own time at this running time."""
+        return running_s - next(added for behind, added in self._runs[::-1] if running_s > behind)
 
 
 class EpochBuilder:

@@ -39,7 +39,7 @@ from ahrsd.estimator.epoch import (
     rest_quadratics,
     widening_by_imperfections,
 )
-from ahrsd.estimator.epoch_data import EpochBuilder, check_samples, with_border
+from ahrsd.estimator.epoch_data import EpochBuilder, RunningTime, check_samples, with_border
 from ahrsd.estimator.graph import (
     UNDETERMINED_RATIO,
     Node,
@@ -392,6 +392,7 @@ class Estimator:
         self._new: list[chain.EpochData] = []  # not in the window yet
         self._last: chain.EpochData | None = None  # the newest one
         self._builder = EpochBuilder(self.parameters)
+        self._time = RunningTime()
         self._window: Window | None = None
         self._whitening = np.eye(12)
         self._tilts: deque[Array] = deque(maxlen=64)
@@ -412,8 +413,14 @@ class Estimator:
         rate or step is not a finite number; nothing of the block is then taken.
         """
         check_samples(block)
-        gap = block.gap_before and len(block) > 0
-        closed = self._builder.gap(float(block.time_s[0])) if gap else []
+        closed: list[chain.EpochData] = []
+        if block.gap_before and len(block) > 0:
+            fell = self._time.falls(block)
+            block = self._time.follow(block)
+            # behind a restart of the device nothing is continued
+            closed = self._builder.gap(np.inf if fell else float(block.time_s[0]))
+        elif len(block) > 0:
+            block = self._time.follow(block)
         closed += self._builder.add(block)
         for data in closed:
             self._append(data)
@@ -494,7 +501,7 @@ class Estimator:
             if not is_sure or (window.epochs[k].has_motion and not contradicts):
                 self._contradicted_s = None
             elif contradicts and self._contradicted_s is None:
-                self._contradicted_s = float(window.epochs[k].data.time_s[0])
+                self._contradicted_s = self._time.device_s(window.epochs[k].data.time_s[0])
             if self._contradictions == _CHANGED_EPOCHS:
                 window = self._window = self._restart_after_change(window, _CHANGED_EPOCHS - 1 - k)
                 break
@@ -502,7 +509,7 @@ class Estimator:
 
     def _restart_after_change(self, window: Window, count: int) -> Window:
         """Forget everything before the last `count` epochs, at whose beginning the iron changed."""
-        self.restarted_s = float(window.epochs[-count].data.time_s[0])
+        self.restarted_s = self._time.device_s(window.epochs[-count].data.time_s[0])
         self._searching, self._agreed, self._contradictions, self._contradicted_s = (
             True,
             False,

@@ -402,13 +402,15 @@ def estimator_line(status: Status) -> str:
 
 
 def candidate_lines(status: Status) -> list[str]:
-    """What would be written, to be looked at before it is approved."""
-    proposal = status["write_back"]["proposal"]
+    """What would be written, to be looked at before it is approved, or what was."""
+    back = status["write_back"]
+    proposal = back["proposal"]
     if proposal is None:
         return []
     change = _number(proposal["heading_change_deg"], "heading changes by up to {:.1f} deg", "")
+    lead = "it would be written" if back["transaction"] is None else "its write is under way,"
     return [
-        f"candidate: {proposal['id']}, {change}; it would be written as",
+        f"candidate: {proposal['id']}, {change}; {lead} as",
         *(f"  {line}" for line in proposal["lines"]),
     ]
 

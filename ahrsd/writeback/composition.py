@@ -38,14 +38,21 @@ from drivers.vn100.registers import (
     register_lines,
 )
 
-MAG, GYRO = 23, 84
+MAG, ACCEL, GYRO = 23, 25, 84
 MAX_CONDITION: Final = 8.0  # as gate G9 (docs/reference/gates.md), but not configurable
+SCALES: Final = (0.2, 5.0)  # of a correction matrix, the cube root of its determinant; as gate G9
 MAX_OFFSET_GAUSS: Final = 1.3
+MAX_ACCEL_BIAS_M_S2: Final = 5.0  # half of gravity, a hundred times what the data sheet allows
 MAX_GYRO_BIAS_RAD_S: Final = 0.175  # 10 deg/s, what the data sheet allows a cold sensor
 HELD_WITHIN_SIGMA: Final = 0.5  # largest change along a direction that is undetermined, in sigmas
 HELD_WITHIN: Final = 1e-5  # added to that, for rounding on the wire
 DIGITS: Final = 6  # significant digits of a register's values
 
+_OFFSETS: Final = {  # the offset of each register out = C (in - B): name, limit and unit
+    MAG: ("hard iron", MAX_OFFSET_GAUSS, "gauss"),
+    ACCEL: ("accelerometer bias", MAX_ACCEL_BIAS_M_S2, "m/s^2"),
+    GYRO: ("gyro bias", MAX_GYRO_BIAS_RAD_S, "rad/s"),
+}
 _NAMES: Final = (
     *(f"soft iron {pair}" for pair in ("xx", "xy", "xz", "yy", "yz", "zz")),
     *(f"hard iron {axis}" for axis in "xyz"),
@@ -91,7 +98,9 @@ def compose(
     if gyro_is_raw:
         proposed[GYRO] = _to_wire(GYRO, Affine(present_gyro.matrix, estimate.gyro_bias_rad_s))
     written = Affine.from_register(_floats(proposed[MAG]))
-    _refuse_out_of_bounds(written, estimate.gyro_bias_rad_s)
+    _refuse_matrix(MAG, written.matrix)
+    _refuse_offset(MAG, written.offset)
+    _refuse_offset(GYRO, estimate.gyro_bias_rad_s)
     new = {n: v for n, v in proposed.items() if not _equals_present(registers[n], v)}
     lines = register_lines(new)
     _refuse_irreversible({number: registers[number] for number in new})
@@ -229,21 +238,32 @@ def _refuse_irreversible(old: Mapping[int, Values]) -> None:
 
 
 def refuse_unsafe(values: Mapping[int, Values]) -> None:
-    """Raise UnwritableError if registers 23 and 84 exceed the hard limits."""
-    mag, gyro = (_affine(values, number) for number in (MAG, GYRO))
-    _refuse_out_of_bounds(mag, gyro.offset)
+    """Raise UnwritableError where a register 23, 25 or 84 exceeds the hard limits."""
+    for number in values.keys() & _OFFSETS.keys():
+        affine = Affine.from_register(_floats(values[number]))
+        _refuse_matrix(number, affine.matrix)
+        _refuse_offset(number, affine.offset)
 
 
-def _refuse_out_of_bounds(written: Affine, gyro_bias_rad_s: Array) -> None:
-    eigenvalues = np.linalg.eigvalsh(0.5 * (written.matrix + written.matrix.T))
-    if eigenvalues[0] <= 0.0:
-        raise UnwritableError("the correction matrix is not positive definite")
-    condition = float(np.linalg.cond(written.matrix))
+def _refuse_matrix(number: int, matrix: Array) -> None:
+    """Refuse a matrix that no sensor can need: it mirrors, flattens, or is in another unit."""
+    which = f"the correction matrix of register {number}"
+    if not np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] > 0.0:  # nor where it is nan
+        raise UnwritableError(
+            f"{which} is not positive definite; a rotation of the axes belongs in register 26"
+        )
+    condition = float(np.linalg.cond(matrix))
     if condition > MAX_CONDITION:
-        raise UnwritableError(f"condition {condition:.1f} of the correction, limit {MAX_CONDITION}")
-    offset = float(np.linalg.norm(written.offset))
-    if offset > MAX_OFFSET_GAUSS:
-        raise UnwritableError(f"hard iron {offset:.2f} gauss, limit {MAX_OFFSET_GAUSS}")
-    bias = float(np.linalg.norm(gyro_bias_rad_s))
-    if bias > MAX_GYRO_BIAS_RAD_S:
-        raise UnwritableError(f"gyro bias {bias:.3f} rad/s, limit {MAX_GYRO_BIAS_RAD_S}")
+        raise UnwritableError(f"{which} has the condition {condition:.1f}, limit {MAX_CONDITION}")
+    scale = float(np.cbrt(np.linalg.det(matrix)))
+    if not SCALES[0] <= scale <= SCALES[1]:
+        raise UnwritableError(
+            f"{which} multiplies by {scale:.3g}, limits {SCALES[0]} and {SCALES[1]}"
+        )
+
+
+def _refuse_offset(number: int, offset: Array) -> None:
+    name, limit, unit = _OFFSETS[number]
+    size = float(np.linalg.norm(offset))
+    if not size <= limit:
+        raise UnwritableError(f"{name} {size:.3g} {unit}, limit {limit} {unit}")

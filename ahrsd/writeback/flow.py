@@ -884,8 +884,9 @@ class Flow:
             which = ", ".join(map(str, by_hand[1]))
             self.outbox.note(
                 "error",
-                f"a write by hand of registers {which} was broken off: the device holds some old "
-                "and some new values; `ahrsd registers rollback` puts the old ones back",
+                f"a write by hand of registers {which}, or its save, was broken off: the device "
+                "holds some old and some new values; `ahrsd registers rollback` puts the old ones "
+                "back; add --save after a save",
             )
 
     def transaction(self) -> Transaction:

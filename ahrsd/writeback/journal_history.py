@@ -276,6 +276,8 @@ TIMES_KEPT: Final = 1000  # far more than any budget allows in a day
 
 BY_HAND: Final = "HAND_PREPARED"  # a write of the registers command
 BY_HAND_DONE: Final = "HAND_VERIFIED"  # its good end; at a bad one, `restored` says how it ended
+BY_HAND_SAVE: Final = "HAND_FLASH_SENT"  # its save to flash, about to be sent
+BY_HAND_SAVED: Final = "HAND_FLASH_ACKED"  # and the good end of that
 
 
 _TOUCHED_RAM: Final = (RecordKind.RAM_VERIFIED, RecordKind.RAM_FAILED, RecordKind.ROLLBACK)
@@ -324,10 +326,12 @@ class JournalHistory:
 
     open:      the transaction that no record has ended; `last`, `last_at`: its newest record
     newest_at: the time of the newest record of any kind
+    flashes_at, flashes: saves to flash by ahrsd, also by hand; `flashes` with those of clients
     rollbacks: since the last proven write or unlock; each means that a calibration was bad
     holds:     what the device must hold after the newest transaction, if known
     values:    registers with old and new values of writes, including those by hand
     trials:    registers with new values of writes that were neither saved nor kept by a person
+    by_hand:   old and new values of a write by hand, or of its save, that has no end
     broken:    the kind of a record that could not be parsed; then nothing may be written
     """
 
@@ -351,18 +355,24 @@ class JournalHistory:
     @staticmethod
     def of(records: Iterable[JournalRecord]) -> JournalHistory:
         """The history of these records, oldest first."""
-        history = JournalHistory()
+        history, by_hand = JournalHistory(), None
         for record in records:
             if record.kind in RecordKind.__members__:
                 history = history.with_record(RecordKind(record.kind), record.facts)
             elif record.kind == BY_HAND:
                 history = history._with_write_of_others(record.facts)._with_by_hand(record.facts)
-            elif record.kind == BY_HAND_DONE or record.facts.get("restored"):
+                by_hand = history.by_hand
+            elif record.kind == BY_HAND_SAVE:  # if that breaks off, the flash may hold some of each
+                at = Stamp.of(record.facts)
+                history = replace(history._with_flash(at), newest_at=at, by_hand=by_hand)
+            elif record.kind in (BY_HAND_DONE, BY_HAND_SAVED) or record.facts.get("restored"):
                 history = replace(history, by_hand=None)
         return history
 
     def with_record(self, kind: RecordKind, facts: Mapping[str, Any]) -> JournalHistory:
         """The history after one more record."""
+        if kind is RecordKind.CLIENT_SAVED:
+            return replace(self, flashes=self.flashes + 1)
         if kind in OF_OTHERS:
             return self
         at = Stamp.of(facts)
@@ -432,14 +442,18 @@ class JournalHistory:
         left = {n: v for n, v in (self.holds or {}).items() if str(n) not in written}
         return replace(self, holds=left or None)
 
+    def _with_flash(self, at: Stamp) -> JournalHistory:
+        """With one more save to flash."""
+        flashes_at = (*self.flashes_at, at)[-TIMES_KEPT:]
+        return replace(self, flashes_at=flashes_at, flashes=self.flashes + 1)
+
     def _with_counts(self, kind: RecordKind, facts: Mapping[str, Any], at: Stamp) -> JournalHistory:
         """With budgets and rollbacks updated."""
         changes: dict[str, Any] = {}
         if kind in _TOUCHED_RAM and self.last is RecordKind.PREPARED:
             changes["ram_writes_at"] = (*self.ram_writes_at, at)[-TIMES_KEPT:]
         if kind is RecordKind.FLASH_SENT:
-            changes["flashes_at"] = (*self.flashes_at, at)[-TIMES_KEPT:]
-            changes["flashes"] = self.flashes + 1
+            return self._with_flash(at)
         if kind is RecordKind.PROVEN:
             changes["rollbacks"] = 0
         if (

@@ -450,10 +450,14 @@ def missing(profile: Profile, values: Mapping[int, Values]) -> tuple[int, ...]:
     return tuple(n for n in CONFIGURATION if profile.has(n) and n not in values)
 
 
-def write_verified(register: int, values: Values, *, held: bool = False) -> Procedure[Values]:
+def write_verified(
+    register: int, values: Values, *, held: bool = False, unit: Unit | None = None
+) -> Procedure[Values]:
     """Write, see the echo, read afresh, compare; up to three times. Returns what was read.
 
     held: the device itself held the values (`commands.Write`)
+    unit: each attempt is one command right behind the answer that this unit is still the one that
+          answers, for in a silence another may take over the cable; else NotAsKnown or TooLate
     An echo that never came is no failure as long as the fresh read shows the values. Raises
     VerifyFailed; ValueError before anything is sent where the device would refuse the values.
     """
@@ -461,7 +465,7 @@ def write_verified(register: int, values: Values, *, held: bool = False) -> Proc
     back: Values = ()
     for _ in range(WRITE_TRIES):
         with suppress(NoReply):  # carried out or not: the read says which
-            yield command
+            yield from asked(command) if unit is None else asked_of(Seen(unit, {}), command)
         back = yield from read(register)
         if same(register, values, back[: len(values)]):
             return back
@@ -506,9 +510,12 @@ def save_settings(*, behind: bool = False) -> Procedure[None]:
     yield Pause(ERROR_WINDOW_S, watch_errors=True)
 
 
-def restore(saved: Mapping[int, Values], keys: Iterable[int]) -> Procedure[tuple[int, ...]]:
+def restore(
+    saved: Mapping[int, Values], keys: Iterable[int], unit: Unit | None = None
+) -> Procedure[tuple[int, ...]]:
     """Put the registers `keys` back to `saved`; returns those that had to be written.
 
+    unit: only this one is written (`write_verified`)
     Binary outputs that differ are switched off first, so that the device's check whether all output
     fits the baud rate cannot refuse an intermediate state; then the rest, the output type (6) last.
     One that fails does not keep the others from being restored: RestoreFailed at the end.
@@ -520,7 +527,7 @@ def restore(saved: Mapping[int, Values], keys: Iterable[int]) -> Procedure[tuple
     written = set()
     for step in (_switch_off, _put_back):
         for number in order:
-            if (yield from _attempted(errors, number, step(number, saved[number]))):
+            if (yield from _attempted(errors, number, step(number, saved[number], unit))):
                 written.add(number)
     if errors:
         raise RestoreFailed(errors)
@@ -542,21 +549,21 @@ def differences(
     return result
 
 
-def _put_back(number: int, values: Values) -> Procedure[bool]:
+def _put_back(number: int, values: Values, unit: Unit | None) -> Procedure[bool]:
     present = yield from read(number)
     if same(number, values, present):
         return False
-    yield from write_verified(number, values, held=True)
+    yield from write_verified(number, values, held=True, unit=unit)
     return True
 
 
-def _switch_off(number: int, values: Values) -> Procedure[bool]:
+def _switch_off(number: int, values: Values, unit: Unit | None) -> Procedure[bool]:
     if number not in BINARY_OUTPUTS:
         return False
     present = yield from read(number)
     if same(number, values, present) or same(number, BINARY_OUTPUT_OFF, present):
         return False
-    yield from write_verified(number, BINARY_OUTPUT_OFF)
+    yield from write_verified(number, BINARY_OUTPUT_OFF, unit=unit)
     return True
 
 
@@ -566,7 +573,7 @@ def _attempted(
     """`procedure`, its failure noted; a link that is gone or a cancel ends everything."""
     try:
         return (yield from procedure)
-    except (DeviceRefused, NoReply, VerifyFailed, ValueError) as error:
+    except (DeviceRefused, NoReply, TooLate, VerifyFailed, ValueError) as error:
         errors[number] = error
         return False
 
@@ -644,6 +651,22 @@ def identify_surely() -> Procedure[Identity]:
     return identity
 
 
+def read_twice(ids: Iterable[int]) -> Procedure[dict[int, Values]]:
+    """Registers whose values will be put back; raises Unsteady where two readings differ."""
+    values = yield from read_registers(ids)
+    return (yield from _read_again(values, values))
+
+
+def _read_again(values: Mapping[int, Values], ids: Iterable[int]) -> Procedure[dict[int, Values]]:
+    """Those of `ids` once more; raises Unsteady where that differs from `values`."""
+    again: dict[int, Values] = {}
+    for number in ids:
+        again[number] = yield from read(number)
+        if not same(number, values[number], again[number]):
+            raise Unsteady(f"register {number} reads {values[number]}, then {again[number]}")
+    return again
+
+
 def read_surely(identity: Identity, twice: Iterable[int]) -> Procedure[dict[int, Values]]:
     """The configuration of this device, and at the end it still is this device that answers.
 
@@ -653,10 +676,9 @@ def read_surely(identity: Identity, twice: Iterable[int]) -> Procedure[dict[int,
     RegisterValueError.
     """
     values = yield from read_configuration(identity.profile)
-    for number in (n for n in twice if n in values):
-        again = yield from read(number)
-        if not same(number, values[number], again):
-            raise Unsteady(f"register {number} reads {values[number]}, then {again}")
+    for number, again in (
+        yield from _read_again(values, (n for n in twice if n in values))
+    ).items():
         if number in SESSION_SETTINGS:
             format_command(number, again, held=True)
     if (unit := (yield from read_unit())) != identity.unit:

@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import pytest
 
-from ahrsd.cli.device.register_changes import apply, gate
-from ahrsd.daemon.journal import Journal, journal_path
-from ahrsd.errors import DeviceError
+from ahrsd.cli.device.register_changes import apply, gate, save_to_flash
+from ahrsd.daemon.journal import Journal, Record, journal_path
+from ahrsd.errors import DeviceError, JournalError
 from drivers.serial_port import SerialPort
-from drivers.vn100.commands import identify
+from drivers.vn100.commands import Read, Unsteady, identify
 from drivers.vn100.device import Device
 
 SERIAL = 100130608
@@ -264,9 +264,78 @@ def test_another_unit_is_neither_written_nor_put_back(emulated, tmp_path):
         device = Device(port, gate({23}, save=False))
         judged = replace(device.run(identify()), serial=SERIAL + 1)
         journal = Journal.open(tmp_path / "j.jsonl")
-        with pytest.raises(DeviceError, match=f"{SERIAL}, not {SERIAL + 1}; NOT put back"):
+        with pytest.raises(DeviceError, match=f"another.*NOT put back.*{SERIAL}, not {SERIAL + 1}"):
             apply(device, journal, judged, {23: NEW_VALUES})
         assert ram(emulator) == FACTORY
+
+
+class FirstReadingAltered(Device):
+    """Of what is read of register 23, the first reading is altered on its way."""
+
+    altered = False
+
+    def run(self, procedure, timeout_s=60.0):
+        return super().run(self._alter(procedure), timeout_s)
+
+    def _alter(self, procedure):
+        reply = None
+        try:
+            while True:
+                command = procedure.send(reply)
+                reply = yield command
+                if command == Read(23) and not self.altered:
+                    self.altered = True
+                    reply = replace(reply, tokens=("2", *reply.tokens[1:]))
+        except StopIteration as end:
+            return end.value
+
+
+def test_altered_reading_is_never_put_back(emulated, tmp_path):
+    """What the journal calls old is what `rollback` writes."""
+    with emulated() as (emulator, path), SerialPort(path, 115200) as port:
+        device = FirstReadingAltered(port, gate({23}, save=False))
+        journal, identity = Journal.open(tmp_path / "j.jsonl"), device.run(identify())
+        with pytest.raises(Unsteady, match=r"register 23 reads \(2.0, .*, then \(1.0, "):
+            apply(device, journal, identity, {23: NEW_VALUES})
+        assert ram(emulator) == FACTORY
+    assert journal.records() == []
+
+
+class FullDisk(Journal):
+    """A journal that cannot take records of one kind."""
+
+    kind = ""
+
+    def append(self, kind: str, **facts: object) -> Record:
+        if kind == self.kind:
+            raise JournalError("the disk is full")
+        return super().append(kind, **facts)
+
+
+@pytest.mark.parametrize(
+    ("kind", "said", "holds"),
+    [
+        ("HAND_PREPARED", "^the disk is full", FACTORY),
+        ("HAND_VERIFIED", "^the new values are in RAM, written and verified; not rec", NEW_VALUES),
+        ("HAND_FAILED", "; the old values are back; not recorded: the disk is full", FACTORY),
+        ("HAND_FLASH_SENT", "^not saved to flash: the new values are in RAM only; not", NEW_VALUES),
+        ("HAND_FLASH_ACKED", "^saved to flash; not recorded: the disk is full", NEW_VALUES),
+    ],
+)
+def test_full_disk_behind_a_write_does_not_hide_what_was_done(
+    emulated, tmp_path, kind, said, holds
+):
+    faults = ("refused_write",) if kind == "HAND_FAILED" else ()
+    with emulated(faults=faults) as (emulator, path), SerialPort(path, 115200) as port:
+        device = Device(port, gate({23}, save=True))
+        identity = device.run(identify())
+        journal = FullDisk(tmp_path / "j.jsonl", [], 0, b"", lambda: "")
+        journal.kind = kind
+        with pytest.raises(JournalError, match=said):
+            record = apply(device, journal, identity, {23: NEW_VALUES})
+            save_to_flash(device, journal, identity, record)
+        assert ram(emulator) == holds
+        assert emulator.counters["saves"] == (kind == "HAND_FLASH_ACKED")
 
 
 def test_save_without_an_answer_is_told_as_unknown(run, emulated, tmp_path, capsys):
@@ -301,11 +370,21 @@ def test_unknown_firmware_is_never_written(run, emulated, tmp_path, capsys):
         (["23", *["1", "0", "0", "0", "1", "0", "0", "0", "x", "0", "0", "0"]], "'x' is no f32"),
         (["4", "3.1"], "register 4 is never written: it is read only"),
         (["200", "1"], "the VN-100 has no register 200"),
+        (["23", *["0"] * 12], "the correction matrix of register 23 is not positive definite"),
+        (["84", *["0"] * 12], "the correction matrix of register 84 is not positive definite"),
+        (["25", *["0"] * 12], "the correction matrix of register 25 is not positive definite"),
+        (["23", "-1", *IDENTITY[1:]], "a rotation of the axes belongs in register 26"),
+        (["23", *IDENTITY[:8], "0.1", "0", "0", "0"], "has the condition 10.0, limit 8.0"),
+        (["23", *["100" if v == "1" else v for v in IDENTITY]], "multiplies by 100, limits 0.2"),
+        (["84", *["57.3" if v == "1" else v for v in IDENTITY]], "multiplies by 57.3, limits 0.2"),
+        (["23", *IDENTITY[:9], "12", "0", "0"], "hard iron 12 gauss, limit 1.3 gauss"),
+        (["25", *IDENTITY[:9], "0", "0", "9.81"], "accelerometer bias 9.81 m/s^2, limit 5.0 m/s^2"),
+        (["84", *IDENTITY[:9], "0.5", "0", "0"], "gyro bias 0.5 rad/s, limit 0.175 rad/s"),
     ],
 )
 def test_wrong_values_never_reach_the_port(run, arguments, words, capsys):
     assert run("registers", "write", "/dev/does-not-exist", *arguments, "--yes") == 2
-    assert words in capsys.readouterr().err
+    assert words in " ".join(capsys.readouterr().err.split())
 
 
 def test_missing_port_is_code_75(run, capsys):
@@ -430,8 +509,8 @@ FAR = [*FACTORY[:9], 1.4, 0, 0]
         ({"registers": {"6": [0]}}, "has no register 23"),
         ({"registers": {"23": [1, 2]}}, "registers 23: "),
         ({"registers": {"23": ["nan", *FACTORY[1:]]}}, "registers 23: "),
-        ({"registers": {"23": FLIPPED}}, "register 23 holds no usable calibration"),
-        ({"registers": {"23": FAR}}, "hard iron 1.40 gauss, limit 1.3"),
+        ({"registers": {"23": FLIPPED}}, "register 23 is not positive definite"),
+        ({"registers": {"23": FAR}}, "hard iron 1.4 gauss, limit 1.3"),
         ({"registers_in_force": {}}, "it is not known which registers were in force"),
         ({"registers_in_force": {"23": list(NEW_VALUES), "84": list(FACTORY)},
           "registers": {"84": [*FACTORY[:9], 0.01, 0, 0]}},

@@ -15,6 +15,7 @@ from ahrsd.core.core import Core
 from ahrsd.core.estimation import Calibrator
 from ahrsd.core.settings import CalibratorSettings
 from ahrsd.estimator import locked
+from ahrsd.estimator.online import WHOLE, Estimator
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.evidence.values import BasisFacts, HealthFacts
 from ahrsd.samples import SampleBlock
@@ -92,6 +93,33 @@ def later(blocks: list[SampleBlock], times: int) -> list[SampleBlock]:
         for k in range(times)
         for block in blocks
     ]
+
+
+def test_drift_is_followed_across_a_restart_of_the_device(blocks):
+    """Its time falls there, and no run may be taken for one at the same time as another."""
+    estimator = Estimator(Config().estimator.parameters(), at_once=WHOLE)
+    for run_, starts_s in enumerate((900.0, 20.0)):
+        for number, block in enumerate(blocks):
+            since_s = block.time_s - blocks[0].time_s[0]
+            behind_s = 63.0 * run_ + since_s
+            drift = behind_s[:, None] * np.array([4e-5, -3e-5, 3e-5])
+            dt_s = block.dt_s.copy()
+            dt_s[0] = dt_s[0] if number else np.nan
+            estimator.add(
+                replace(
+                    block,
+                    time_s=starts_s + since_s,
+                    host_s=behind_s,
+                    dt_s=dt_s,
+                    gyro_b_rad_s=block.gyro_b_rad_s + drift,
+                    gap_before=block.gap_before or not number,
+                )
+            )
+    estimate = estimator.finish()
+    assert estimate is not None
+    assert estimate.sigma[9:].max() < 1.5e-3
+    now = DEVICE.truth.gyro_bias_rad_s + 123.0 * np.array([4e-5, -3e-5, 3e-5])
+    assert np.abs((estimate.gyro_bias_rad_s - now) / estimate.sigma[9:]).max() < 4
 
 
 def test_batch_has_no_held_out_samples_and_loses_no_step(blocks):

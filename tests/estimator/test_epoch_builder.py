@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from ahrsd import so3
 from ahrsd.estimator.epoch_data import (
     EpochBuilder,
+    RunningTime,
     StepAverager,
     check_samples,
     join_epochs,
@@ -234,3 +235,21 @@ def test_gravity_direction_is_nan_without_an_accelerometer():
     silent = replace(block, accel_b_m_s2=np.full((N, 3), np.nan))
     (data,) = EpochBuilder(EstimatorParameters()).add(silent)
     assert np.isnan(data.down_b).all()
+
+
+def test_time_goes_on_where_the_device_restarted():
+    """By the host's clock, and what is reported is in the device's own time."""
+    running, one = RunningTime(), np.ones((2, 3))
+
+    def at(time_s: float, host_s: float) -> SampleBlock:
+        times = np.array([time_s, time_s + 1.0])
+        return SampleBlock(times, np.ones(2), host_s + np.arange(2.0), one, one, one)
+
+    before = at(900.0, 50.0)
+    assert running.follow(before) is before
+    assert running.falls(at(2.0, 58.0))
+    assert running.follow(at(2.0, 58.0)).time_s.tolist() == [908.0, 909.0]
+    assert running.follow(at(4.0, 60.0)).time_s.tolist() == [910.0, 911.0]
+    assert running.follow(at(1.0, 61.0)).time_s.tolist() == [911.1, 912.1]  # no host time
+    assert [running.device_s(s) for s in (900.5, 908.0, 911.0)] == [900.5, 2.0, 5.0]
+    assert round(running.device_s(912.1), 9) == 2.0

@@ -78,7 +78,7 @@ def test_unwritable_registers_are_reported_and_left_out():
     strong = replace(ESTIMATE, hard_iron_gauss=np.array([2.0, 0.0, 0.0]))
     found = calibration_json("a", strong, {})
     assert found["registers"] == {}
-    assert "hard iron 2.00 gauss, limit 1.3" in found["warnings"]
+    assert "hard iron 2 gauss, limit 1.3 gauss" in found["warnings"]
 
 
 @pytest.mark.parametrize(

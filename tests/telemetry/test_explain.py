@@ -192,11 +192,14 @@ def test_status_shows_the_candidate_to_be_reviewed():
         "lines": ["$VNWRG,23,1.1*XX", "$VNWRG,84,1*XX"],
         "heading_change_deg": 12.34,
     }
-    assert candidate_lines(status(write_back={"proposal": proposal})) == [
+    back = {"proposal": proposal, "transaction": None}
+    assert candidate_lines(status(write_back=back)) == [
         "candidate: 12ab34cd, heading changes by up to 12.3 deg; it would be written as",
         "  $VNWRG,23,1.1*XX",
         "  $VNWRG,84,1*XX",
     ]
+    on_trial = candidate_lines(status(write_back={**back, "transaction": "12ab34cd-1"}))
+    assert on_trial[0].endswith("; its write is under way, as")
     assert candidate_lines(status()) == []
 
 

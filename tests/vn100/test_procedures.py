@@ -16,6 +16,7 @@ from drivers.vn100.commands import (
     CONFIGURATION,
     Identity,
     NoReply,
+    NotAsKnown,
     Read,
     RestoreFailed,
     VerifyFailed,
@@ -221,6 +222,28 @@ def test_write_without_a_reply_is_verified_by_a_read():
     device.ram[84] = NEW_23_TEXT
     device.deaf.add("VNWRG,84")
     assert run(device, write_verified(84, NEW_23)) == pytest.approx(NEW_23)
+
+
+@pytest.mark.parametrize("putting_back", [False, True])
+def test_unit_that_takes_over_the_cable_in_a_silence_is_not_written(putting_back):
+    device = Device()
+    unit, answer = run(device, identify()).unit, device.answer
+
+    def swapped(line):
+        if line.startswith("$VNWRG"):
+            device.ram[3] = "0000000007"
+            device.deaf.add("VNWRG")
+            answer(line)
+            device.deaf.clear()
+            return b""
+        return answer(line)
+
+    device.answer = swapped
+    write = restore({23: NEW_23}, (23,), unit) if putting_back else None
+    with pytest.raises(NotAsKnown, match="another device answers"):
+        run(device, write or write_verified(23, NEW_23, unit=unit))
+    assert sum(line.startswith("VNWRG") for line in device.log) == 1
+    assert device.ram[23] == NO_CALIBRATION
 
 
 def test_values_that_the_device_would_refuse_are_never_sent():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ahrsd.samples import SampleBlock
-from ahrsd.writeback.journal_history import JournalHistory, Now, Stamp
+from ahrsd.writeback.journal_history import JournalHistory, Now, Stamp, StoredRecord
 from ahrsd.writeback.policy import Stillness, StillPolicy, WriteBackPolicy, flash_budget, ram_budget
 from ahrsd.writeback.states import Mode, Purpose, State
 from drivers.vn100.commands import Word, Write
@@ -96,6 +96,20 @@ def test_flash_writes_are_limited_per_day_and_per_lifetime():
     assert today == ["1 flash writes in a day, limit 1"]
     worn = flash_budget(policy, JournalHistory(flashes=200), Now(at(DAY_S)))
     assert worn == ["200 flash writes of this device, limit 200"]
+
+
+def test_saves_by_hand_and_by_clients_count_in_the_flash_budget():
+    policy = WriteBackPolicy(flash_writes_lifetime=3)
+    by_hand = StoredRecord("HAND_FLASH_SENT", at(50.0).facts())
+    history = JournalHistory.of([by_hand])
+    assert flash_budget(policy, history, Now(at(60.0))) == ["1 flash writes in a day, limit 1"]
+    assert flash_budget(policy, history, Now(at(51.0 + DAY_S))) == []
+    client = StoredRecord("CLIENT_SAVED", {"client": "ros", "serial": 1, **at(60.0).facts()})
+    assert flash_budget(policy, JournalHistory.of([client]), Now(at(70.0))) == []
+    worn = JournalHistory.of([by_hand, client, client])
+    assert flash_budget(policy, worn, Now(at(61.0 + DAY_S))) == [
+        "3 flash writes of this device, limit 3"
+    ]
 
 
 def test_flash_budget_holds_over_thirty_days_of_changing_iron(make_rig):

@@ -15,7 +15,7 @@ The daemon's own kinds (`writeback.reconcile`) promise more, gates and a trial, 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,12 +44,14 @@ from drivers.vn100.commands import (
     read,
     read_present,
     read_registers,
+    read_twice,
     restore,
     save_settings_of,
     write_verified,
 )
 from drivers.vn100.device import Device
 from drivers.vn100.errors import DriverError
+from drivers.vn100.register_codec import OUT_OF_RANGE
 from drivers.vn100.registers import (
     REGISTERS,
     SESSION_SETTINGS,
@@ -145,9 +147,10 @@ def apply(
     """Write and verify `changes` in RAM; returns the record that `rollback` goes back to.
 
     why: facts for the journal: `reason`, and for a rollback `undoes`, the number of the change.
-    Raises JournalError before anything is sent, DeviceError with the outcome of putting back.
+    Raises JournalError or Unsteady before anything is written, DeviceError with the outcome of
+    putting back.
     """
-    old = device.run(read_registers(changes))
+    old = device.run(read_twice(changes))
     prepared = _append(
         journal,
         "HAND_PREPARED",
@@ -160,10 +163,16 @@ def apply(
         device.run(quiet(_write_all(identity, changes, held="undoes" in why)))
     except (DriverError, PortError) as error:
         restored = _put_back(device, identity, old)
-        _append(journal, "HAND_FAILED", txn=prepared.seq, error=str(error), restored=not restored)
         outcome = f"NOT put back: {restored}" if restored else "the old values are back"
+        _append_behind(
+            journal, "HAND_FAILED", f"{error}; {outcome}",
+            txn=prepared.seq, error=str(error), restored=not restored,
+        )  # fmt: skip
         raise DeviceError(f"{error}; {outcome}") from error
-    _append(journal, "HAND_VERIFIED", txn=prepared.seq)
+    _append_behind(
+        journal, "HAND_VERIFIED", "the new values are in RAM, written and verified",
+        txn=prepared.seq,
+    )  # fmt: skip
     return prepared
 
 
@@ -173,7 +182,10 @@ def save_to_flash(device: Device, journal: Journal, identity: Identity, prepared
     present = device.run(read_registers(expected))
     if changed := to_write(present, expected):
         raise DeviceError(f"register {min(changed)} no longer holds what was written; not saved")
-    _append(journal, "HAND_FLASH_SENT", txn=prepared.seq)
+    _append_behind(
+        journal, "HAND_FLASH_SENT", "not saved to flash: the new values are in RAM only",
+        txn=prepared.seq,
+    )  # fmt: skip
     try:
         device.run(quiet(save_settings_of(Seen(identity.unit, present))))
     except (NotAsKnown, TooLate) as error:
@@ -183,7 +195,7 @@ def save_to_flash(device: Device, journal: Journal, identity: Identity, prepared
             f"{error}; whether it was saved is not known: switch the device off and on and compare "
             f"it with {prepared.seq}:new of the journal (`ahrsd registers diff`)"
         ) from error
-    _append(journal, "HAND_FLASH_ACKED", txn=prepared.seq)
+    _append_behind(journal, "HAND_FLASH_ACKED", "saved to flash", txn=prepared.seq)
 
 
 def _append(journal: Journal, kind: str, **facts: object) -> Record:
@@ -191,11 +203,18 @@ def _append(journal: Journal, kind: str, **facts: object) -> Record:
     return journal.append(kind, **{**host_clock.stamp(), **facts})
 
 
+def _append_behind(journal: Journal, kind: str, so_far: str, **facts: object) -> None:
+    """The same behind something done; what is `so_far` is told even where it cannot be recorded."""
+    try:
+        _append(journal, kind, **facts)
+    except JournalError as error:
+        raise JournalError(f"{so_far}; not recorded: {error}") from error
+
+
 def _write_all(identity: Identity, changes: Changes, held: bool) -> Procedure[None]:
     """Write and read back each; then read all of them again: a restart in between undoes some."""
     for number, values in changes.items():
-        yield from _refuse_other_device(identity)
-        yield from write_verified(number, values, held=held)
+        yield from write_verified(number, values, held=held, unit=identity.unit)
     yield from _refuse_other_device(identity)
     for number, values in changes.items():
         back = yield from read(number)
@@ -214,7 +233,7 @@ def _put_back(device: Device, identity: Identity, old: Changes) -> str:
 
 def _restore(identity: Identity, old: Changes) -> Procedure[None]:
     yield from _refuse_other_device(identity)
-    yield from restore(old, old)
+    yield from restore(old, old, identity.unit)
 
 
 def _refuse_other_device(identity: Identity) -> Procedure[None]:
@@ -326,6 +345,17 @@ class Sources:
         return register_values(find(Journal.open(paths[0]), int(number)), which or "old")
 
 
+def typed(number: int, tokens: Sequence[str]) -> Changes:
+    """What a person typed.  Raises RegisterValueError, also for what no sensor can need."""
+    wanted = {number: parse(number, tokens)}
+    format_command(number, wanted[number])
+    try:
+        refuse_unsafe(wanted)
+    except UnwritableError as error:
+        raise RegisterValueError(str(error), OUT_OF_RANGE) from error
+    return wanted
+
+
 def calibrated(
     path: Path, serial: int | None
 ) -> Callable[[Device, Journal], tuple[Changes, Mapping[str, object]]]:
@@ -337,7 +367,7 @@ def calibrated(
     body = _calibration(path)
     new, in_force = (_registers_in(path, body, key) for key in ("registers", "registers_in_force"))
     try:
-        refuse_unsafe({**in_force, **new})
+        refuse_unsafe(new)
         for number, values in new.items():
             format_command(number, values)
     except (UnwritableError, RegisterValueError) as error:

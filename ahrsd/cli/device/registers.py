@@ -39,6 +39,7 @@ from ahrsd.cli.device.register_changes import (
     refuse_unproven_save,
     save_to_flash,
     to_write,
+    typed,
 )
 from ahrsd.cli.files import refuse_unwritable, write_text
 from ahrsd.config.config import default_state_directory
@@ -59,6 +60,7 @@ from ahrsd.writeback.journal_history import JournalHistory, RecordKind, find_rec
 from drivers.vn100.commands import (
     Identity,
     identify,
+    identify_surely,
     missing,
     read_configuration,
     read_present,
@@ -71,8 +73,6 @@ from drivers.vn100.registers import (
     ROTATION,
     RegisterValueError,
     Values,
-    format_command,
-    parse,
 )
 
 # -- Lock and unlock -------------------------------------------------------------------------------
@@ -322,6 +322,8 @@ def write(
 ) -> None:
     """Write register ID of the device on PORT; VALUES in the manual's order, blanks or commas.
 
+    Of registers 23, 25 and 84, values that no sensor can need are refused.
+
     With --from the registers of a calibration: it must have converged, its numbers must be within
     the daemon's limits, and the device must be the one that was recorded and still hold the values
     that were in force then.
@@ -336,8 +338,7 @@ def write(
         raise click.UsageError("give ID and VALUES, or --from FILE")
     tokens = [token for value in values for token in value.split(",") if token]
     try:
-        wanted = {number: parse(number, tokens)}
-        format_command(number, wanted[number])
+        wanted = typed(number, tokens)
     except RegisterValueError as error:
         raise click.BadParameter(str(error), param_hint="VALUES") from error
     state = _state(state_directory)
@@ -444,7 +445,7 @@ def _change(
     """Read, show, and with `yes` journal, write, verify and tell how to go back."""
     permitted: set[int] = set()
     with open_device(port, baud, gate(permitted, save=save and yes)) as device:
-        identity = device.run(identify())
+        identity = device.run(identify_surely())
         journal = Journal.open(journal_file or journal_path(state, identity.serial))
         if other := find_record_of_other_device(journal.records(), identity.serial):
             raise JournalError(f"{journal.path}: {other}; nothing was written")
