@@ -595,7 +595,8 @@ class Stream:
         lost = np.array(self._lost)
         if self._attitude is not None:
             ypr, rate = np.hsplit(table[:, self._attitude], 2)
-            lost = np.maximum(lost, self._turns.look(ypr, rate, self._steps.step_s))
+            told = lost > 0 if self._arrivals[-1] != 0.0 else None  # by arrivals: how many, too
+            lost = np.maximum(lost, self._turns.look(ypr, rate, self._steps.step_s, told))
             self._say_turns()
         if not self.facts.expected:
             lost[0] = 0  # nothing came before the first one

@@ -316,8 +316,17 @@ class TurnWatch:
         """The next message does not follow the last one."""
         self._last = None
 
-    def look(self, ypr_rad: Array, gyro_rad_s: Array, step_s: float) -> NDArray[np.int64]:
-        """Estimated numbers of messages (N,) that are missing before each of N messages."""
+    def look(
+        self,
+        ypr_rad: Array,
+        gyro_rad_s: Array,
+        step_s: float,
+        told: NDArray[np.bool_] | None = None,
+    ) -> NDArray[np.int64]:
+        """Estimated numbers of messages (N,) that are missing before each of N messages.
+
+        told: (N,) true where it is known how many are missing; nothing is estimated there
+        """
         table = np.hstack([ypr_rad, gyro_rad_s])
         if self._last is None:
             self._last = table[0]
@@ -330,6 +339,8 @@ class TurnWatch:
             turned = _turned(table[:, :3])
         found = np.zeros(len(said), dtype=np.int64)
         jumps = _jumps(turned, said)
+        if told is not None:
+            jumps &= ~told
         weight = min(step_s / _SPEED_S, 1.0)
         for k, (now, jumped) in enumerate(zip(speed[1:].tolist(), jumps.tolist(), strict=True)):
             if math.isfinite(now):

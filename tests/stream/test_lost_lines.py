@@ -136,3 +136,19 @@ def test_samples_of_a_stream_with_lost_messages_have_the_right_times():
     missing = numbers[-1] + 1 - len(numbers)
     assert stream.health().drop_rate == pytest.approx(missing / (numbers[-1] + 1))
     assert any("by the times at which the others arrived" in text for text in stream.warnings)
+
+
+def test_a_loss_that_the_arrivals_tell_is_not_counted_again_by_the_attitude():
+    stream = Stream(RegisterEpochs(), 40.0)
+    layout = MESSAGES["VNYMR"]
+    at, numbers = arrivals(40.0, 0.1, "exact", 800)
+    for one, number in zip(at.tolist(), numbers.tolist(), strict=True):
+        yaw = (number * 0.025 * 1.5 + np.pi) % (2.0 * np.pi) - np.pi  # 1.5 rad/s
+        said = {"yaw_rad": yaw, "pitch_rad": 0.0, "roll_rad": 0.0}
+        said |= {"gyro_x_rad_s": 0.0, "gyro_y_rad_s": 0.0, "gyro_z_rad_s": 0.9}
+        values = tuple(said.get(column.name, 0.1) for column in layout.columns)
+        stream.take(Measurement(layout, values, 0), one)
+    stream.flush()
+    missing = numbers[-1] + 1 - len(numbers)
+    assert stream.health().drop_rate == pytest.approx(missing / (numbers[-1] + 1))
+    assert [text for text in stream.warnings if "turned further" in text] == []
