@@ -34,6 +34,7 @@ from ahrsd.stream.decompensation import (
     sample_blocks,
 )
 from ahrsd.stream.device_clock import DeviceClock, Gap, StepClock, StreamTimeline, TimelineSteps
+from ahrsd.stream.in_turn import sensors_in_turn
 from ahrsd.stream.lost_lines import LostLines
 from ahrsd.stream.streams_without_time import (
     RateWatch,
@@ -168,6 +169,7 @@ _PAUSE_S, _PAUSE_STEPS = 0.5, 4.0  # arrivals apart by both: something was not s
 _LONGEST_PAUSE_S = (
     60.0  # a longer one may be the host's clock that was set: its length says nothing
 )
+_FIRST = 200  # samples that are asked whether they are of one device
 _SAID_SHARE = 1e-3  # of the messages; when fewer are missing by their arrivals nothing is said
 _MESSAGE_BYTES = 120  # of $VNYMR: how many messages a longer piece of damage was
 _GARBAGE_BYTES = 60  # of no text; less may have come between two whole messages
@@ -224,6 +226,8 @@ class Stream:
         self._lines, self._lines_said = LostLines(), ""
         self._waiting: tuple[list[tuple[float, ...]], list[float], list[int]] = ([], [], [])
         self._parts = Parts()
+        self._first: list[Array] = []
+        self._first_count = 0
         self._given_s: float | None = None
         self._given_steps, self._given_step_s, self._excused = 0, 0.0, 0
 
@@ -527,11 +531,25 @@ class Stream:
         arrived_s = None if arrivals[-1] == 0.0 else arrivals
         found = sample_blocks(extractor, extracted, steps, host_s, self.epochs, arrived_s)
         blocks = self._unbridged(found)
+        self._look_for_turns(blocks)
         if steps.keep.any():
             self._left_out = not blocks or blocks[-1].time_s[-1] != time_s[steps.keep][-1]
         self._rows, self._arrivals, self._lost = self._waiting
         self._waiting = [], [], []
         return blocks
+
+    def _look_for_turns(self, blocks: list[SampleBlock]) -> None:
+        """Whether the first samples are of one device; two on one wire send in turn."""
+        if self._first_count >= _FIRST:
+            return
+        for block in blocks:
+            self._first.append(block.raw_b_gauss)
+            self._first_count += len(block)
+        if self._first_count < _FIRST:
+            return
+        if words := sensors_in_turn(np.concatenate(self._first)):
+            self.warnings[words] = None
+        self._first.clear()
 
     def _settle(self, extractor: Extractor, ends: bool) -> bool:
         """What the arrivals say is missing; rows that need those behind them wait.
