@@ -63,6 +63,7 @@ from ahrsd.recording.limits import (
     refuse_beyond,
 )
 from ahrsd.samples import Array, SampleBlock, in_periods, known_force
+from ahrsd.stream.in_turn import sensors_in_turn
 
 PARQUET = b"PAR1"  # how such a file begins
 NOTES_KEY = "ahrsd.notes"  # in the metadata of a converted table
@@ -435,16 +436,8 @@ class _TableRows:
         rows = self.vectors(MAG)
         if len(rows) < MINIMUM_ROWS:
             return
-        jump = float(np.median(np.linalg.norm(np.diff(rows, axis=0), axis=1)))
-        for count in range(2, _MOST_SENSORS + 1):
-            again = np.median(np.linalg.norm(rows[count:] - rows[:-count], axis=1))
-            if jump > _APART * again:
-                self.notes.append(
-                    f"the field jumps by {1e3 * jump:.3g} mG from row to row and is the same again "
-                    f"after {count} rows: these are the rows of {count} sensors in turn, of which "
-                    "only one may be kept, or an alternating current is near"
-                )
-                return
+        if words := sensors_in_turn(rows):
+            self.notes.append(words)
 
     def drop_impossible(self) -> None:
         """Rows with a reading that no such sensor can have among good ones: marks, damaged cells.

@@ -5,7 +5,8 @@ so that the blocks do not depend on how the bytes were cut), then turned into ar
 
 Time of a sample: the device's own TimeStartup where the message carries it; else steps of one over
 the rate. Damaged messages, steps over which the device turned further than its rate can explain
-(`TurnWatch`), and a pause in the arrivals count as lost messages then, so that nothing is bridged.
+(`TurnWatch`), and those whose absence shows in the arrivals of the others (`LostLines`) count as
+lost messages then, so that nothing is bridged.
 The rate of such a stream is what the caller says, else what the register of this very output says
 (`streams_without_time`), else what the arrival times say, else the factory's 40 Hz. Where messages
 come at another rate than a register says, time after time, the arrivals are right.
@@ -33,10 +34,13 @@ from ahrsd.stream.decompensation import (
     sample_blocks,
 )
 from ahrsd.stream.device_clock import DeviceClock, Gap, StepClock, StreamTimeline, TimelineSteps
+from ahrsd.stream.in_turn import sensors_in_turn
+from ahrsd.stream.lost_lines import LostLines
 from ahrsd.stream.streams_without_time import (
     RateWatch,
     TurnWatch,
     attitude_columns,
+    long_enough,
     offered_rate,
     rate_by_registers,
     rate_of_arrivals,
@@ -165,6 +169,8 @@ _PAUSE_S, _PAUSE_STEPS = 0.5, 4.0  # arrivals apart by both: something was not s
 _LONGEST_PAUSE_S = (
     60.0  # a longer one may be the host's clock that was set: its length says nothing
 )
+_FIRST = 200  # samples that are asked whether they are of one device
+_SAID_SHARE = 1e-3  # of the messages; when fewer are missing by their arrivals nothing is said
 _MESSAGE_BYTES = 120  # of $VNYMR: how many messages a longer piece of damage was
 _GARBAGE_BYTES = 60  # of no text; less may have come between two whole messages
 _MOST_NAMES = 64  # of messages; no VN-100 sends so many, but a damaged wire may now and then
@@ -217,7 +223,11 @@ class Stream:
         self._turns = TurnWatch()
         self._turns_said = self._rate_warned = ""
         self._watch = RateWatch()
+        self._lines, self._lines_said = LostLines(), ""
+        self._waiting: tuple[list[tuple[float, ...]], list[float], list[int]] = ([], [], [])
         self._parts = Parts()
+        self._first: list[Array] = []
+        self._first_count = 0
         self._given_s: float | None = None
         self._given_steps, self._given_step_s, self._excused = 0, 0.0, 0
 
@@ -296,6 +306,7 @@ class Stream:
         self._parts.forget()
         self._turns.forget()
         self._watch.forget()
+        self._lines.forget()
         self._arrived_s = 0.0
         if self._steps is not None:  # counted time stood still meanwhile and the host's did not
             self.clock = DeviceClock()
@@ -321,34 +332,39 @@ class Stream:
                 if whole is None or extractor is None:
                     return []
                 measurement, host_s = whole
-        if not extractor.has_time:
-            self._look_at_arrival(host_s)
+        before = [] if extractor.has_time else self._look_at_arrival(host_s)
         self._rows.append(measurement.values)
         self._arrivals.append(host_s)
         self._lost.append(self._lost_next)
         self._lost_next = 0
         if len(self._rows) < self._want:
-            return []
+            return before
         self._want = self._wanted(extractor)
-        return self.flush() if len(self._rows) >= self._want else []
+        return before + self._turn(ends=False) if len(self._rows) >= self._want else before
 
-    def _look_at_arrival(self, host_s: float) -> None:
-        """What an arrival says of a stream without time: a pause, and whether the rate is right."""
+    def _look_at_arrival(self, host_s: float) -> list[SampleBlock]:
+        """What an arrival says of a stream without time: a pause, and whether the rate is right.
+
+        The samples before a pause whose length nobody knows.
+        """
         before_s, self._arrived_s = self._arrived_s, host_s
         if before_s <= 0.0:
-            return
+            return []
         step_s, pause_s = self._step_s(), host_s - before_s
         if pause_s > max(_PAUSE_S, _PAUSE_STEPS * step_s):
             self._watch.forget()
             if self._steps is None:
                 self._clear()  # these arrivals and those to come are not on one line
-            else:
-                known = pause_s <= _LONGEST_PAUSE_S
-                self.lost(max(round(pause_s / step_s) - 1, 1) if known else 1)
+            elif pause_s > _LONGEST_PAUSE_S:
+                blocks = self._turn(ends=True)
+                self._lines.forget()
+                self.lost(1)
+                return blocks
         elif self._steps is not None and self._said_rate_hz is None:
             comes_hz = self._watch.look(host_s, self._lost_next, self.facts.rate_hz)
             if comes_hz is not None:
                 self._correct_rate(comes_hz)
+        return []
 
     def _step_s(self) -> float:
         """Seconds between messages as far as is known; infinite where nothing is."""
@@ -370,7 +386,9 @@ class Stream:
         self._steps = StepClock(rate_hz, since_s)
         self._cut()
         facts, self._turns, self.all_gaps = self.facts, TurnWatch(), Gaps(self.all_gaps.keep)
+        self._lines = LostLines()
         self.warnings.pop(self._turns_said, None)
+        self.warnings.pop(self._lines_said, None)
         facts.expected, facts.duration_s = float(facts.samples), facts.samples / rate_hz
         self._replaced = facts.samples > 0
 
@@ -452,12 +470,16 @@ class Stream:
             period = self._timeline.period_s
             return 16 if not np.isfinite(period) else _rows(1.0 / period)
         if self._steps is None and self._rate() is None:
-            return len(self._rows) + 1
+            rows = len(self._rows)
+            return rows + (rows // 4 if long_enough(self._arrivals) else 1)
         rate = self.facts.rate_hz
         return _rows(rate) if np.isfinite(rate) else 1
 
-    def _rate(self) -> float | None:
-        """Rate of a stream without device time, None while it must still be watched."""
+    def _rate(self, ends: bool = False) -> float | None:
+        """Rate of a stream without device time, None while it must still be watched.
+
+        ends: whether no more of it comes
+        """
         said = self._said_rate_hz
         if said is not None:
             return self._decide(said, self._said_source)
@@ -469,8 +491,8 @@ class Stream:
             return self._decide(FACTORY_RATE_HZ, "assumed: the factory's rate")
         if self.epochs.now.compensation is None:
             return None  # the registers may yet be read
-        arrived_hz = rate_of_arrivals(layout, self._arrivals, self._lost)
-        return None if arrived_hz is None else self._decide(arrived_hz, "arrival times")
+        arrived = rate_of_arrivals(layout, self._arrivals, self._lost, ends)
+        return None if arrived is None else self._decide(*arrived)
 
     def _decide(self, rate_hz: float, source: str) -> float:
         self.facts.rate_hz, self.facts.rate_source = rate_hz, source
@@ -486,11 +508,17 @@ class Stream:
 
     def flush(self) -> list[SampleBlock]:
         """Turn what is collected into blocks now (registers change, the link goes, the end)."""
+        return self._turn(ends=True)
+
+    def _turn(self, ends: bool) -> list[SampleBlock]:
+        """The same of what can be judged; ends: all of it, whatever would come behind."""
         extractor = self._extractor
         if extractor is None or not self._rows:
             return []
-        if not extractor.has_time and self._steps is None and self._rate() is None:
+        if not extractor.has_time and self._steps is None and self._rate(ends) is None:
             self._clear()  # nobody can say yet when they were
+            return []
+        if not self._settle(extractor, ends):
             return []
         table = np.array(self._rows, dtype=np.float64)
         extracted = extractor.extract_table(table)
@@ -503,9 +531,59 @@ class Stream:
         arrived_s = None if arrivals[-1] == 0.0 else arrivals
         found = sample_blocks(extractor, extracted, steps, host_s, self.epochs, arrived_s)
         blocks = self._unbridged(found)
+        self._look_for_turns(blocks)
         if steps.keep.any():
             self._left_out = not blocks or blocks[-1].time_s[-1] != time_s[steps.keep][-1]
+        self._rows, self._arrivals, self._lost = self._waiting
+        self._waiting = [], [], []
         return blocks
+
+    def _look_for_turns(self, blocks: list[SampleBlock]) -> None:
+        """Whether the first samples are of one device; two on one wire send in turn."""
+        if self._first_count >= _FIRST:
+            return
+        for block in blocks:
+            self._first.append(block.raw_b_gauss)
+            self._first_count += len(block)
+        if self._first_count < _FIRST:
+            return
+        if words := sensors_in_turn(np.concatenate(self._first)):
+            self.warnings[words] = None
+        self._first.clear()
+
+    def _settle(self, extractor: Extractor, ends: bool) -> bool:
+        """What the arrivals say is missing; rows that need those behind them wait.
+
+        False where all of them wait. Of rows with one arrival or none nothing can be said.
+        """
+        if extractor.has_time or self._steps is None or self._arrivals[-1] == 0.0:
+            return True
+        seen = self._lines.look(self._arrivals, self._lost, self._steps.step_s, ends)
+        count = seen.settled
+        self._waiting = self._rows[count:], self._arrivals[count:], self._lost[count:]
+        missing = np.cumsum(seen.lost + ~seen.used)[seen.used]  # those without a time are as lost
+        self._lost = np.diff(missing, prepend=0).tolist()
+        self._rows = [row for row, used in zip(self._rows, seen.used, strict=False) if used]
+        self._arrivals = [at for at, used in zip(self._arrivals, seen.used, strict=False) if used]
+        self._say_lines()
+        if self._rows:
+            return True
+        self._rows, self._arrivals, self._lost = self._waiting
+        self._waiting = [], [], []
+        return False
+
+    def _say_lines(self) -> None:
+        lines = self._lines
+        total = lines.missing + self.by_layout[self.facts.layout]
+        self.warnings.pop(self._lines_said, None)
+        if lines.places < _FEW_PLACES or lines.missing < _SAID_SHARE * total:
+            return
+        self._lines_said = (
+            "messages are missing although the bytes show no gap: by the times at which the others "
+            f"arrived, at {counted(lines.places, 'place')} ({100.0 * lines.missing / total:.2g} % "
+            "of all are missing); these steps are not used; was the recording computer too slow?"
+        )
+        self.warnings[self._lines_said] = None
 
     def peek(self) -> list[SampleBlock]:
         """What waits for its block to be full, as far as it carries its time; changes nothing."""
@@ -535,7 +613,8 @@ class Stream:
         lost = np.array(self._lost)
         if self._attitude is not None:
             ypr, rate = np.hsplit(table[:, self._attitude], 2)
-            lost = np.maximum(lost, self._turns.look(ypr, rate, self._steps.step_s))
+            told = lost > 0 if self._arrivals[-1] != 0.0 else None  # by arrivals: how many, too
+            lost = np.maximum(lost, self._turns.look(ypr, rate, self._steps.step_s, told))
             self._say_turns()
         if not self.facts.expected:
             lost[0] = 0  # nothing came before the first one

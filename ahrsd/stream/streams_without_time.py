@@ -6,7 +6,8 @@ divisor (vn100-protocol 4.4). Two outputs with the same fields and different rat
 
 Arrivals say a rate over some seconds only: a USB adapter delivers several messages at once. They
 are asked where no register says it, and whether what a register says is what comes (`RateWatch`):
-registers may have been changed since they were read, and other models divide another rate.
+registers may have been changed since they were read, and other models divide another rate. Lost
+messages make the mean rate too low; the step between those that came tells (`lost_lines`).
 
 **The device's own attitude.** Between two messages the attitude turns by the vector v = log(R_k^T
 R_(k+1)), and the gyro says the mean rate w over the same step; v = w dt. Two things follow:
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 
 from ahrsd import so3
 from ahrsd.samples import Array
+from ahrsd.stream.lost_lines import FASTEST, step_of
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.messages import MESSAGES, BinaryLayout, Layout, binary_layout
@@ -45,6 +47,8 @@ _LEAST_ARRIVALS, _MOST_ARRIVALS, _LEAST_SPAN_S = 100, 2000, 2.0
 _WATCHED, _WATCHED_S = 100, 4.0
 _DIFFERS = 0.15  # an adapter's bunches are far below, another divisor is above
 _WINDOWS = 2
+_MOST_DIVISOR = 16  # of binary packets; slower ones have rates so close that any one is near
+UNSURE = "the mean of arrival times; messages may be missing, as no regular step explains them"
 _STANDS_S = 1.0  # so much time of messages with one stamp: the host's clock stands
 
 
@@ -80,24 +84,46 @@ def _number(value: float | str) -> float:
     return 0.0 if isinstance(value, str) else float(value)
 
 
-def rate_of_arrivals(
-    layout: Layout, arrivals_s: Sequence[float], lost: Sequence[int]
-) -> float | None:
-    """Hz by a line through the arrivals of messages; None while they say too little.
-
-    lost: messages that were lost before each. A rate that the device offers is taken for it where
-    it is within 2 %.
-    """
+def long_enough(arrivals_s: Sequence[float]) -> bool:
+    """Whether so many messages arrived over such a time that their rate may be asked."""
     count = len(arrivals_s)
     span_s = arrivals_s[-1] - arrivals_s[0] if count else 0.0
     if count < _LEAST_ARRIVALS or span_s <= 0.0:
+        return False
+    return span_s >= _LEAST_SPAN_S or count >= _MOST_ARRIVALS
+
+
+def rate_of_arrivals(
+    layout: Layout, arrivals_s: Sequence[float], lost: Sequence[int], ends: bool = False
+) -> tuple[float, str] | None:
+    """Hz by the arrivals of messages, and in words whether they are sure of it.
+
+    None while they say too little. A rate that the device offers is taken for it where it is
+    within 2 %.
+
+    lost: messages that were lost before each, as far as is known; ends: whether no more come
+    """
+    if not long_enough(arrivals_s):
         return None
-    if span_s < _LEAST_SPAN_S and count < _MOST_ARRIVALS:
+    mean_hz = _mean_rate(arrivals_s, lost)
+    step_s, sure = step_of(arrivals_s, lost, _offered_steps(layout, mean_hz))
+    if not step_s > 0.0:
         return None
-    number = np.cumsum(1.0 + np.asarray(lost, dtype=np.float64))
-    number -= number.mean()
-    step_s = float(number @ np.asarray(arrivals_s) / (number @ number))
-    return offered_rate(layout, 1.0 / step_s) if step_s > 0.0 else None
+    if not sure and not ends and len(arrivals_s) < _MOST_ARRIVALS:
+        return None
+    return offered_rate(layout, 1.0 / step_s), "arrival times" if sure else UNSURE
+
+
+def _mean_rate(arrivals_s: Sequence[float], lost: Sequence[int]) -> float:
+    return (len(lost) - 1 + sum(lost[1:])) / (arrivals_s[-1] - arrivals_s[0])
+
+
+def _offered_steps(layout: Layout, mean_hz: float) -> list[float]:
+    """Steps that the device offers for this kind of message, of those near or shorter ones."""
+    if not isinstance(layout, BinaryLayout):
+        return [1.0 / usual for usual in ASYNC_OUTPUT_RATES_HZ[1:]]
+    longest = min(math.ceil(SAMPLE_RATE_HZ / mean_hz) + 1, _MOST_DIVISOR)
+    return [n / SAMPLE_RATE_HZ for n in range(max(longest // 2, 1), longest + 1)]
 
 
 def offered_rate(layout: Layout, rate_hz: float) -> float:
@@ -118,23 +144,32 @@ class RateWatch:
 
     def forget(self) -> None:
         """What follows does not follow on."""
-        self._first_s = self._last_s = float("nan")
+        self._last_s = float("nan")
         self._count = self._same = 0
+        self._arrivals: list[float] = []
+        self._lost: list[int] = []
 
     def look(self, arrival_s: float, lost: int, rate_hz: float) -> float | None:
         """One message; the rate at which they come where that is another one, time after time."""
         self._same = self._same + 1 if arrival_s == self._last_s else 0
-        if self._same > _STANDS_S * rate_hz or not self._count:
+        if self._same > _STANDS_S * rate_hz or not self._arrivals:
             self.forget()
-            self._first_s = self._last_s = arrival_s
-            self._count = 1
+            self._arrivals.append(arrival_s)
+            self._lost.append(0)
+            self._last_s = arrival_s
             return None
-        self._count += 1 + lost
+        self._arrivals.append(arrival_s)
+        self._lost.append(lost)
+        self._count += lost
         self._last_s = arrival_s
-        span_s = arrival_s - self._first_s
-        if self._count < _WATCHED or span_s < _WATCHED_S:
+        span_s = arrival_s - self._arrivals[0]
+        count = self._count + len(self._arrivals)
+        if count < _WATCHED or span_s < _WATCHED_S:
             return None
-        comes_hz = (self._count - 1) / span_s
+        comes_hz = (count - 1) / span_s
+        if rate_hz / FASTEST < comes_hz < rate_hz * (1.0 - _DIFFERS):  # or some are lost
+            step_s, sure = step_of(self._arrivals, self._lost, (1.0 / rate_hz,))
+            comes_hz = 1.0 / step_s if sure else rate_hz
         self.forget()
         if abs(comes_hz / rate_hz - 1.0) < _DIFFERS:
             self._differing.clear()
@@ -281,8 +316,17 @@ class TurnWatch:
         """The next message does not follow the last one."""
         self._last = None
 
-    def look(self, ypr_rad: Array, gyro_rad_s: Array, step_s: float) -> NDArray[np.int64]:
-        """Estimated numbers of messages (N,) that are missing before each of N messages."""
+    def look(
+        self,
+        ypr_rad: Array,
+        gyro_rad_s: Array,
+        step_s: float,
+        told: NDArray[np.bool_] | None = None,
+    ) -> NDArray[np.int64]:
+        """Estimated numbers of messages (N,) that are missing before each of N messages.
+
+        told: (N,) true where it is known how many are missing; nothing is estimated there
+        """
         table = np.hstack([ypr_rad, gyro_rad_s])
         if self._last is None:
             self._last = table[0]
@@ -295,6 +339,8 @@ class TurnWatch:
             turned = _turned(table[:, :3])
         found = np.zeros(len(said), dtype=np.int64)
         jumps = _jumps(turned, said)
+        if told is not None:
+            jumps &= ~told
         weight = min(step_s / _SPEED_S, 1.0)
         for k, (now, jumped) in enumerate(zip(speed[1:].tolist(), jumps.tolist(), strict=True)):
             if math.isfinite(now):

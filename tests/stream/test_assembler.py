@@ -386,3 +386,14 @@ def test_repeated_rate_gives_one_warning():
         "weights wrong; --rate sets that of a recording, device.configure_stream asks a device "
         "for packets with their time"
     ]
+
+
+@pytest.mark.parametrize(("apart_gauss", "told"), [(0.1, 1), (0.0, 0)])
+def test_messages_of_two_devices_in_turn_are_told(apart_gauss, told):
+    stream = Stream(RegisterEpochs(), 80.0)
+    for k in range(400):
+        field = 0.1 + 1e-4 * k + apart_gauss * (k % 2)
+        stream.take(message(VNYMR, k, mag_x_gauss=field), 0.0)
+    stream.flush()
+    said = [text for text in stream.warnings if "2 sensors in turn" in text]
+    assert len(said) == told

@@ -48,7 +48,7 @@ def test_rate_is_taken_only_from_the_register_of_that_output(layout, registers, 
 def test_rate_of_bunched_arrivals_is_right(rate_hz):
     times = np.arange(round(12 * max(rate_hz, 10.0))) / rate_hz
     arrivals = (np.ceil(times / 0.016) * 0.016).tolist()  # as its latency timer lets them go
-    assert rate_of_arrivals(AUTOPILOT, arrivals, [0] * len(arrivals)) == rate_hz
+    assert rate_of_arrivals(AUTOPILOT, arrivals, [0] * len(arrivals)) == (rate_hz, "arrival times")
 
 
 def test_rate_accounts_for_lost_messages_and_needs_enough_arrivals():
@@ -56,7 +56,10 @@ def test_rate_accounts_for_lost_messages_and_needs_enough_arrivals():
     kept = np.ones(400, bool)
     kept[10:400:7] = False
     lost = np.diff(np.flatnonzero(kept), prepend=-1) - 1
-    assert rate_of_arrivals(AUTOPILOT, times[kept].tolist(), lost.tolist()) == 50.0
+    assert rate_of_arrivals(AUTOPILOT, times[kept].tolist(), lost.tolist()) == (
+        50.0,
+        "arrival times",
+    )
     assert rate_of_arrivals(AUTOPILOT, times[:90].tolist(), [0] * 90) is None
     assert rate_of_arrivals(AUTOPILOT, (times[:300] / 20).tolist(), [0] * 300) is None
     assert rate_of_arrivals(AUTOPILOT, [5.0] * 3000, [0] * 3000) is None
