@@ -149,7 +149,7 @@ def _at(day: float) -> np.datetime64:
 _DEVICES, _DRAWN, _FINDINGS, _FAILURES = 40, 6, 60, 30  # at most on the page
 _CHANCE = 0.01
 _MISMATCHES = """
-    select device, count(*) filter (mismatch), count(mismatch) from recordings group by device"""
+    select device, count(*) filter (mismatch), count(mismatch) from results group by device"""
 
 
 def write_page(output: Path, path: Path) -> None:

@@ -101,7 +101,7 @@ def test_drift_question_reports_the_step(said, out):
 def test_other_questions_are_answered(said, out):
     assert "motor_current  vehicle  rov1" in said("ask", out, "recurring")[1]
     assert "1 refused: <b>is empty</b>\n  record again" in said("ask", out, "failures")[1]
-    code, text, _ = said("ask", out, "select vehicle, count(*) as n from recordings group by 1")
+    code, text, _ = said("ask", out, "select vehicle, count(*) as n from results group by 1")
     assert code == 0
     assert sorted(text.split()[2:]) == ["12", "13", "rov1", "rov2"]
 
@@ -154,5 +154,5 @@ def test_page_is_complete_in_a_browser(said, out, tmp_path, width_px):
 def test_unknown_question_is_refused_with_the_possible_ones(said, out):
     code, _, err = said("ask", out, "nonsense")
     assert code == 2
-    assert err.endswith("a question is drift, recurring, failures, or a SELECT over `recordings`\n")
+    assert err.endswith("a question is drift, recurring, failures, or a SELECT over `results`\n")
     assert err.count("\n") == 1

@@ -64,7 +64,7 @@ def ask(output: Path, question: str, json_path: str | None) -> None:
                 with standard deviations and change points; largest heading error first
     recurring   findings that are more frequent on a device, a vehicle, at a place or a temperature
     failures    recordings that gave no answer, and why
-    SELECT ...  one query over the table `recordings`; nothing can be written
+    SELECT ...  one query over the table `results`; nothing can be written
     """
     from ahrsd.fleet.questions import (
         AnswerTable,
