@@ -23,7 +23,7 @@ from ahrsd.recording.capture import new_capture_path
 from ahrsd.report.summary import summary_lines
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.sd_notify import Notifier
-from drivers.serial_port import BaudFound, PortError, find_device, spelled
+from drivers.serial_port import BaudFound, NoPort, PortError, find_device, spelled
 
 log = logging.getLogger("ahrsd")
 
@@ -78,14 +78,15 @@ def open_public(config: Config, shell: Shell, notifier: Notifier) -> Public:
 
 
 def _search(config: Config, port: Path, notifier: Notifier, wait: bool) -> BaudFound:
-    """The device's rate. Raises PortError where there is none and `wait` is false."""
+    """The device's rate. Raises PortError where there is none and `wait` is false, and where what
+    has the name can never be a port."""
     said = None if config.device.baud == "auto" else config.device.baud
     before = ""
     while True:
         try:
             return find_device(port, said, may_query=config.mode != "passive")
         except PortError as error:
-            if not wait:
+            if not wait or isinstance(error, NoPort):
                 raise
             if str(error) != before:
                 before = str(error)
@@ -105,7 +106,8 @@ def run_daemon(
     """`ahrsd run`: until a signal; returns the exit code. `load` gives the configuration on SIGHUP.
 
     A device is heard before anything else is begun, so a wrong port leaves nothing behind. Raises
-    PortError (not with `wait`: then it looks again and again), ConfigError, CaptureError.
+    PortError (with `wait` only NoPort: otherwise it looks again and again), ConfigError,
+    CaptureError.
     """
     port, notifier, reloader = config.device.port, Notifier(), Reloader(load, config)
     if port is None:
