@@ -121,6 +121,10 @@ class FleetRows(AbstractContextManager["FleetRows"]):
                 self._connection = _opened(self._store)
         return ask(self._connection)
 
+    def empty(self) -> bool:
+        """Whether no recording has a row."""
+        return self._ask("select 1 from results limit 1").rows == []
+
     def counts(self) -> dict[str, Any]:
         """How many rows of what."""
         names = ("recordings", "devices", "vehicles", "mismatches", "seconds", "newest_utc")
@@ -297,8 +301,8 @@ def drift_lines(found: Sequence[DeviceDrift], of_no_device: int = 0) -> list[str
         lines.append(f"... and {len(found) - _MOST} more devices: --json has all")
     if of_no_device:
         lines.append(
-            f"left out: {counted(of_no_device, 'calibration', ',')} of no known device: in "
-            "another OUT, --vehicle or --folders say whose they are"
+            f"left out: {counted(of_no_device, 'calibration', ',')} of no known device: the "
+            "same `ahrsd fleet run` with --vehicle or --folders says whose they are"
         )
     return lines
 

@@ -53,6 +53,41 @@ def test_archive_without_any_result_exits_with_code_one(said, tmp_path):
     assert "0 recordings: nothing to do\n  1 recording had a row already" in text
 
 
+def test_names_that_are_given_later_change_the_rows_and_examine_nothing_again(said, tmp_path):
+    archive, out = tmp_path / "archive", tmp_path / "out"
+    for name in ("vn7/bay", "vn8/fjord"):
+        (archive / name).mkdir(parents=True)
+        (archive / name / f"{name[:3]}.csv").write_text(f"a\n{name[2]}\n")
+
+    def labels(*options):
+        code, text, err = said("run", archive, "-o", out, "--jobs", 1, *options)
+        assert code == (0 if "had a row already" in text else 1), err
+        query = "select vehicle, place, serial_number from results order by recording"
+        found = json.loads(said("ask", out, query, "--json", "-")[1])
+        changed = [int(line.split()[0]) for line in text.splitlines() if "as said now" in line]
+        return [tuple(row.values()) for row in found], changed
+
+    assert labels() == ([("vn7", None, None), ("vn8", None, None)], [])
+    assert labels("--vehicle", "rov1") == ([("rov1", None, None)] * 2, [2])
+    assert labels() == ([("rov1", None, None)] * 2, [])
+    places = [("rov1", "bay", 7), ("rov1", "fjord", 8)]
+    assert labels("--folders", "serial,place") == (places, [2])
+    assert labels("--place", "bay") == ([("rov1", "bay", 7), ("rov1", "bay", 8)], [1])
+    assert labels("--place", "bay") == ([("rov1", "bay", 7), ("rov1", "bay", 8)], [])
+
+
+def test_no_question_about_no_rows_is_answered_as_if_all_were_well(said, tmp_path):
+    (tmp_path / "archive").mkdir()
+    said("run", tmp_path / "archive", "-o", tmp_path / "out", "--jobs", 1)
+    for question in ("drift", "recurring", "failures"):
+        code, text, _ = said("ask", tmp_path / "out", question)
+        assert (code, text) == (0, f"{tmp_path}/out: no recording has a row yet\n")
+    said("status", tmp_path / "out", "--report", tmp_path / "page")
+    page = (tmp_path / "page" / "report.html").read_text()
+    assert "No recording has a row yet." in page
+    assert "Every recording gave an answer." not in page
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -56,8 +56,8 @@ def test_recordings_of_unknown_devices_are_not_one_device(tmp_path):
     assert left_out == 3
     assert questions.drift_lines([], left_out) == [
         "no device has two calibrations whose time is known",
-        "left out: 3 calibrations of no known device: in another OUT, --vehicle or --folders say "
-        "whose they are",
+        "left out: 3 calibrations of no known device: the same `ahrsd fleet run` with --vehicle or "
+        "--folders says whose they are",
     ]
 
 
