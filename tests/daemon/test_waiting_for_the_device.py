@@ -27,6 +27,10 @@ def stopped_soon():
     signal.signal(signal.SIGTERM, before)
 
 
+def ended(*_: object) -> None:
+    pytest.fail("no run began")
+
+
 @pytest.mark.parametrize("name", ["file", "folder", "socket://nowhere", "tcp://10.0.0.7:4001"])
 @pytest.mark.usefixtures("stopped_soon")
 def test_what_can_never_be_a_port_is_not_waited_for(tmp_path, name):
@@ -35,11 +39,11 @@ def test_what_can_never_be_a_port_is_not_waited_for(tmp_path, name):
     port = Path(name) if "://" in name else tmp_path / name
     config = Config(device=DeviceSection(port=port), state_directory=tmp_path / "state")
     with pytest.raises(NoPort):
-        run_daemon(config, wait=True)
+        run_daemon(config, ended, wait=True)
 
 
 @pytest.mark.usefixtures("stopped_soon")
 def test_an_absent_device_is_waited_for_until_a_signal(tmp_path):
     port = DeviceSection(port=tmp_path / "ttyUSB7")
     config = Config(device=port, state_directory=tmp_path / "state")
-    assert run_daemon(config, wait=True) == EXIT_DONE
+    assert run_daemon(config, ended, wait=True) == EXIT_DONE
