@@ -71,7 +71,7 @@ def calibration_json(
     said = [*warnings, *estimate.warnings, *refusal, *not_yet, *widened]
     return (
         base
-        | _found(estimate, heading or HeadingErrors())
+        | _found(estimate, heading or HeadingErrors(), most)
         | {
             "registers": written,
             "warnings": list(dict.fromkeys(said)),
@@ -79,8 +79,8 @@ def calibration_json(
     )
 
 
-def _found(estimate: Estimate, heading: HeadingErrors) -> dict[str, object]:
-    """What the estimate says, in the contract's names."""
+def _found(estimate: Estimate, heading: HeadingErrors, most: str) -> dict[str, object]:
+    """What the estimate says, in the contract's names; most: what dominates the heading's sigma."""
     parts = np.split(estimate.sigma, [6, 9])
     return {
         "samples": estimate.samples,
@@ -110,6 +110,7 @@ def _found(estimate: Estimate, heading: HeadingErrors) -> dict[str, object]:
             "score": _number(estimate.observability.score),
             "unobservable": list(estimate.observability.unobservable),
             "prior_ratio": estimate.observability.prior_ratio.tolist(),
+            "dominated_by": most or None,
         },
     }
 

@@ -15,7 +15,8 @@ Errors::
     +-- PortAbsent               wait for the device, or the path is wrong
     +-- PortBusy                 somebody has it: `holders` says who
     +-- PortForbidden            no permission: the text names the group to join
-    +-- PortUnusable             no terminal, a rate it cannot do
+    +-- PortUnusable             it cannot be configured, a rate it cannot do
+    |   +-- NoPort               what has this name is no port: no waiting helps
     +-- PortLost                 it was open and is gone: close, open again
 
 Who else has a terminal device open is read from /proc (Linux): locks are advice, and a program that
@@ -221,6 +222,10 @@ class PortForbidden(PortError):
 
 class PortUnusable(PortError):
     """The device is there and cannot be opened or configured."""
+
+
+class NoPort(PortUnusable):
+    """The name is that of a file or folder, or of no port of a device server."""
 
 
 class PortLost(PortError):
@@ -525,7 +530,7 @@ def spelled(path: str | Path) -> str:
 def _open_url(url: str, baud: int) -> serial.Serial:
     if not _WHOLE_URL.match(url):
         scheme = url.partition(":")[0]
-        raise PortUnusable(f"{url} names no port of a device server: expected {scheme}://HOST:PORT")
+        raise NoPort(f"{url} names no port of a device server: expected {scheme}://HOST:PORT")
     try:
         port = serial.serial_for_url(url, baud, timeout=0)
     except (OSError, ValueError) as error:  # serial.SerialException is an OSError
@@ -577,7 +582,7 @@ def _why(path: str, error: Exception) -> PortError:
     if number in (errno.EBUSY, errno.EAGAIN):
         return PortBusy(path, holders(path))
     if number == errno.ENOENT and _ON_NETWORK.match(path):
-        return PortUnusable(
+        return NoPort(
             f"{path} is no port: one of a device server is socket://HOST:PORT or "
             "rfc2217://HOST:PORT"
         )
@@ -585,7 +590,15 @@ def _why(path: str, error: Exception) -> PortError:
         return PortAbsent(f"{path} does not exist: is the device plugged in, is the name right?")
     if number in (errno.EACCES, errno.EPERM):
         return PortForbidden(f"{path}: no permission; {_who_may(path)}")
-    return PortUnusable(f"{path} cannot be opened as a serial port: {error}")
+    kind = PortUnusable if _is_device(path) else NoPort
+    return kind(f"{path} cannot be opened as a serial port: {error}")
+
+
+def _is_device(path: str) -> bool:
+    try:
+        return stat.S_ISCHR(Path(path).stat().st_mode)
+    except OSError:  # gone meanwhile: it may come again
+        return True
 
 
 def _who_may(path: str) -> str:

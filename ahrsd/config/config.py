@@ -294,7 +294,7 @@ def core_settings(
         columns_max_age_s=config.terms.max_age_s,
         warm_start_s=config.estimator.warm_start_s,
         shares=tuple(
-            SharePolicy(s.name, s.owner, s.save, s.reset, s.calibration_writes)
+            SharePolicy(s.name, s.owner, s.save, s.reset, s.calibration)
             for s in config.share
             if s.pty is not None  # who reads over the network says nothing
         ),

@@ -89,9 +89,9 @@ Baud = Literal["auto", 9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800
 
 _PLACES: Final = ("pty", "tcp", "udp")  # of a share, exactly one
 _KEYS_OF: Final = {  # which of them a key of a share is for
-    **dict.fromkeys(("owner", "save", "reset", "calibration_writes", "group"), ("pty",)),
+    **dict.fromkeys(("owner", "save", "reset", "factory_reset", "calibration", "group"), ("pty",)),
     **dict.fromkeys(
-        ("send", "other_hosts", "calibration", "max_heading_sigma_deg"), ("tcp", "udp")
+        ("send", "other_hosts", "calibrated_by", "max_heading_sigma_deg"), ("tcp", "udp")
     ),
 }
 
@@ -158,7 +158,7 @@ class ShareSection(Section):
     the calibrated field and rate (docs/reference/socket.md); nmea: HDM and XDR, ten a second."""
     other_hosts: bool = False
     """Needed for an address of tcp or udp that is not of this machine alone (127.0.0.0/8, ::1)."""
-    calibration: Literal["registers", "qualified"] = "registers"
+    calibrated_by: Literal["registers", "qualified"] = "registers"
     """What corrected and nmea are calibrated by; registers: only what is in the device; qualified:
     a candidate that passed every gate is applied here, before and without a write or an approval,
     so the heading changes while the vehicle is under way."""
@@ -167,15 +167,17 @@ class ShareSection(Section):
     nmea. [deg]"""
     owner: bool = False
     """The program on the pty may set outputs and other settings of the device, in RAM; at most one
-    may. The others read and listen. Nobody may write calibration registers (but see
-    calibration_writes)."""
+    may. The others read and listen. Nobody may write calibration registers (but see the key
+    calibration)."""
     save: Literal["refuse", "clean"] = "clean"
     """What is done with the owner's VNWNV; clean: it is sent once the device's RAM holds nothing
     unproven (a calibration on trial is undone first and written again afterwards)."""
     reset: Literal["refuse", "announce"] = "announce"
     """What is done with the owner's VNRST; announce: it is sent, and ahrsd expects the restart (a
     calibration on trial is undone first and written again afterwards)."""
-    calibration_writes: Literal["guard", "pass"] = "guard"
+    factory_reset: Literal["refuse"] = "refuse"
+    """What is done with VNRFS, from anybody: VNERR 09; it would erase all settings in the flash."""
+    calibration: Literal["guard", "pass"] = "guard"
     """What is done with the owner's writes of registers 23, 25, 26, 43, 44, 74 and 84; guard: VNERR
     09; pass: journaled and sent, in mode stage and commit, while no calibration of ahrsd's is under
     way."""
@@ -192,8 +194,8 @@ class ShareSection(Section):
             set_ = getattr(self, key) != type(self).model_fields[key].get_default()
             if set_ and given[0] not in kind:
                 raise ValueError(f"{key} is for {' and '.join(kind)}; this share is {given[0]}")
-        if self.calibration_writes == "pass" and not self.owner:
-            raise ValueError('calibration_writes = "pass" is for the share with owner = true')
+        if self.calibration == "pass" and not self.owner:
+            raise ValueError('calibration = "pass" is for the share with owner = true')
         if self.pty is None:
             self.address.check(self.kind, other_hosts=self.other_hosts)
         return self

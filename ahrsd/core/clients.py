@@ -218,10 +218,10 @@ def _describe_passing_share(name: str, writeback: WriteBack) -> str:
     mode = writeback.policy.mode
     if mode < Mode.STAGE:
         return (
-            f'{name}: calibration_writes = "pass" lets nothing pass in mode {mode.name.lower()}: '
+            f'{name}: calibration = "pass" lets nothing pass in mode {mode.name.lower()}: '
             "what calibrates is refused"
         )
-    return f'{name} may write what calibrates (calibration_writes = "pass")'
+    return f'{name} may write what calibrates (calibration = "pass")'
 
 
 def _is_no_reply(error: Exception | None) -> bool:

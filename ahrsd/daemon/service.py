@@ -13,6 +13,7 @@ from pathlib import Path
 from types import FrameType
 
 from ahrsd.config.config import Config, Reloader, terms_text, with_date
+from ahrsd.core.core import Core
 from ahrsd.daemon.core_runner import SWITCH_S, Shell, close_shell, open_shell
 from ahrsd.daemon.daemon import Daemon, Recall
 from ahrsd.daemon.heap import needed_bytes, take_heap
@@ -20,10 +21,9 @@ from ahrsd.daemon.host_clock import HostClock
 from ahrsd.daemon.vehicle_files import VehicleFiles
 from ahrsd.errors import EXIT_DONE, ConfigError
 from ahrsd.recording.capture import new_capture_path
-from ahrsd.report.summary import summary_lines
 from ahrsd.telemetry.public import Public
 from ahrsd.telemetry.sd_notify import Notifier
-from drivers.serial_port import BaudFound, PortError, find_device, spelled
+from drivers.serial_port import BaudFound, NoPort, PortError, find_device, spelled
 
 log = logging.getLogger("ahrsd")
 
@@ -78,14 +78,15 @@ def open_public(config: Config, shell: Shell, notifier: Notifier) -> Public:
 
 
 def _search(config: Config, port: Path, notifier: Notifier, wait: bool) -> BaudFound:
-    """The device's rate. Raises PortError where there is none and `wait` is false."""
+    """The device's rate. Raises PortError where there is none and `wait` is false, and where what
+    has the name can never be a port."""
     said = None if config.device.baud == "auto" else config.device.baud
     before = ""
     while True:
         try:
             return find_device(port, said, may_query=config.mode != "passive")
         except PortError as error:
-            if not wait:
+            if not wait or isinstance(error, NoPort):
                 raise
             if str(error) != before:
                 before = str(error)
@@ -97,15 +98,18 @@ def _search(config: Config, port: Path, notifier: Notifier, wait: bool) -> BaudF
 
 def run_daemon(
     config: Config,
-    say: Callable[[str], None] = print,
+    close: Callable[[Core, str], None],
     *,
     wait: bool = False,
     load: Callable[[], Config] | None = None,
 ) -> int:
     """`ahrsd run`: until a signal; returns the exit code. `load` gives the configuration on SIGHUP.
 
+    `close` is told how the run ended: the core, and the name of the capture or the port.
+
     A device is heard before anything else is begun, so a wrong port leaves nothing behind. Raises
-    PortError (not with `wait`: then it looks again and again), ConfigError, CaptureError.
+    PortError (with `wait` only NoPort: otherwise it looks again and again), ConfigError,
+    CaptureError.
     """
     port, notifier, reloader = config.device.port, Notifier(), Reloader(load, config)
     if port is None:
@@ -146,6 +150,5 @@ def run_daemon(
         vehicle.close(_LEAST_S)
         public.close()
         close_shell(shell, (daemon.stopped_s or time.monotonic()) + _EXIT_S)
-    for line in summary_lines(shell.core, str(capture or port)):
-        say(line)
+    close(shell.core, str(capture or port))
     return EXIT_DONE

@@ -338,7 +338,7 @@ CALIBRATIONS = f"""
     select device, vehicle, key, epoch_ms(recorded_utc) as at_ms,
            coalesce(recorded_by = 'the file''s date', false) as by_file_date,
            temperature_c, field_gauss, heading_sigma_deg, {", ".join([*_VALUES, *_SIGMAS])}
-    from recordings where converged and recorded_utc is not null and device is not null"""
+    from results where converged and recorded_utc is not null and device is not null"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -84,7 +84,7 @@ class FailureLine:
 
 @dataclass(frozen=True, slots=True)
 class FleetPage:
-    """What the page shows; more: devices and failures that are not on it."""
+    """What the page shows; more: devices and failures that are not on it; empty: no rows."""
 
     title: str
     verdict: str
@@ -94,6 +94,7 @@ class FleetPage:
     failures: Sequence[FailureLine]
     more: str
     command: str
+    empty: bool
 
 
 def write_fleet_report(path: Path, page: FleetPage) -> None:
@@ -149,7 +150,7 @@ def _at(day: float) -> np.datetime64:
 _DEVICES, _DRAWN, _FINDINGS, _FAILURES = 40, 6, 60, 30  # at most on the page
 _CHANCE = 0.01
 _MISMATCHES = """
-    select device, count(*) filter (mismatch), count(mismatch) from recordings group by device"""
+    select device, count(*) filter (mismatch), count(mismatch) from results group by device"""
 
 
 def write_page(output: Path, path: Path) -> None:
@@ -172,7 +173,7 @@ def _page(output: Path, rows: FleetRows) -> FleetPage:
         title=f"Fleet {printable(output.resolve().name)}",
         verdict=(
             f"{counted(counts['recordings'], 'recording', ',')} of "
-            f"{counted(counts['devices'], 'device', ',')}: {outcomes}. "
+            f"{counted(counts['devices'], 'device', ',')}: {outcomes or 'no row yet'}. "
             f"{counts['mismatches']:,} differ from what their calibration predicts."
         ),
         devices=[_line(one, mismatches.get(one.device, "–")) for one in drifts[:_DEVICES]],
@@ -188,6 +189,7 @@ def _page(output: Path, rows: FleetRows) -> FleetPage:
         if more > 0
         else "",
         command=f"ahrsd fleet status {printable(output, 500)} --report DIR",
+        empty=not counts["recordings"],
     )
 
 

@@ -1,6 +1,6 @@
 """What the rows say: DuckDB over Parquet, read-only.
 
-The table is `recordings`: a row's columns, and `device`: the serial number, else the vehicle, else
+The table is `results`: a row's columns, and `device`: the serial number, else the vehicle, else
 nothing: of recordings of which neither is known nobody can say that they are of one device.
 Where recordings were examined by several versions or options, it has the newest row of each.
 
@@ -44,7 +44,7 @@ _DIAGNOSED = """
            (10 * floor(temperature_c / 10))::int || ' to ' ||
            (10 * floor(temperature_c / 10) + 10)::int || ' degC' as temperature,
            list_distinct(list_transform(findings, lambda one: one.effect)) as effects
-    from recordings where findings is not null"""
+    from results where findings is not null"""
 _RECURRING = """
     with found as (select {what} as name, unnest(effects) as effect from diagnosed),
     sizes as (select {what} as name, count(*) as size from diagnosed group by name),
@@ -56,7 +56,7 @@ _RECURRING = """
 _FAILURES = f"""
     select outcome, error, count(*) as recordings, any_value(remedy) as remedy,
            min(recording) as example
-    from recordings where outcome not in {ANSWERED} or error is not null
+    from results where outcome not in {ANSWERED} or error is not null
     group by outcome, error order by recordings desc, outcome, error"""
 
 
@@ -91,14 +91,14 @@ class FleetRows(AbstractContextManager["FleetRows"]):
         try:
             parsed = duckdb.extract_statements(query)
             if len(parsed) != 1 or parsed[0].type != duckdb.StatementType.SELECT:
-                raise AhrsdError("ask: one SELECT over the table `recordings` can be asked")
+                raise AhrsdError("ask: one SELECT over the table `results` can be asked")
             return self._ask(query)
         except duckdb.Error as error:
             words = line(str(error).strip().partition(chr(10))[0])
             if isinstance(error, duckdb.ParserException):
-                words += "; a question is drift, recurring, failures, or a SELECT over `recordings`"
+                words += "; a question is drift, recurring, failures, or a SELECT over `results`"
             elif isinstance(error, duckdb.CatalogException):
-                words += "; the table is `recordings`"
+                words += "; the table is `results`"
             raise AhrsdError(f"ask: {words}") from error
 
     def _ask(self, query: str) -> AnswerTable:
@@ -121,16 +121,20 @@ class FleetRows(AbstractContextManager["FleetRows"]):
                 self._connection = _opened(self._store)
         return ask(self._connection)
 
+    def empty(self) -> bool:
+        """Whether no recording has a row."""
+        return self._ask("select 1 from results limit 1").rows == []
+
     def counts(self) -> dict[str, Any]:
         """How many rows of what."""
         names = ("recordings", "devices", "vehicles", "mismatches", "seconds", "newest_utc")
         (numbers,) = self._ask(
             """select count(*), count(distinct device),
                       count(distinct vehicle), count(*) filter (mismatch), sum(seconds),
-                      max(finished_utc) from recordings"""
+                      max(finished_utc) from results"""
         ).rows
-        outcomes = "select outcome, count(*) as n from recordings group by outcome order by n desc"
-        versions = "select distinct version from recordings order by version"
+        outcomes = "select outcome, count(*) as n from results group by outcome order by n desc"
+        versions = "select distinct version from results order by version"
         return {
             **dict(zip(names, map(_plain, numbers), strict=True)),
             "outcomes": dict(self._ask(outcomes).rows),
@@ -164,7 +168,7 @@ class FleetRows(AbstractContextManager["FleetRows"]):
 
     def of_no_device(self) -> int:
         """Calibrations of which neither serial number nor vehicle is known: no part of `drift`."""
-        query = "select count(*) from recordings where converged and device is null"
+        query = "select count(*) from results where converged and device is null"
         ((count,),) = self._ask(query).rows
         return int(count)
 
@@ -204,7 +208,7 @@ def _connected(store: Store) -> duckdb.DuckDBPyConnection:
         other = "where key not in (select key from spool)"
         every = f"{every} union all {in_parts} {other}" if len(spooled) else in_parts
     connection.execute(f"create view every_row as {every}")
-    connection.execute(f"create view recordings as {_newest(connection)}")
+    connection.execute(f"create view results as {_newest(connection)}")
     connection.execute(f"set allowed_directories = [{_quoted(store.root / 'parts')}]")
     connection.execute("set enable_external_access = false")
     connection.execute("set lock_configuration = true")
@@ -297,8 +301,8 @@ def drift_lines(found: Sequence[DeviceDrift], of_no_device: int = 0) -> list[str
         lines.append(f"... and {len(found) - _MOST} more devices: --json has all")
     if of_no_device:
         lines.append(
-            f"left out: {counted(of_no_device, 'calibration', ',')} of no known device: in "
-            "another OUT, --vehicle or --folders say whose they are"
+            f"left out: {counted(of_no_device, 'calibration', ',')} of no known device: the "
+            "same `ahrsd fleet run` with --vehicle or --folders says whose they are"
         )
     return lines
 

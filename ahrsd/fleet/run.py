@@ -57,6 +57,7 @@ class Orders:
 
     levels: what the folders of the archive name, from the top; vehicle, place: of all recordings
     again: rows that are failures are made anew
+    relabel: vehicle, place, serial: which of them rows that are there take too
     """
 
     out: str
@@ -68,6 +69,7 @@ class Orders:
     limit_s: float = 600.0
     memory_bytes: int = 2 << 30
     again: bool = False
+    relabel: tuple[str, ...] = ()
 
     @property
     def options(self) -> str:
@@ -183,20 +185,26 @@ def keep_loss(entry: ArchiveEntry, loss: Loss, orders: Orders) -> Answer:
 
 
 def _labels(entry: ArchiveEntry, orders: Orders) -> Row:
-    """Whose recording it is: by its folders, or by what was said of all."""
-    named = dict(zip(orders.levels, entry.folders))
-    serial = named.get("serial", "")
-    digits = max(_DIGITS.findall(serial), key=len, default="")  # of vn100-100130608 the number
     return {
         "stamp": stamp(entry, orders),
         "recording": printable(entry.url, 1000),
         "size_bytes": entry.size_bytes,
         "version": __version__,
         "options": orders.options,
+        "tries": 1,
+        **_whose(entry, orders),
+    }
+
+
+def _whose(entry: ArchiveEntry, orders: Orders) -> Row:
+    """Whose recording it is: by its folders, or by what was said of all."""
+    named = dict(zip(orders.levels, entry.folders))
+    serial = named.get("serial", "")
+    digits = max(_DIGITS.findall(serial), key=len, default="")  # of vn100-100130608 the number
+    return {
         "vehicle": orders.vehicle or _text(named.get("vehicle")),
         "place": orders.place or _text(named.get("place")),
         "serial_number": int(digits) if 0 < len(digits) < 19 else None,
-        "tries": 1,
     }
 
 
@@ -254,11 +262,13 @@ class Progress:
     """How far a run is.
 
     left_out: files that by their name are no recordings, by suffix; linked: how many folders are
-    only linked to, and the first of them; before: recordings with a row
+    only linked to, and the first of them; before: recordings with a row; relabelled: rows that
+    have another vehicle, place or serial number now
     """
 
     total: int = 0
     before: int = 0
+    relabelled: int = 0
     left_out: collections.Counter[str] = field(default_factory=collections.Counter)
     linked: int = 0
     first_linked: str = ""
@@ -309,6 +319,8 @@ def run(
         tell(progress)
         missing = (one for one in archive.entries() if not known.holds(stamp(one, orders)))
         try:
+            if orders.relabel:
+                progress.relabelled = store.relabel(_whose_are(archive, orders, known))
             if progress.total:
                 _through(missing, orders, task, place, store, progress, tell)
             store.compact()
@@ -342,6 +354,16 @@ def _through(
                 told_s = time.monotonic()
             if progress.done % _COMPACTED == 0:
                 store.compact()
+
+
+def _whose_are(archive: Archive, orders: Orders, known: Known) -> dict[str, Row]:
+    """By stamp, of all recordings that have a row: what they are to take."""
+    columns = ["serial_number" if name == "serial" else name for name in orders.relabel]
+    stamped = ((stamp(entry, orders), entry) for entry in archive.entries())
+    return {
+        name: {column: whose[column] for column in columns}
+        for name, whose in ((n, _whose(entry, orders)) for n, entry in stamped if known.holds(n))
+    }
 
 
 def _planned(archive: Archive, orders: Orders, known: Known) -> Progress:

@@ -19,7 +19,7 @@ import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -182,6 +182,22 @@ class Store:
         listed = self.parts()
         self._publish([*listed, *(self._part(table, name) for name in _folders(table))])
 
+    def relabel(self, labels: Mapping[str, Row]) -> int:
+        """Give rows, by stamp, another vehicle, place or serial number; how many have one now.
+
+        What is empty changes nothing, and no serial number that a row has is replaced: the
+        recording may have said it. The spool must be empty; only for who holds `alone`.
+        """
+        parts, changed = [], 0
+        for part in self.parts():
+            table, of_part = _relabelled(_read(part), labels)
+            parts += [self._part(table, n) for n in _folders(table)] if of_part else [part]
+            changed += of_part
+        if changed:
+            self._publish(parts)
+            self._remove_others(parts)
+        return changed
+
     def _part(self, table: pyarrow.Table, name: str) -> Path:
         serial = None if name == _folder(None) else int(name.partition("=")[2])
         column = table["serial_number"]
@@ -297,6 +313,21 @@ def _read(part: Path, columns: list[str] | None = None) -> pyarrow.Table:
 
 def _rows(part: Path) -> int:
     return int(pyarrow.parquet.read_metadata(part).num_rows)
+
+
+def _relabelled(table: pyarrow.Table, labels: Mapping[str, Row]) -> tuple[pyarrow.Table, int]:
+    """The table with the labels, and how many of its rows they change."""
+    names = ("vehicle", "place", "serial_number")
+    before = list(zip(*(table[name].to_pylist() for name in names), strict=True))
+    after = []
+    for stamp, (vehicle, place, serial) in zip(table["stamp"].to_pylist(), before, strict=True):
+        said = labels.get(stamp, {})
+        number = said.get("serial_number") if serial is None else serial
+        after.append((said.get("vehicle") or vehicle, said.get("place") or place, number))
+    for name, values in zip(names, zip(*after, strict=True), strict=False):
+        column = pyarrow.array(values, SCHEMA.field(name).type)
+        table = table.set_column(table.schema.get_field_index(name), name, column)
+    return table, sum(one != other for one, other in zip(before, after, strict=True))
 
 
 def _holds_any(part: Path, keys: pyarrow.ChunkedArray) -> bool:

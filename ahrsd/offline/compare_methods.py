@@ -41,6 +41,8 @@ def published_json(
     )
     body["warnings"] = warnings
     body["converged"] = found.converged
+    if blocks := _blocks(result):
+        body["duration_s"] = float(blocks[-1].time_s[-1] - blocks[0].time_s[0])
     if found.soft_iron is not None:
         body["soft_iron"] = found.soft_iron.tolist()
         body["correction_matrix"] = np.linalg.inv(found.soft_iron).tolist()

@@ -12,7 +12,7 @@ is an argument.
 | VNASY | by the port: only this client's stream stops and resumes |
 | register 5 (baud rate) | success; the line to the device is not changed |
 | registers 23, 25, 26, 43, 44, 74, 84 and the words that change them | VNERR 09: ahrsd owns them |
-| the same registers, for an owner with `calibration_writes = "pass"` | the device's |
+| the same registers, for an owner with `calibration = "pass"` | the device's |
 | VNWNV, VNRST | as the share's policy says |
 | VNRFS and the words of vendor tools | VNERR 09 |
 | any other read | the device's |
@@ -102,19 +102,18 @@ class SharePolicy:
     owner: it may set the device's output registers; at most one share is the owner
     save:  VNWNV is refused, or sent once the device's RAM holds no unproven values
     reset: VNRST is refused, or sent and reported
-    calibration_writes: the owner's writes of calibration registers are refused, or journaled and
-           sent
+    calibration: the owner's writes of calibration registers are refused, or journaled and sent
     """
 
     name: str
     owner: bool = False
     save: Literal["refuse", "clean"] = "clean"
     reset: Literal["refuse", "announce"] = "announce"
-    calibration_writes: Literal["guard", "pass"] = "guard"
+    calibration: Literal["guard", "pass"] = "guard"
 
     def passes(self, number: int) -> bool:
         """Whether this share may write this calibration register."""
-        return self.owner and self.calibration_writes == "pass" and number in PASSABLE
+        return self.owner and self.calibration == "pass" and number in PASSABLE
 
 
 @dataclass(frozen=True, slots=True)

@@ -276,7 +276,7 @@ class Terms(Protocol):
         """`corrected` or `nmea`."""
 
     @property
-    def calibration(self) -> str:
+    def calibrated_by(self) -> str:
         """`qualified`, where a candidate may be applied before it is written, or `registers`."""
 
     @property
@@ -308,7 +308,7 @@ class Feed:
         self.pace_s = _PACE_S[terms.send]
         self._nmea = terms.send == "nmea"
         self._max_sigma_deg = terms.max_heading_sigma_deg
-        self._chooser, self._tilt = Chooser(terms.calibration == QUALIFIED), Tilt()
+        self._chooser, self._tilt = Chooser(terms.calibrated_by == QUALIFIED), Tilt()
         self._bias: Array | None = None
         self._seq = 0
         self._wall_offset_s = 0.0

@@ -19,8 +19,8 @@ when the device restarts. Then it is identified and read as after any restart, a
 set aside only if it is the same device with the same registers. Any other loss of the device ends
 it: a restart that no program requested, a lost link, a doubt about the device.
 
-**Client's write.** A client's write of calibration registers, if its share has `calibration_writes
-= "pass"`.
+**Client's write.** A client's write of calibration registers, if its share has
+`calibration = "pass"`.
 
 It is a change by another program and is treated as one. It is journaled before it is sent, with the
 values before and after. While it is under way, the registers in force are unknown. After it,

@@ -8,7 +8,7 @@
 | ROLL_BACK | a transaction restores them | stage |
 | SAVE | session settings restored (with `configure_stream`), then VNWNV | commit |
 | CLIENT | command of a program on a shared port (`sharing.arbiter`) | passive |
-| CLIENT_CALIBRATION | the same, of the owner with `calibration_writes = "pass"` | stage |
+| CLIENT_CALIBRATION | the same, of the owner with `calibration = "pass"` | stage |
 
 A client's settings, in RAM for its session, are restored for a save like the daemon's own.
 

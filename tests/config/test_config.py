@@ -259,12 +259,12 @@ def test_the_command_line_names_the_state_directory_as_the_other_commands_do(tmp
         ('udp = "127.0.0.1:2101"\ngroup = "x"', "group is for pty; this share is udp"),
         ('pty = "/x"\nsend = "nmea"', "send is for tcp and udp; this share is pty"),
         (
-            'pty = "/x"\ncalibration_writes = "pass"',
-            'calibration_writes = "pass" is for the share with owner = true',
+            'pty = "/x"\ncalibration = "pass"',
+            'calibration = "pass" is for the share with owner = true',
         ),
         (
-            'udp = "127.0.0.1:2101"\ncalibration_writes = "pass"',
-            "calibration_writes is for pty; this share is udp",
+            'udp = "127.0.0.1:2101"\ncalibration = "pass"',
+            "calibration is for pty; this share is udp",
         ),
         ('pty = "/x"\nownr = true', "share.0.ownr = True: unknown key; did you mean owner?"),
     ],
@@ -279,12 +279,29 @@ def test_impossible_share_is_refused_in_one_line(tmp_path, share, words):
 def test_shares_of_every_kind_come_back_from_their_text(tmp_path):
     config = load(
         tmp_path,
-        '[[share]]\npty = "/x"\nowner = true\ncalibration_writes = "pass"\n'
-        '[[share]]\ntcp = "[::1]:2101"\nsend = "corrected"\ncalibration = "registers"\n'
+        '[[share]]\npty = "/x"\nowner = true\ncalibration = "pass"\n'
+        '[[share]]\ntcp = "[::1]:2101"\nsend = "corrected"\ncalibrated_by = "registers"\n'
         '[[share]]\nudp = "192.168.1.255:10110"\nsend = "nmea"\nother_hosts = true\n',
     )
     names = [share.name for share in config.share]
     assert names == ["/x", "tcp [::1]:2101", "udp 192.168.1.255:10110"]
     assert load(tmp_path, print_config(config)) == config
     (policy,) = core_settings(config).shares
-    assert (policy.name, policy.owner, policy.calibration_writes) == ("/x", True, "pass")
+    assert (policy.name, policy.owner, policy.calibration) == ("/x", True, "pass")
+
+
+def test_every_key_of_a_share_that_others_rely_on_is_accepted(tmp_path):
+    config = load(
+        tmp_path,
+        '[[share]]\npty = "/x"\nowner = true\ncalibration = "guard"\nsave = "clean"\n'
+        'reset = "announce"\nfactory_reset = "refuse"\n'
+        '[[share]]\ntcp = "127.0.0.1:2101"\nsend = "raw"\n',
+    )
+    assert (config.share[0].calibration, config.share[0].factory_reset) == ("guard", "refuse")
+    assert config.share[1].send == "raw"
+
+
+@pytest.mark.parametrize("line", ['factory_reset = "pass"', 'save = "pass"'])
+def test_a_share_lets_no_factory_reset_and_no_unproven_save_pass(tmp_path, line):
+    with pytest.raises(ConfigError, match=line.partition(" ")[0]):
+        load(tmp_path, f'[[share]]\npty = "/x"\nowner = true\n{line}\n')

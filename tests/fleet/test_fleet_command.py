@@ -9,6 +9,8 @@ from browser import BROWSER, look_at
 from fleet_rows import row, store_of
 
 from ahrsd.__main__ import main
+from ahrsd.fleet.archive import Archive
+from ahrsd.fleet.run import Orders, stamp
 
 pytest.importorskip("duckdb", reason="duckdb (the extra fleet) is not installed")
 
@@ -51,6 +53,47 @@ def test_archive_without_any_result_exits_with_code_one(said, tmp_path):
     code, text, _ = said("run", tmp_path / "archive", "-o", tmp_path / "out", "--jobs", 1)
     assert code == 0
     assert "0 recordings: nothing to do\n  1 recording had a row already" in text
+
+
+def test_names_that_are_given_later_change_the_rows_and_examine_nothing_again(said, tmp_path):
+    archive, out = tmp_path / "archive", tmp_path / "out"
+    for name in ("vn7/bay", "vn8/fjord"):
+        (archive / name).mkdir(parents=True)
+        (archive / name / f"{name[:3]}.csv").write_text("a\n1\n")
+    rows = [
+        row(i, recording=one.url, stamp=stamp(one, Orders(str(out))), vehicle=one.folders[0],
+            serial_number=None)
+        for i, one in enumerate(Archive(str(archive)).entries())
+    ]  # fmt: skip
+    store_of(out, rows)
+
+    def labels(*options):
+        code, text, _ = said("run", archive, "-o", out, "--jobs", 1, *options)
+        assert code == 0
+        assert "0 recordings: nothing to do\n  2 recordings had a row already" in text
+        query = "select vehicle, place, serial_number from results order by recording"
+        found = json.loads(said("ask", out, query, "--json", "-")[1])
+        changed = [int(line.split()[0]) for line in text.splitlines() if "as said now" in line]
+        return [tuple(row.values()) for row in found], changed
+
+    assert labels() == ([("vn7", None, None), ("vn8", None, None)], [])
+    assert labels("--vehicle", "rov1") == ([("rov1", None, None)] * 2, [2])
+    assert labels() == ([("rov1", None, None)] * 2, [])
+    places = [("rov1", "bay", 7), ("rov1", "fjord", 8)]
+    assert labels("--folders", "serial,place") == (places, [2])
+    assert labels("--place", "bay") == ([("rov1", "bay", 7), ("rov1", "bay", 8)], [1])
+    assert labels("--place", "bay") == ([("rov1", "bay", 7), ("rov1", "bay", 8)], [])
+
+
+def test_no_question_about_no_rows_is_answered_as_if_all_were_well(said, tmp_path):
+    store_of(tmp_path / "out", [])
+    for question in ("drift", "recurring", "failures"):
+        code, text, _ = said("ask", tmp_path / "out", question)
+        assert (code, text) == (0, f"{tmp_path}/out: no recording has a row yet\n")
+    said("status", tmp_path / "out", "--report", tmp_path / "page")
+    page = (tmp_path / "page" / "report.html").read_text()
+    assert "No recording has a row yet." in page
+    assert "Every recording gave an answer." not in page
 
 
 @pytest.mark.parametrize(
@@ -101,7 +144,7 @@ def test_drift_question_reports_the_step(said, out):
 def test_other_questions_are_answered(said, out):
     assert "motor_current  vehicle  rov1" in said("ask", out, "recurring")[1]
     assert "1 refused: <b>is empty</b>\n  record again" in said("ask", out, "failures")[1]
-    code, text, _ = said("ask", out, "select vehicle, count(*) as n from recordings group by 1")
+    code, text, _ = said("ask", out, "select vehicle, count(*) as n from results group by 1")
     assert code == 0
     assert sorted(text.split()[2:]) == ["12", "13", "rov1", "rov2"]
 
@@ -154,5 +197,5 @@ def test_page_is_complete_in_a_browser(said, out, tmp_path, width_px):
 def test_unknown_question_is_refused_with_the_possible_ones(said, out):
     code, _, err = said("ask", out, "nonsense")
     assert code == 2
-    assert err.endswith("a question is drift, recurring, failures, or a SELECT over `recordings`\n")
+    assert err.endswith("a question is drift, recurring, failures, or a SELECT over `results`\n")
     assert err.count("\n") == 1

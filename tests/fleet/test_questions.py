@@ -56,8 +56,8 @@ def test_recordings_of_unknown_devices_are_not_one_device(tmp_path):
     assert left_out == 3
     assert questions.drift_lines([], left_out) == [
         "no device has two calibrations whose time is known",
-        "left out: 3 calibrations of no known device: in another OUT, --vehicle or --folders say "
-        "whose they are",
+        "left out: 3 calibrations of no known device: the same `ahrsd fleet run` with --vehicle or "
+        "--folders says whose they are",
     ]
 
 
@@ -115,7 +115,7 @@ def test_failures_by_reason_the_most_frequent_first(tmp_path):
 def test_sql_reads_the_rows(tmp_path):
     store = store_of(tmp_path / "out", [row(1), row(2, vehicle="rov2")], compacted=False)
     with FleetRows(store) as asked:
-        found = asked.sql("select vehicle, count(*) as n from recordings group by 1 order by 1")
+        found = asked.sql("select vehicle, count(*) as n from results group by 1 order by 1")
     assert found.columns == ("vehicle", "n")
     assert found.rows == [("rov1", 1), ("rov2", 1)]
     assert found.json() == [{"vehicle": "rov1", "n": 1}, {"vehicle": "rov2", "n": 1}]
@@ -126,12 +126,12 @@ def test_sql_reads_the_rows(tmp_path):
     [
         "copy recordings to '{out}/x.csv'",
         "create table x as select 1",
-        "select 1; drop view recordings",
+        "select 1; drop view results",
         "set enable_external_access = true",
         "attach '{out}/x.db'",
         "select * from read_text('{out}/secret.txt')",
         "select * from glob('{out}/*')",
-        "select nonsense from recordings",
+        "select nonsense from results",
         "selec",
         "",
     ],
@@ -150,7 +150,7 @@ def test_newest_row_of_each_recording_counts(tmp_path):
     new = row(9, version="0.2.0", content_sha256=f"{1:064x}", recording="dive_1.mcap",
               finished_utc="2026-02-01T00:00:00+00:00")  # fmt: skip
     with FleetRows(store_of(tmp_path / "out", [*old, new])) as asked:
-        found = asked.sql("select recording, version from recordings order by 1").rows
+        found = asked.sql("select recording, version from results order by 1").rows
         counts = asked.counts()
     assert found == [("dive_1.mcap", "0.2.0"), ("dive_2.mcap", "0.1.0")]
     assert counts["recordings"] == 2
@@ -162,7 +162,7 @@ def test_replaced_parts_are_looked_up_again(tmp_path):
     with FleetRows(store) as asked:
         store.put(row(2))
         store.compact()  # the opened part is gone
-        assert asked.sql("select count(*) from recordings").rows == [(2,)]
+        assert asked.sql("select count(*) from results").rows == [(2,)]
 
 
 def test_foreign_texts_do_not_reach_the_terminal(tmp_path):
@@ -174,7 +174,7 @@ def test_foreign_texts_do_not_reach_the_terminal(tmp_path):
         lines = [
             *questions.drift_lines(asked.drift()),
             *questions.failure_lines(asked.failures()),
-            *questions.table_lines(*(lambda a: (a.columns, a.rows))(asked.sql("from recordings"))),
+            *questions.table_lines(*(lambda a: (a.columns, a.rows))(asked.sql("from results"))),
             *questions.table_lines(("\x1b",), []),
         ]
     assert lines

@@ -41,7 +41,7 @@ def ran(archive: Path | str, out: Path, place: Place = ONE, **orders: object) ->
 
 def rows(out: Path) -> dict[str, dict[str, object]]:
     with FleetRows(Store(out)) as asked:
-        found = asked.sql("select * from recordings").json()
+        found = asked.sql("select * from results").json()
     assert len({one["key"] for one in found}) == len(found)
     return {Path(one["recording"]).name: one for one in found}
 
@@ -181,7 +181,7 @@ def test_options_are_in_the_key_and_labels_come_from_folders(archive, tmp_path):
     assert ran(tmp_path / "archive", tmp_path / "out", **given).done == 0
     assert ran(tmp_path / "archive", tmp_path / "out", rate_hz=25.0, **given).done == 1
     with FleetRows(Store(tmp_path / "out")) as asked:
-        every = asked.sql("select options, converged from recordings").rows
+        every = asked.sql("select options, converged from results").rows
     assert every == [(json.dumps({"rate_hz": 25.0}), found["converged"])]
 
 

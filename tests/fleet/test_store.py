@@ -16,7 +16,7 @@ pytest.importorskip("duckdb", reason="duckdb (the extra fleet) is not installed"
 
 def recordings(store: Store) -> list[str]:
     with FleetRows(store) as rows:
-        return [name for (name,) in rows.sql("select recording from recordings order by 1").rows]
+        return [name for (name,) in rows.sql("select recording from results order by 1").rows]
 
 
 def names(*numbers: int) -> list[str]:
@@ -79,7 +79,7 @@ def test_new_row_replaces_the_old_one_in_another_part(tmp_path):
     store.put(row(1, serial_number=100))
     for _ in range(2):
         with FleetRows(store) as rows:
-            found = rows.sql("select key, outcome, serial_number from recordings order by key").rows
+            found = rows.sql("select key, outcome, serial_number from results order by key").rows
         assert found == [(f"{1:032x}", "done", 100), (f"{2:032x}", "done", 100)]
         store.compact()
     assert [p.parent.name for p in store.parts()] == ["serial=100"]

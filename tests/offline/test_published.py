@@ -44,6 +44,7 @@ def test_all_methods_are_printed_in_one_table(simulated, run, capsys):
     assert [entry["method"] for entry in body] == ["magyc", *METHODS]
     true = np.array(truth["hard_iron_gauss"])
     for entry in body:
+        assert entry["duration_s"] == pytest.approx(199.96)
         if entry["method"] in ("magyc", "ellipsoid", "magyc-bfg"):
             assert entry["converged"], entry["warnings"]
             error = np.linalg.norm(np.array(entry["hard_iron_gauss"]) - true)

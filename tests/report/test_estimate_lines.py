@@ -41,3 +41,12 @@ def test_wrong_axes_or_units_are_a_warning_in_json():
     found = estimate(heading_sigma_deg=1.7, widened_by=ADVICE)
     said = calibration_json("x", found, {}, method="magyc", samples=1, gyro_is_raw=True)
     assert said["warnings"] == [f"most of the heading's sigma: {ADVICE}"]
+
+
+def test_what_dominates_the_heading_is_named_in_json():
+    found = estimate(heading_sigma_deg=1.7, widened_by=ADVICE)
+    assert calibration_json("x", found, {})["observability"]["dominated_by"] == ADVICE
+    small = calibration_json("x", replace(found, widened_by=""), {})
+    assert small["observability"]["dominated_by"] is None
+    wrong = calibration_json("x", found, {}, wrong=("the axes are swapped",))
+    assert wrong["observability"]["dominated_by"] is None

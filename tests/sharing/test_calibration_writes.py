@@ -16,7 +16,7 @@ from ahrsd.events import SamplesSeen
 from ahrsd.sharing.arbiter import SharePolicy
 from ahrsd.writeback.states import Mode
 
-OWNER = SharePolicy("owner", owner=True, calibration_writes="pass")
+OWNER = SharePolicy("owner", owner=True, calibration="pass")
 SHARES = (OWNER, SharePolicy("log"))
 ONE = "1,0,0,0,1,0,0,0,1,0,0,0"
 THEIRS = "1.02,0,0,0,1.01,0,0,0,1,0.11,0.01,0.02"

@@ -51,18 +51,18 @@ def test_calibration_registers_are_refused_for_every_client(policy, number):
 def test_calibration_registers_pass_for_a_permitted_owner_from_mode_stage(number):
     values = next(iter(REGISTERS[number].defaults.values()))
     body = f"VNWRG,{format_reply(number, values)}"
-    passing = SharePolicy("/a", owner=True, calibration_writes="pass")
+    passing = SharePolicy("/a", owner=True, calibration="pass")
     answer = parse_client_command(body, passing)
     assert answer == ClientCommand(Kind.CALIBRATE, body, Write(number, values))
     allowed = [m for m in Mode if permitted(answer.command, m, False, answer.purpose)]
     assert allowed == [Mode.STAGE, Mode.COMMIT]
     assert answer.purpose is Purpose.CLIENT_CALIBRATION
-    nobody = SharePolicy("/b", calibration_writes="pass")
+    nobody = SharePolicy("/b", calibration="pass")
     assert refused(body, nobody).code == 0x09
 
 
 def test_permission_for_calibration_changes_nothing_else():
-    passing = SharePolicy("/a", owner=True, calibration_writes="pass")
+    passing = SharePolicy("/a", owner=True, calibration="pass")
     for number in REGISTERS:
         for values in REGISTERS[number].defaults.values():
             body = f"VNWRG,{format_reply(number, values)}"

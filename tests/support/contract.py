@@ -34,7 +34,7 @@ CALIBRATION = {
         "before_rms": (*NUMBER, NULL),
         "after_rms": (*NUMBER, NULL),
     },
-    "observability": dict,
+    "observability": {"dominated_by": (str, NULL)},
     "registers": dict,
     "warnings": [str],
 }

@@ -96,7 +96,7 @@ def proposal_distance_deg(one, other):
 
 
 def test_corrected_share_has_true_values_after_a_candidate_qualified():
-    told = Told("corrected", calibration="qualified")
+    told = Told("corrected", calibrated_by="qualified")
     told.until("QUALIFIED")
     told.outlet.lines.clear()
     told.go(20.0)
@@ -130,7 +130,7 @@ def test_share_uses_the_registers_until_an_approval_by_default():
 
 
 def test_values_are_continuous_when_the_candidate_is_written():
-    told = Told("corrected", mode=Mode.COMMIT, calibration="qualified")
+    told = Told("corrected", mode=Mode.COMMIT, calibrated_by="qualified")
     told.until("QUALIFIED")
     told.go(1.0)
     told.outlet.lines.clear()
@@ -149,7 +149,7 @@ def test_values_are_continuous_when_the_candidate_is_written():
 
 
 def test_share_has_device_values_and_no_heading_before_an_estimate():
-    told = Told("corrected", calibration="registers", max_heading_sigma_deg=1.0)
+    told = Told("corrected", calibrated_by="registers", max_heading_sigma_deg=1.0)
     told.until("QUALIFIED")
     told.go(10.0)
     for sample in told.outlet.records():
@@ -161,7 +161,7 @@ def test_share_has_device_values_and_no_heading_before_an_estimate():
 
 
 def test_records_are_numbered_without_gaps_and_each_sample_comes_once():
-    told = Told("corrected", calibration="qualified")
+    told = Told("corrected", calibrated_by="qualified")
     told.go(20.0)
     assert [json.loads(line)["seq"] for line in told.outlet.lines] == told.outlet.numbers
     assert told.outlet.numbers == list(range(1, len(told.outlet.numbers) + 1))
@@ -174,7 +174,7 @@ def test_records_are_numbered_without_gaps_and_each_sample_comes_once():
 def test_fields_are_those_of_the_documentation():
     page = (Path(__file__).parents[2] / "docs" / "reference" / "socket.md").read_text()
     part = page[page.index("## Corrected samples") : page.index("## Prometheus")]
-    told = Told("corrected", calibration="qualified")
+    told = Told("corrected", calibrated_by="qualified")
     told.go(3.0)
     for kind in ("sample", "state"):
         fields = set(told.outlet.records(kind)[-1]) - {"record", "seq"}
@@ -184,7 +184,7 @@ def test_fields_are_those_of_the_documentation():
 
 
 def test_missing_device_is_reported_within_two_seconds():
-    told = Told("corrected", calibration="qualified")
+    told = Told("corrected", calibrated_by="qualified")
     told.until("QUALIFIED")
     told.run.feed(inputs.LinkLost(told.run.now_ns, "unplugged"))
     told.outlet.lines.clear()
@@ -196,14 +196,14 @@ def test_missing_device_is_reported_within_two_seconds():
 
 
 def test_share_without_readers_computes_nothing():
-    told = Told("corrected", calibration="qualified")
+    told = Told("corrected", calibrated_by="qualified")
     told.outlet.wanted = False
     told.go(5.0)
     assert told.outlet.records() == []
 
 
 def test_nmea_share_sends_heading_at_ten_hertz_and_empty_fields_without_a_device():
-    told = Told("nmea", calibration="qualified")
+    told = Told("nmea", calibrated_by="qualified")
     told.go(3.0)
     assert set(told.outlet.lines[::2]) == {b"$HCHDM,,M*07\r\n"}
     told.until("QUALIFIED")
@@ -234,7 +234,7 @@ def test_nmea_share_sends_heading_at_ten_hertz_and_empty_fields_without_a_device
 
 
 def test_candidate_is_applied_in_passive_mode():
-    told = Told("corrected", binary=False, mode=Mode.PASSIVE, calibration="qualified")
+    told = Told("corrected", binary=False, mode=Mode.PASSIVE, calibrated_by="qualified")
     told.until("QUALIFIED")
     told.outlet.lines.clear()
     told.go(10.0)

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import click
 
+from ahrsd.cli.files import refuse_unwritable, write_json
 from ahrsd.config.config import Config, Mode, load_config, print_config
+
+if TYPE_CHECKING:
+    from ahrsd.core.core import Core
 
 # Whether it may be opened is for the driver to say: it knows the group that one must join.
 _PORT = click.Path(path_type=Path, readable=False)
@@ -27,6 +31,7 @@ _PORT = click.Path(path_type=Path, readable=False)
     "--mode", type=click.Choice(get_args(Mode)), help="What the daemon may write (see above)."
 )
 @click.option("--wait", is_flag=True, help="Wait if the device is not there (for a service).")
+@click.option("--json", "json_path", help="Closing summary as JSON into this file, - for stdout.")
 @click.option(
     "--print-config", "print_only", is_flag=True, help="Print the configuration and exit."
 )
@@ -36,6 +41,7 @@ def command(
     directory: Path | None,
     mode: Mode | None,
     wait: bool,
+    json_path: str | None,
     print_only: bool,
 ) -> None:
     """Calibrate the device on a port from its own stream, and write back as far as the mode allows.
@@ -58,9 +64,18 @@ def command(
         raise click.UsageError("no port: give --port, or device.port in the configuration")
     from ahrsd.cli.device.access import driver_errors
     from ahrsd.daemon.service import run_daemon
+    from ahrsd.report.summary import summary_json, summary_lines
 
+    def close(core: Core, recording: str) -> None:
+        if json_path is not None:
+            write_json(json_path, summary_json(core, recording))
+        if json_path != "-":
+            for line in summary_lines(core, recording):
+                click.echo(line)
+
+    refuse_unwritable(json_path, (path,))
     with driver_errors():
-        raise SystemExit(run_daemon(config, wait=wait, load=load if path else None))
+        raise SystemExit(run_daemon(config, close, wait=wait, load=load if path else None))
 
 
 def _configured(

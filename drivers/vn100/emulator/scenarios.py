@@ -5,6 +5,7 @@ device = build(Setup("rov", seed=3))
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -25,6 +26,7 @@ from drivers.vn100.registers import ASYNC_OUTPUT_RATES_HZ
 Values = tuple[float | int | str, ...]
 
 FIRMWARES = {"2": "2.1.0.0", "3": "3.1.0.0"}
+_VERSION = re.compile(r"\d{1,3}(\.\d{1,3}){3}")  # as register 4 prints it
 CALIBRATION_SET = (0x06, 0x0001, 0x083F)  # TimeStartup; ImuStatus, Uncomp* , Temp, Pres, SensSat
 
 
@@ -109,6 +111,9 @@ def build(setup: Setup, further: Further | None = None) -> Emulator:
     if scenario.calibrated:
         presets.update(calibration_registers(truth))
     firmware = FIRMWARES.get(setup.firmware, setup.firmware) or scenario.firmware
+    if not _VERSION.fullmatch(firmware):
+        known = " or ".join(FIRMWARES)
+        raise ValueError(f"no firmware {firmware!r}: {known}, or a version such as 3.0.0.0")
     device = Emulator(
         truth,
         motion,

@@ -7,6 +7,7 @@ Bytes are counted on the pty, as the device receives them.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import select
@@ -21,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from contract import REPLAY, faults
 from drivers_at_start import ROS2_DAWONN, SDK
 from patience import PATIENCE_S
 
@@ -136,13 +138,18 @@ def grown(path: Path, by: int):
     return condition
 
 
-def test_passive_sends_no_byte(program, tmp_path):
-    with program("--mode", "passive", output="imu") as (running, _):
+def test_passive_sends_no_byte_and_ends_with_a_summary(program, tmp_path):
+    target = tmp_path / "run.json"
+    with program("--mode", "passive", "--json", str(target), output="imu") as (running, _):
         running.until(lambda: list((tmp_path / "captures").glob("*.mcap")))
         running.until(grown(captured(tmp_path), 10_000))
         assert running.stop() == 0
         assert bytes(running.heard) == b""
     assert re.search(r"messages: \d{2,} valid", running.said)
+    closing = json.loads(target.read_text())
+    assert faults(closing, {**REPLAY, "calibration": {"schema": "ahrsd.calibration/1"}}) == []
+    again = replay(captured(tmp_path), Config()).core.decisions
+    assert (closing["decision_sha256"], closing["decisions"]) == (again.sha256, again.entries)
 
 
 def test_observe_sends_only_register_reads(program, tmp_path):

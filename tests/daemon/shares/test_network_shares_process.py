@@ -88,8 +88,9 @@ class Vehicle:
             f'[[share]]\npty = "{folder}/vn100"\n'
             f'[[share]]\ntcp = "127.0.0.1:{self.raw}"\n'
             f'[[share]]\ntcp = "127.0.0.1:{self.corrected}"\nsend = "corrected"\n'
-            'calibration = "qualified"\n'
-            f'[[share]]\nudp = "127.0.0.1:{self.nmea}"\nsend = "nmea"\ncalibration = "qualified"\n'
+            'calibrated_by = "qualified"\n'
+            f'[[share]]\nudp = "127.0.0.1:{self.nmea}"\nsend = "nmea"\n'
+            'calibrated_by = "qualified"\n'
         )
         self.process: subprocess.Popen[bytes] | None = None
 

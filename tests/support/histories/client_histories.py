@@ -48,7 +48,7 @@ class ClientHistory:
     def __init__(self, seed: int, *, passes: bool = False) -> None:
         self._rng = np.random.default_rng(seed)
         cable = two_units(binary=bool(seed % 2))
-        shares = (replace(SHARES[0], calibration_writes="pass"), SHARES[1]) if passes else SHARES
+        shares = (replace(SHARES[0], calibration="pass"), SHARES[1]) if passes else SHARES
         self.run = CabledRun(cable, shares=shares, min_interval_s=0.0, cooldown_s=0.0)
         self._passes, self._watched = passes, 0
         self._ram = dict.fromkeys(NEW, ONE)

@@ -123,7 +123,7 @@ class World:
         self.notes: list[tuple[float, str]] = []
         self.finished = False
         self.kills = 0
-        shares = (SharePolicy(CLIENT, owner=True, calibration_writes="pass"),)
+        shares = (SharePolicy(CLIENT, owner=True, calibration="pass"),)
         settings = core_settings(self.config, policy=self.policy)
         self.settings = replace(settings, keep=16, shares=shares)
         self.answered: list[tuple[float, str]] = []

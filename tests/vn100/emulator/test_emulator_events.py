@@ -218,6 +218,9 @@ def test_impossible_setups_are_refused_with_a_reason():
     for rate_hz in (-5, 0, 77):
         with pytest.raises(ValueError, match="register 7 has 1, 2, 4, 5, 10, 20, 25, 40, 50, 100"):
             build(Setup(output="ascii", rate_hz=rate_hz))
+    for firmware in ("x", "4", "3.0", "3.1.0.0-beta"):
+        with pytest.raises(ValueError, match=r"2 or 3, or a version such as 3\.0\.0\.0"):
+            build(Setup(firmware=firmware))
 
 
 def test_a_clock_that_wraps_begins_again_and_the_device_does_not():

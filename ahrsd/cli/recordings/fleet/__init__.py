@@ -68,8 +68,8 @@ def command() -> None:
 @click.option(
     "--retry-failed", "again", is_flag=True, help="Repeat the recordings that gave no answer."
 )
-@click.option("--folders", default="vehicle", show_default=True, metavar="LEVEL,...",
-              help="The folder levels, from the top: vehicle, place, serial, or -.")  # fmt: skip
+@click.option("--folders", metavar="LEVEL,...", help="The folder levels, from the top: "
+              "vehicle, place, serial, or -.  [default: vehicle]")  # fmt: skip
 @click.option("--vehicle", help="The vehicle of all recordings.")
 @click.option("--place", help="The place of all recordings.")
 @click.option("--match", "patterns", multiple=True, metavar="GLOB",
@@ -87,7 +87,7 @@ def run(
     limit_s: float,
     memory_bytes: int,
     again: bool,
-    folders: str,
+    folders: str | None,
     vehicle: str | None,
     place: str | None,
     patterns: tuple[str, ...],
@@ -98,6 +98,7 @@ def run(
     """Give every recording of ARCHIVE a row: a folder, or an address such as s3://bucket/dives.
 
     What takes too long or too much memory, crashes or is no recording is a row with its reason.
+    --vehicle, --place and --folders also change the rows that are there.
     Exit 1 where not one recording gave an answer; 75 where another run is at work, or the cluster
     is gone.
     """
@@ -107,16 +108,20 @@ def run(
 
     if folder is not None:
         make_folder(folder, ("report.html",))
+    levels = _levels(folders or "vehicle")
+    said = {name for name in levels if folders and name in ROLES}
+    said |= {name for name, value in (("vehicle", vehicle), ("place", place)) if value}
     orders = Orders(
         out=str(output.resolve()),
         columns=columns,
         rate_hz=rate_hz,
-        levels=_levels(folders),
+        levels=levels,
         vehicle=vehicle,
         place=place,
         limit_s=limit_s,
         memory_bytes=memory_bytes,
         again=again,
+        relabel=tuple(said),
     )
     where = Place(jobs or os.cpu_count() or 1, LOADS, cluster)
     source = Archive(archive if "://" in archive else str(Path(archive).resolve()), patterns)
@@ -136,6 +141,11 @@ def _end_lines(done: Progress, output: Path) -> list[str]:
     lines = [f"{output}: {counted(done.done, 'recording', ',')}: {summary(done.outcomes)}"]
     if done.before:
         lines.append(f"  {counted(done.before, 'recording', ',')} had a row already")
+    if done.relabelled:
+        lines.append(
+            f"  {counted(done.relabelled, 'row', ',')} of these: another vehicle, place or serial "
+            "number, as said now"
+        )
     if done.left_out:
         names = ", ".join(f"{number} {suffix}" for suffix, number in done.left_out.most_common(5))
         lines.append(f"  left out, no recordings by their names: {names} (--match takes others)")

@@ -10,6 +10,7 @@ from ahrsd.cli.files import make_folder, refuse_unwritable, write_json
 from ahrsd.printable import counted
 
 _FOLDER = click.Path(path_type=Path)
+_QUESTIONS = ("drift", "recurring", "failures")  # any other is a SELECT
 
 
 @click.command()
@@ -64,7 +65,7 @@ def ask(output: Path, question: str, json_path: str | None) -> None:
                 with standard deviations and change points; largest heading error first
     recurring   findings that are more frequent on a device, a vehicle, at a place or a temperature
     failures    recordings that gave no answer, and why
-    SELECT ...  one query over the table `recordings`; nothing can be written
+    SELECT ...  one query over the table `results`; nothing can be written
     """
     from ahrsd.fleet.questions import (
         AnswerTable,
@@ -94,6 +95,8 @@ def ask(output: Path, question: str, json_path: str | None) -> None:
                 answer = rows.sql(question)
                 lines = table_lines(answer.columns, answer.rows)
             body = answer.json()
+        if question in _QUESTIONS and rows.empty():
+            lines = [f"{output}: no recording has a row yet"]
     if json_path is not None:
         write_json(json_path, body)
     if json_path != "-":
