@@ -118,7 +118,7 @@ def _own_rates(rates: Array) -> Array:
         by_itself = centred[:, axis] - explained
         if float(np.std(by_itself)) > least:
             own[:, axis] = by_itself
-    return own
+    return np.asarray(own)
 
 
 def _correlation(a: Array, b: Array) -> float:
