@@ -79,22 +79,64 @@ def _clock_shift(real: Track, simulated: Track) -> tuple[float, float, str]:
     reach = min(reach, len(grid) // 4)
     lag, most = _best_lag(a, b, reach)
     if most >= priors.SAME_MOTION:
-        return lag * step, most, ""
+        # an axis that turns little hardly counts in a correlation over all axes
+        axes = _nearest_axes(*_at_lag(a, b, lag))
+        return lag * step, most, _axes_words(axes) if _differ(axes) else ""
     turned = _best_lag(_rate_magnitudes(a), _rate_magnitudes(b), reach)
     if turned[1] <= most:
         return lag * step, most, ""
-    return turned[0] * step, turned[1], _axes_words(*_at_lag(a, b, turned[0]))
+    return turned[0] * step, turned[1], _axes_words(_nearest_axes(*_at_lag(a, b, turned[0])))
 
 
-def _axes_words(a: Array, b: Array) -> str:
-    """The axes of b (N, 3) that are x, y and z of a (N, 3), by the correlation of their rates."""
-    correlation = np.corrcoef(a, b, rowvar=False)[:3, 3:]
-    told = []
-    for axis, row in zip("xyz", correlation, strict=True):
-        nearest = int(np.argmax(np.abs(row)))
-        if abs(row[nearest]) >= priors.SAME_MOTION:
-            sign = "+" if row[nearest] > 0.0 else "-"
-            told.append(f"{sign}{'xyz'[nearest]} is the recording's {axis}")
+def _nearest_axes(a: Array, b: Array) -> dict[int, tuple[int, float]]:
+    """For each axis of a (N, 3), the axis of b (N, 3) that turns as it does, and the sign.
+
+    Left out are axes that turn too little by themselves, or as no axis of b does.
+    """
+    own, others = _own_rates(a), _own_rates(b)
+    found = {}
+    for axis in range(3):
+        correlation = [_correlation(own[:, axis], other) for other in others.T]
+        nearest = int(np.argmax(np.abs(correlation)))
+        if abs(correlation[nearest]) >= priors.SAME_MOTION:
+            found[axis] = (nearest, float(np.sign(correlation[nearest])))
+    return found
+
+
+def _own_rates(rates: Array) -> Array:
+    """(N, 3) rates about their means, each without what the other two axes explain; zero where an
+    axis turns too little by itself.
+
+    An axis at rest reads a share of the others' rates if it is misaligned, of either sign.
+    """
+    centred = rates - rates.mean(axis=0)
+    least = priors.TURNS_BY_ITSELF * float(np.sqrt(np.mean(np.sum(centred**2, axis=1))))
+    own = np.zeros_like(centred)
+    for axis in range(3):
+        others = np.delete(centred, axis, axis=1)
+        explained = others @ np.linalg.lstsq(others, centred[:, axis], rcond=None)[0]
+        by_itself = centred[:, axis] - explained
+        if float(np.std(by_itself)) > least:
+            own[:, axis] = by_itself
+    return np.asarray(own)
+
+
+def _correlation(a: Array, b: Array) -> float:
+    power = float(np.sum(a * a) * np.sum(b * b))
+    return float(np.sum(a * b)) / power**0.5 if power > 0.0 else 0.0
+
+
+def _differ(axes: dict[int, tuple[int, float]]) -> bool:
+    """Whether any axis is not the one of the same name."""
+    return any(one != (axis, 1.0) for axis, one in axes.items())
+
+
+def _axes_words(axes: dict[int, tuple[int, float]]) -> str:
+    """The axes of the simulation that are x, y and z of the recording."""
+    told = [
+        f"{'+' if sign > 0.0 else '-'}{'xyz'[nearest]} is the recording's {'xyz'[axis]}"
+        for axis, (nearest, sign) in axes.items()
+    ]
     return f"its {', its '.join(told)}" if told else "no axis of it is one of the recording's"
 
 

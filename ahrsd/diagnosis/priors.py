@@ -389,6 +389,9 @@ BAND_ALONG = 0.1
 OVERLAP_S = 20.0
 #: Correlation of the two gyros, above which the motion is the same; another motion is far below.
 SAME_MOTION = 0.8
+#: Standard deviation of what an axis turns without the others, as a share of the rates of all axes,
+#: above which it is judged by itself.  Source: chosen; cross-axis errors are a few per cent.
+TURNS_BY_ITSELF = 0.02
 #: Standard deviations: if all parameters differ by less, two effects are the same.  Source: chosen.
 SAME_SIGMAS = 4.0
 #: Deviation of the difference of what two effects add over time, as a share of what one adds, below

@@ -159,6 +159,29 @@ def test_simulation_in_other_axes_is_a_difference():
     assert left.notes == (f"the simulation has other axes: {overlap.other_axes}",)
 
 
+def test_negated_axis_that_hardly_turns_is_a_difference():
+    """The roll of a boat: without it the two motions correlate by more than 0.9."""
+    rates = turning() * [0.15, 0.05, 1.0]
+    overlap = align(track_of(rates), track_of(rates * [-1.0, 1.0, 1.0]))
+    assert overlap.other_axes == (
+        "its -x is the recording's x, its +y is the recording's y, its +z is the recording's z"
+    )
+    swapped = align(track_of(rates), track_of(rates[:, [1, 0, 2]])).other_axes
+    assert swapped == (
+        "its +y is the recording's x, its +x is the recording's y, its +z is the recording's z"
+    )
+
+
+def test_opposite_cross_axis_errors_are_no_other_axes():
+    noise = 0.01 * np.random.default_rng(1).normal(size=(2, len(TIME_S), 3))
+    rates = turning() * [0.0, 0.1, 1.0]
+    leak = np.outer(rates[:, 2], [0.03, 0.0, 0.0])
+    overlap = align(track_of(rates + leak + noise[0]), track_of(rates - leak + noise[1]))
+    assert overlap.other_axes == ""
+    still = align(track_of(rates), track_of(turning() * [0.1, 0.1, 1.0]))
+    assert still.other_axes == ""
+
+
 def test_axis_that_cannot_be_told_by_its_rate_is_not_named():
     rates = turning()
     c, s = np.cos(np.radians(50.0)), np.sin(np.radians(50.0))

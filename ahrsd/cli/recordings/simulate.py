@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 _MG, _MRAD = 1e-3, 1e-3
 _RECORDED = "recorded"
 _MOST_SAMPLES = 1e7
+_USUAL_HZ = 25.0
+#: options that --model and --along leave without use
+_OF_A_SCENARIO = (
+    *("motion", "seconds", "mag_mg", "gyro_mrad", "hard_iron_as_read", "gyro_path"),
+    *("outliers", "magnet_at_s", "step_at_s", "gap_at_s", "effects"),
+)
 
 
 @click.command()
@@ -33,7 +39,13 @@ _MOST_SAMPLES = 1e7
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Chooses motion and noise."
 )
 @click.option("--seconds", default=400.0, show_default=True, help="Length.")
-@click.option("--rate", "rate_hz", default=25.0, show_default=True, help="Samples per second.")
+@click.option(
+    "--rate",
+    "rate_hz",
+    type=float,
+    show_default=f"{_USUAL_HZ:g}",
+    help="Samples per second; with --along messages per second, if messages have no time.",
+)
 @click.option("--noise-mag", "mag_mg", default=1.0, show_default=True, help="mG per sample.")
 @click.option(
     "--noise-gyro", "gyro_mrad", default=5.0, show_default=True, help="mrad/s per sample."
@@ -79,12 +91,28 @@ def command(**options: object) -> None:
     if (wanted.model is None) != (wanted.along_path is None):
         raise AhrsdError("--model and --along need each other")
     if wanted.model is not None and wanted.along_path is not None:
-        if wanted.scenario is not None or wanted.effects:
-            raise AhrsdError("--model and --along take neither a scenario nor --effect")
+        if wanted.scenario is not None:
+            raise AhrsdError("--model and --along take no scenario")
+        if unused := _given(_OF_A_SCENARIO):
+            raise AhrsdError(
+                f"--model and --along take no {' and no '.join(unused)}: motion, noise and effects "
+                "are the recording's and the model's"
+            )
         _simulate_along(wanted, wanted.model, wanted.along_path)
     else:
         _simulate_scenario(wanted)
     raise SystemExit(EXIT_DONE)
+
+
+def _given(names: tuple[str, ...]) -> list[str]:
+    """Those of these options that the command line has, as it spells them."""
+    context = click.get_current_context()
+    return [
+        one.opts[0]
+        for one in context.command.params
+        if one.name in names
+        and context.get_parameter_source(one.name) is click.core.ParameterSource.COMMANDLINE
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +124,7 @@ class _Options:
     motion: str
     seed: int
     seconds: float
-    rate_hz: float
+    rate_hz: float | None
     mag_mg: float
     gyro_mrad: float
     hard_iron_as_read: bool
@@ -141,7 +169,8 @@ def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
         raise AhrsdError("name a scenario (wam, mam, lam, recorded), or give --model and --along")
     if (wanted.scenario == _RECORDED) != (wanted.gyro_path is not None):
         raise AhrsdError("the scenario recorded and the option --gyro need each other")
-    if not (0 < wanted.seconds * wanted.rate_hz < _MOST_SAMPLES):
+    rate_hz = _USUAL_HZ if wanted.rate_hz is None else wanted.rate_hz
+    if not (0 < wanted.seconds * rate_hz < _MOST_SAMPLES):
         raise AhrsdError(f"--seconds times --rate must be positive and below {_MOST_SAMPLES:g}")
     try:
         disturbances = Disturbances(
@@ -157,8 +186,8 @@ def _experiment(wanted: _Options) -> tuple[Experiment, dict[str, object]]:
             scenario=wanted.scenario,
             motion=wanted.motion,
             seed=wanted.seed,
-            samples=round(wanted.seconds * wanted.rate_hz),
-            rate_hz=wanted.rate_hz,
+            samples=round(wanted.seconds * rate_hz),
+            rate_hz=rate_hz,
             noise_mag_gauss=wanted.mag_mg * _MG,
             noise_gyro_rad_s=wanted.gyro_mrad * _MRAD,
             iron=Iron(offset_behind_iron=wanted.hard_iron_as_read),
@@ -199,7 +228,7 @@ def _simulate_along(wanted: _Options, model_path: Path, recording: Path) -> None
     if not is_table(output):
         raise AhrsdError(f"{output}: the name must end in one of {', '.join(TABLE_SUFFIXES)}")
     model = load_model(model_path)
-    read, notes = load_track(recording, columns=wanted.columns)
+    read, notes = load_track(recording, wanted.rate_hz, columns=wanted.columns)
     columns, refused = simulate_along_motion(model, recording, read, seed)
     for note in [*notes, *refused]:
         click.echo(f"{recording}: {note}", err=True)

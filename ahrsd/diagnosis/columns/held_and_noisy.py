@@ -55,12 +55,13 @@ class HeldColumn:
 
 def find_held_columns(track: Track) -> tuple[HeldColumn, ...]:
     """The columns that were sampled less often than the sensor and held."""
-    found = (_held_column(name, values, track) for name, values in track.covariates.items())
+    found = (find_held_column(track, name) for name in track.covariates)
     return tuple(one for one in found if one is not None)
 
 
-def _held_column(name: str, values: Array, track: Track) -> HeldColumn | None:
-    """The column as a held one; None if it is not."""
+def find_held_column(track: Track, name: str) -> HeldColumn | None:
+    """The column as one that was sampled less often than the sensor and held; None if it is not."""
+    values = track.covariates[name]
     if role_of(name, values) in (None, *TWO_LEVEL_ROLES) or not np.isfinite(values).all():
         return None
     rows = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from tracks import experiment, track_of
 
 from ahrsd.diagnosis.effects.library import EFFECTS
+from ahrsd.diagnosis.effects.sensor_sources import MotorCurrentField
 from ahrsd.diagnosis.inference.diagnose import build_and_fit_null
 from ahrsd.diagnosis.inference.likelihood import richest_model
 from ahrsd.diagnosis.track import Spec
@@ -62,3 +63,27 @@ def test_held_column_is_unchanged_if_the_field_does_not_follow_it(driven):
     speed = 1.2 + 0.25 * gaussian_filter1d(np.random.default_rng(3).normal(size=4_000), 40.0)
     track = driven.track.with_columns({"speed_m_s": held(speed, 5)})
     assert not any("speed_m_s" in said for said in notes_at_the_richest_model(track))
+
+
+class CountedMotorCurrentField(MotorCurrentField):
+    """Counts how often its settings are looked up: once per fit of a model, at least."""
+
+    looked_up = 0
+
+    def settings(self, context):
+        self.looked_up += 1
+        return super().settings(context)
+
+
+def lookups_with_columns(count):
+    track = track_of(experiment("wam", motion="rov", seed=4, samples=300, rate_hz=RATE_HZ))
+    rng = np.random.default_rng(5)
+    columns = {f"motor_{k:02d}_current_a": held(rng.normal(size=300), 5) for k in range(count)}
+    problem, fit = build_and_fit_null(track.with_columns(columns), Spec())
+    effect = CountedMotorCurrentField()
+    richest_model.fit_richest_model(problem, fit.filtered, {effect.identifier: effect})
+    return effect.looked_up
+
+
+def test_number_of_fits_does_not_grow_with_the_number_of_held_columns():
+    assert lookups_with_columns(6) == lookups_with_columns(2)

@@ -149,11 +149,26 @@ def test_simulation_of_a_repaired_model_along_a_recording(run, tmp_path):
     assert made.read_bytes() == first
 
 
+def test_rate_is_that_of_a_stream_without_time_whose_motion_is_followed(run, tmp_path):
+    source, path = tmp_path / "s.vnraw", tmp_path / "m.json"
+    assert run("simulate", "mam", "-o", source, *SHORT) == 0
+    model = NullModel(np.eye(3), np.zeros(3), np.zeros(3), 1e-3, 5e-3)
+    path.write_text(to_text(RepairedModel(model, forward.model_noise(model), (), "s")))
+    made = tmp_path / "y.csv"
+    along = ("--model", path, "--along", source, "--rate", 20.0)
+    assert run("simulate", *along, "-o", made) == 0
+    assert np.median(np.diff(read_table(made).rows.time_s)) == pytest.approx(0.05)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("--model", "m.json"), "--model and --along need each other"),
-        (("wam", "--model", "m.json", "--along", "s.csv"), "take neither a scenario"),
+        (("wam", "--model", "m.json", "--along", "s.csv"), "take no scenario"),
+        (
+            ("--model", "m.json", "--along", "s.csv", "--seconds", "9", "--outliers", "0.1"),
+            "--model and --along take no --seconds and no --outliers",
+        ),
         (("--model", "none.json", "--along", "s.csv"), "none.json: cannot be read"),
         (("--model", "s.csv", "--along", "s.csv"), "s.csv: is no JSON"),
         (("--model", "m.json", "--along", "none.csv"), "none.csv: does not exist"),

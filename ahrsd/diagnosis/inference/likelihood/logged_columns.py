@@ -10,7 +10,7 @@ causes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +20,7 @@ from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.calibration_fit.problem import Problem
 from ahrsd.diagnosis.columns.held_and_noisy import (
     denoise_columns,
-    find_held_columns,
+    find_held_column,
     interpolate_held_columns,
 )
 from ahrsd.diagnosis.columns.roles import label
@@ -79,14 +79,17 @@ class LoggerModel:
         ]
 
 
-def clean_columns(problem: Problem, log_likelihood: LogLikelihood) -> Problem:
+def clean_columns(
+    problem: Problem, log_likelihood: LogLikelihood, in_model: Collection[str]
+) -> Problem:
     """The problem without the logger's artefacts in its columns, where that is more probable.
 
     Its notes say so.
+    in_model: the columns on which the likelihood depends
     """
     best = None
     for clean in (_interpolate_held, _remove_noise):
-        for name in sorted(problem.recorded.covariates):
+        for name in sorted(in_model):
             changed = clean(problem, name)
             if changed is None:
                 continue
@@ -99,11 +102,11 @@ def clean_columns(problem: Problem, log_likelihood: LogLikelihood) -> Problem:
 
 def _interpolate_held(problem: Problem, name: str) -> Problem | None:
     """With a column interpolated linearly between its values, if these are rare; else None."""
-    held = tuple(one for one in find_held_columns(problem.recorded) if one.name == name)
-    if not held:
+    held = find_held_column(problem.recorded, name)
+    if held is None:
         return None
-    note = f"column {label(name)} has a new value {held[0].interval_words}: interpolated linearly"
-    return _replace_recorded(problem, interpolate_held_columns(problem.recorded, held), note)
+    note = f"column {label(name)} has a new value {held.interval_words}: interpolated linearly"
+    return _replace_recorded(problem, interpolate_held_columns(problem.recorded, (held,)), note)
 
 
 def _remove_noise(problem: Problem, name: str) -> Problem | None:
@@ -124,12 +127,8 @@ def find_mean_columns(
     Only one effect at a time is tested: a late field and one by the current's change together
     imitate a mean.
     """
-    made = made.copy()
-    for name in sorted(made.context.track.covariates):
-        effects = _effects_of_column(made.context, library, name)
-        if not effects:
-            continue
-        scan = _scan_without_column(made, keys, at, name)
+    for name, effects in sorted(_effects_by_column(made.context, library).items()):
+        scan = _scan_without_column(made.copy(), keys, at, name)  # what it adds goes with it
         unaveraged = [LoggerModel(name, 0.0, late_s) for late_s in (0.0, *priors.LOGGED_LATE_S)]
         required = (
             max(_best_log_bayes_factors(scan, effects, unaveraged).values()) + priors.ODDS_REAL
@@ -151,17 +150,24 @@ def find_mean_columns(
             yield best
 
 
-def _effects_of_column(
-    context: Context, library: Library, name: str
-) -> list[tuple[Effect, Setting]]:
-    """Effects of a column in their first setting, where a shift in time or a mean changes them."""
-    found = []
+def _effects_by_column(
+    context: Context, library: Library
+) -> dict[str, list[tuple[Effect, Setting]]]:
+    """Effects of each column in their first setting, where a shift in time or a mean changes them.
+
+    Columns without such an effect are left out.
+    """
+    found: dict[str, list[tuple[Effect, Setting]]] = {}
     for effect in library.values():
         if effect.delay or effect.quick or not effect.needs:
             continue
-        by_it = [one for one in effect.settings(context) if one.get("covariate") == name]
-        if by_it and len(effect_components.logged_time_settings(context, effect, by_it[0])) > 1:
-            found.append((effect, by_it[0]))
+        first: dict[str, Setting] = {}
+        for one in effect.settings(context):
+            if (name := one.get("covariate")) in context.track.covariates:
+                first.setdefault(str(name), one)
+        for name, setting in first.items():
+            if len(effect_components.logged_time_settings(context, effect, setting)) > 1:
+                found.setdefault(name, []).append((effect, setting))
     return found
 
 

@@ -184,10 +184,16 @@ def _correct_columns(
     def log_likelihood(one: Problem) -> float:
         return _fit_at_delay(one, filtered, library, 0.0).nats
 
-    problem = clean_columns(problem, log_likelihood).with_lag(problem.lag_s)
     if not problem.recorded.covariates:
         return problem
     here = _fit_at_delay(problem, filtered, library, 0.0)
+    seen = here.base.made.seen
+    in_model = {str(seen[key].component.setting.get("covariate")) for key in here.base.whole}
+    logged = in_model.intersection(problem.recorded.covariates)
+    clean = clean_columns(problem, log_likelihood, logged)
+    if clean is not problem:
+        problem = clean.with_lag(problem.lag_s)
+        here = _fit_at_delay(problem, filtered, library, 0.0)
     for logger in find_mean_columns(here.base.made, here.base.whole, here.at, library):
         corrected = apply_logger_model(problem, logger).with_lag(problem.lag_s)
         found = _fit_at_delay(corrected, filtered, library, 0.0)
