@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ahrsd.printable import counted
 from ahrsd.samples import Array
 
 _MOST_SENSORS = 8
@@ -22,7 +23,8 @@ def sensors_in_turn(field_gauss: Array) -> str:
         if jump > _APART * again:
             return (
                 f"the field jumps by {1e3 * jump:.3g} mG from row to row and is the same again "
-                f"after {count} rows: these are the rows of {count} sensors in turn, of which "
-                "only one may be kept, or an alternating current is near"
+                f"after {counted(count, 'row')}: these are the rows of "
+                f"{counted(count, 'sensor')} in turn, of which only one may be kept, or an "
+                "alternating current is near"
             )
     return ""

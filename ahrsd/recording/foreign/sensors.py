@@ -244,8 +244,8 @@ def _refuse_clock_set_back(path: object, time_s: Array, name: str) -> None:
     at = int(begins[longest])
     raise RecordingError(
         path,
-        f"{name}: its time goes back by {newest[at] - time_s[at]:.4g} s after {at} readings: the "
-        "clock was set, or the recording repeats itself",
+        f"{name}: its time goes back by {newest[at] - time_s[at]:.4g} s after "
+        f"{counted(at, 'reading')}: the clock was set, or the recording repeats itself",
         "cut it in parts there",
     )
 

@@ -209,7 +209,10 @@ def score_changes(
 def _size_prior_change(
     all_sets: Hypotheses, hypothesis: Hypothesis, factor: float, step: float
 ) -> float:
-    """The change if all ordinary sizes are multiplied by the factor."""
+    """The change if all ordinary sizes are multiplied by the factor.
+
+    0 where it cannot be evaluated, because rounding exceeds the residual there.
+    """
     ordinary = {*all_sets.remainder, LAG, LAG_FORM}
     if not ordinary & set(hypothesis.keys):
         return 0.0
@@ -223,7 +226,7 @@ def _size_prior_change(
         evaluate(products, each, hypothesis.at.log_noise, hypothesis.at.psi).nats
         for each in (laws, scaled)
     )
-    return after - before
+    return after - before if np.isfinite(after) else 0.0
 
 
 def _scale_law(law: Law, factor: float) -> Law:
