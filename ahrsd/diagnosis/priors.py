@@ -384,6 +384,13 @@ BAND_LOWEST_HZ = 0.75
 #: turns the field and does not change its size; for others it is about a third.
 BAND_ALONG = 0.1
 
+# --- a specification that is compared with the recording ------------------------------------------
+#: Factors between the noise in a specification and the scatter of successive readings.
+#: NOISE_AGREES: beyond it a note says so; slow noise scatters less, a shaken magnetometer more.
+#: NOISE_IMPOSSIBLE: the magnetometer's noise is not used if the readings scatter by more than this.
+#: Source: chosen; with a hundredth of the scatter no calibration came near the readings.
+NOISE_AGREES, NOISE_IMPOSSIBLE = 5.0, 30.0
+
 # --- a simulation that is compared with the recording ---------------------------------------------
 #: Time that both have to have in common, s.  Source: chosen.
 OVERLAP_S = 20.0

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.columns.roles import prepare_columns
 from ahrsd.diagnosis.data_quality.axes_and_units import axis_and_unit_errors, window_equations
@@ -31,12 +32,6 @@ from ahrsd.samples import Array, SampleBlock
 
 _FEW_MISSING = 0.02  # share of rows with missing acceleration that is interpolated
 _ACCEL_UNITS = (("g", GRAVITY_M_S2), ("mg", 1e-3 * GRAVITY_M_S2))
-
-
-#: factors between a spec's noise and the scatter of successive readings: beyond the first a note
-#: says so, as slow noise scatters less and a magnetometer that is shaken more; with readings that
-#: scatter by more than the second no calibration comes near them, so the entry is not used
-NOISE_AGREES, NOISE_IMPOSSIBLE = 5.0, 30.0
 
 
 def track_of(blocks: list[SampleBlock]) -> Track:
@@ -119,12 +114,12 @@ def check_spec_noise(track: Track, spec: Spec) -> tuple[Spec, list[str]]:
         if given is None or scatter == 0.0 or not np.isfinite(scatter):
             continue
         words = f"the spec says {key} = {given:g}, but successive readings scatter by {scatter:.2g}"
-        if given > NOISE_AGREES * scatter:
+        if given > priors.NOISE_AGREES * scatter:
             notes.append(f"{words}: check its unit; only noise that is slow scatters so little")
-        elif key == "sigma_mag_gauss" and scatter > NOISE_IMPOSSIBLE * given:
+        elif key == "sigma_mag_gauss" and scatter > priors.NOISE_IMPOSSIBLE * given:
             spec = replace(spec, sigma_mag_gauss=None)
             notes.append(f"{words}: it was left out; check its unit, or the sensor")
-        elif key == "sigma_mag_gauss" and scatter > NOISE_AGREES * given:
+        elif key == "sigma_mag_gauss" and scatter > priors.NOISE_AGREES * given:
             notes.append(f"{words}: check its unit; what the spec does not explain is a mismatch")
     return spec, notes
 
