@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import correlate
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Contribution, Diagnosis, Finding, Unexplained
@@ -141,15 +143,39 @@ def _axes_words(axes: dict[int, tuple[int, float]]) -> str:
 
 
 def _best_lag(a: Array, b: Array, reach: int) -> tuple[int, float]:
-    """Lag in rows of b (N, k) behind a, within reach, and the correlation at that lag."""
-    best = (0, -1.0)
-    for lag in range(-reach, reach + 1):
-        x, y = _at_lag(a, b, lag)
-        x, y = x - x.mean(axis=0), y - y.mean(axis=0)
-        power = float(np.sum(x * x) * np.sum(y * y))
-        if power > 0.0:
-            best = max(best, (lag, float(np.sum(x * y)) / power**0.5), key=lambda one: one[1])
-    return best
+    """Lag in rows of b (N, k) behind a, within reach, and the correlation at that lag.
+
+    Over the rows that both have at each lag, about their means there.
+    """
+    lags = np.arange(-reach, reach + 1)
+    begins, ends = np.maximum(0, -lags), len(a) - np.maximum(0, lags)
+    x, y = a - a.mean(axis=0), b - b.mean(axis=0)
+    products = sum(
+        correlate(of_y, of_x, method="fft")[len(a) - 1 + lags]
+        for of_x, of_y in zip(x.T, y.T, strict=True)
+    )
+    sum_x, square_x = _sums(x, begins, ends)
+    sum_y, square_y = _sums(y, begins + lags, ends + lags)
+    rows = (ends - begins)[:, None]
+    covariance = products - np.sum(sum_x * sum_y / rows, axis=1)
+    power_x, power_y = (
+        np.sum(square - total**2 / rows, axis=1)
+        for square, total in ((square_x, sum_x), (square_y, sum_y))
+    )
+    power = np.sqrt(np.maximum(power_x, 0.0) * np.maximum(power_y, 0.0))
+    if not power.any():
+        return 0, -1.0
+    correlation = np.divide(covariance, power, out=np.full(len(lags), -1.0), where=power > 0.0)
+    best = int(np.argmax(correlation))
+    return int(lags[best]), float(correlation[best])
+
+
+def _sums(values: Array, begins: NDArray[np.intp], ends: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Sums (L, k) of values (N, k) and of their squares, of the rows from `begins` to `ends`."""
+    total, square = (
+        np.cumsum(np.pad(one, ((1, 0), (0, 0))), axis=0) for one in (values, values**2)
+    )
+    return total[ends] - total[begins], square[ends] - square[begins]
 
 
 def _at_lag(a: Array, b: Array, lag: int) -> tuple[Array, Array]:
