@@ -13,7 +13,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import correlate
 
 from ahrsd.diagnosis import priors
 from ahrsd.diagnosis.answer.diagnosis import Contribution, Diagnosis, Finding, Unexplained
@@ -147,6 +146,8 @@ def _best_lag(a: Array, b: Array, reach: int) -> tuple[int, float]:
 
     Over the rows that both have at each lag, about their means there.
     """
+    from scipy.signal import correlate  # slow to import, and seldom needed
+
     lags = np.arange(-reach, reach + 1)
     begins, ends = np.maximum(0, -lags), len(a) - np.maximum(0, lags)
     x, y = a - a.mean(axis=0), b - b.mean(axis=0)

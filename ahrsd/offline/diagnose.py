@@ -15,18 +15,18 @@ from pathlib import Path
 import numpy as np
 
 from ahrsd.diagnosis.answer.diagnosis import Diagnosis
+from ahrsd.diagnosis.calibration_fit.noise_fit import check_spec_noise
 from ahrsd.diagnosis.external_simulation import align, remove_common_findings
 from ahrsd.diagnosis.inference.diagnose import diagnose_logged
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel, from_text
 from ahrsd.diagnosis.track import Spec, Track
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.events import Event, SamplesSeen
-from ahrsd.offline.track import check_spec_noise, check_track, track_of
+from ahrsd.offline.track import check_track, track_of
 from ahrsd.printable import printable
 from ahrsd.recording.column_names import NO_MAP, ColumnMap
 from ahrsd.recording.limits import TABLE_ROWS, on_one_thread
 from ahrsd.recording.opening import open_recording
-from ahrsd.samples import SampleBlock
 
 SHORTEST_S = 20.0  # a shorter recording does not even determine the calibration
 FEWEST_ROWS = 100
@@ -58,10 +58,10 @@ def load_track(
     recording = open_recording(path, rate_hz, check_units=False, columns=columns)
     spec_hz = None if spec is None else spec.rate_hz
     if (table := recording.table) is not None:
-        blocks, notes = list(table.blocks(len(table.rows))), list(recording.notes)
+        recorded, notes = track_of(list(table.blocks(len(table.rows)))), list(recording.notes)
     else:
-        blocks, notes = _replay_samples(path, rate_hz or spec_hz, progress)
-    track, more_notes = check_track(track_of(blocks))
+        recorded, notes = _replayed_track(path, rate_hz or spec_hz, progress)
+    track, more_notes = check_track(recorded)
     if len(track) < FEWEST_ROWS or track.duration_s < SHORTEST_S:
         raise RecordingError(
             path,
@@ -82,9 +82,9 @@ def _rate_notes(track: Track, spec_hz: float | None) -> list[str]:
     ]
 
 
-def _replay_samples(
+def _replayed_track(
     path: Path, rate_hz: float | None, progress: Callable[[int], None] | None
-) -> tuple[list[SampleBlock], list[str]]:
+) -> tuple[Track, list[str]]:
     # the daemon's whole pipeline, which a table does not need
     from ahrsd.config.config import Config
     from ahrsd.offline.replay import replay
@@ -99,7 +99,7 @@ def _replay_samples(
         most_samples=TABLE_ROWS,
     )
     blocks = [event.block for event in seen if isinstance(event, SamplesSeen)]
-    return blocks, [*done.warnings, *done.core.stream.warnings]
+    return track_of(blocks), [*done.warnings, *done.core.stream.warnings]
 
 
 def load_spec(path: Path) -> tuple[Spec, list[str]]:

@@ -13,8 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.calibration_fit.noise_fit import noise_of_differences
 from ahrsd.diagnosis.columns.roles import prepare_columns
 from ahrsd.diagnosis.data_quality.axes_and_units import axis_and_unit_errors, window_equations
 from ahrsd.diagnosis.data_quality.facts import is_finding
@@ -24,7 +22,7 @@ from ahrsd.diagnosis.data_quality.timestamps import without_clock_jumps
 from ahrsd.diagnosis.effects.design_matrix import GRAVITY_M_S2
 from ahrsd.diagnosis.repaired_model.forward import remove_terms
 from ahrsd.diagnosis.repaired_model.model_file import RepairedModel
-from ahrsd.diagnosis.track import Spec, Track
+from ahrsd.diagnosis.track import Track
 from ahrsd.errors import AhrsdError
 from ahrsd.events import Event, SamplesSeen
 from ahrsd.printable import counted
@@ -98,30 +96,6 @@ def _usable_acceleration(track: Track) -> tuple[Array | None, list[str]]:
         if 0.7 * GRAVITY_M_S2 < size * factor < 1.4 * GRAVITY_M_S2:
             return accel * factor, [*notes, f"the acceleration was in {unit}: taken as m/s^2"]
     return accel, notes
-
-
-def check_spec_noise(track: Track, spec: Spec) -> tuple[Spec, list[str]]:
-    """The spec without a noise that its readings contradict, and one line on each that they do.
-
-    A gyro may scatter by far more than its noise, which is its motion.
-    """
-    names = "sigma_mag_gauss", "sigma_gyro_rad_s"
-    notes = []
-    if spec.field_gauss is not None:
-        notes.append("the spec's field_gauss changes nothing: the field's strength is not judged")
-    for key, scatter in zip(names, noise_of_differences(track), strict=True):
-        given = getattr(spec, key)
-        if given is None or scatter == 0.0 or not np.isfinite(scatter):
-            continue
-        words = f"the spec says {key} = {given:g}, but successive readings scatter by {scatter:.2g}"
-        if given > priors.NOISE_AGREES * scatter:
-            notes.append(f"{words}: check its unit; only noise that is slow scatters so little")
-        elif key == "sigma_mag_gauss" and scatter > priors.NOISE_IMPOSSIBLE * given:
-            spec = replace(spec, sigma_mag_gauss=None)
-            notes.append(f"{words}: it was left out; check its unit, or the sensor")
-        elif key == "sigma_mag_gauss" and scatter > priors.NOISE_AGREES * given:
-            notes.append(f"{words}: check its unit; what the spec does not explain is a mismatch")
-    return spec, notes
 
 
 def find_faults(blocks: list[SampleBlock]) -> tuple[list[str], list[str]]:

@@ -7,11 +7,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from ahrsd.diagnosis.calibration_fit.noise_fit import check_spec_noise
 from ahrsd.diagnosis.external_simulation import align
 from ahrsd.diagnosis.track import Spec
 from ahrsd.errors import AhrsdError, RecordingError
 from ahrsd.offline.diagnose import load_spec, load_track
-from ahrsd.offline.track import check_spec_noise
 from ahrsd.recording.table import write_table
 from ahrsd.simulation import ScenarioSettings, simulate
 

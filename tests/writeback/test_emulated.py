@@ -139,7 +139,7 @@ def begin(setup):
     return bench, old, new
 
 
-@pytest.mark.parametrize("firmware", ["3.0", "3"])
+@pytest.mark.parametrize("firmware", ["3.0.0.0", "3"])
 def test_registers_reach_the_device_exactly_and_are_rolled_back(firmware):
     bench, old, new = begin(Setup(firmware=firmware, rate_hz=40))
     assert bench.until(lambda: bench.wb.state is State.TRIAL, 5.0)

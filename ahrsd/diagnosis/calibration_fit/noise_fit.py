@@ -284,3 +284,27 @@ def _noise_of_third_differences(track: Track, values: Array) -> float:
     if not found:
         return 0.0
     return float(np.sqrt(np.median(np.median(np.concatenate(found), axis=0))))
+
+
+def check_spec_noise(track: Track, spec: Spec) -> tuple[Spec, list[str]]:
+    """The spec without a noise that its readings contradict, and one line on each that they do.
+
+    A gyro may scatter by far more than its noise, which is its motion.
+    """
+    names = "sigma_mag_gauss", "sigma_gyro_rad_s"
+    notes = []
+    if spec.field_gauss is not None:
+        notes.append("the spec's field_gauss changes nothing: the field's strength is not judged")
+    for key, scatter in zip(names, noise_of_differences(track), strict=True):
+        given = getattr(spec, key)
+        if given is None or scatter == 0.0 or not np.isfinite(scatter):
+            continue
+        words = f"the spec says {key} = {given:g}, but successive readings scatter by {scatter:.2g}"
+        if given > priors.NOISE_AGREES * scatter:
+            notes.append(f"{words}: check its unit; only noise that is slow scatters so little")
+        elif key == "sigma_mag_gauss" and scatter > priors.NOISE_IMPOSSIBLE * given:
+            spec = replace(spec, sigma_mag_gauss=None)
+            notes.append(f"{words}: it was left out; check its unit, or the sensor")
+        elif key == "sigma_mag_gauss" and scatter > priors.NOISE_AGREES * given:
+            notes.append(f"{words}: check its unit; what the spec does not explain is a mismatch")
+    return spec, notes

@@ -24,7 +24,6 @@ import numpy as np
 from drivers.vn100.emulator.physics import Dipole, Disturbance, IronStep
 
 ONCE_DEFAULT_S = 10.0
-_RATE = "per "  # units of probabilities begin so
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +34,11 @@ class FaultKind:
     parameter: float
     unit: str
     duration_s: float = math.inf
+
+    @property
+    def is_probability(self) -> bool:
+        """Whether the parameter is one, of each byte or message."""
+        return self.unit.startswith("per ")
 
 
 def _once(
@@ -131,7 +135,7 @@ def parse_fault(schedule: str) -> Fault:
         raise ValueError(f"no fault {name!r}; there are {', '.join(FAULTS)}")
     begins_s = 0.0 if kind.duration_s == math.inf else ONCE_DEFAULT_S
     size = kind.parameter if parameter is None else _number(parameter, "parameter", schedule)
-    if kind.unit.startswith(_RATE) and size > 1.0:
+    if kind.is_probability and size > 1.0:
         raise ValueError(f"fault {schedule!r}: parameter is a probability, at most 1")
     return Fault(
         name,

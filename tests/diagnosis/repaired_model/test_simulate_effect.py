@@ -194,8 +194,8 @@ def test_bad_use_is_refused_in_one_line(run, tmp_path, monkeypatch, capsys, argu
         (("--effect", "motor_current_field=covariate=foo_a"), "no column foo_a; there is motor_"),
         (("--effect", "hard_iron_step=onset_s=500"), "onset_s is 500, the recording ends at 40 s"),
         (("--step", "500"), "step_at_s is 500: the recording lasts 39.96 s"),
-        (("--step", "nan"), "step_at_s is nan: the recording lasts 39.96 s"),
-        (("--magnet", "-3"), "magnet_at_s is -3: the recording lasts 39.96 s"),
+        (("--step", "nan"), "'--step': nan is not a finite number"),
+        (("--magnet", "-3"), "'--magnet': -3.0 is not in the range x>=0.0"),
         (("--gap", "41"), "gap_at_s is 41: the recording lasts 39.96 s"),
     ],
 )

@@ -93,7 +93,7 @@ def schedule(draw: np.random.Generator) -> tuple[str, ...]:
         elif name.startswith("third_party"):
             value = float(draw.choice([23, 25, 84, 44]))
         elif kind.unit in ("per byte", "per message"):
-            value = kind.parameter * float(draw.choice([0.3, 1.0, 5.0]))
+            value = min(kind.parameter * float(draw.choice([0.3, 1.0, 5.0])), 1.0)
         lines.append(f"{name}={min(value, 1e3)}@{start_s:.3f}+{draw.uniform(0.05, 0.8):.3f}")
     return tuple(lines)
 
@@ -117,7 +117,7 @@ class Schedule:
         output = str(self.draw.choice(["ascii", "imu", "binary"]))
         setup = Setup(
             "rov", device_seed, self.faults, output=output, rate_hz=20, motion=motion,
-            firmware=str(self.draw.choice(["3", "3.0"])),
+            firmware=str(self.draw.choice(["3", "3.0.0.0"])),
         )  # fmt: skip
         settings = core_settings(Config(), policy=POLICY)
         self.run_ = VirtualRun(build(setup), settings, step_s=0.05)
