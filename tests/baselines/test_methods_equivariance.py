@@ -21,6 +21,7 @@ SHIFTED = [method for method in TURNED if method not in ("twostep", "magical-nls
 ATOL = {"magical-nls": 5e-4, "magical-ls": 1e-5, "twostep": 1e-6}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", TURNED)
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=8, deadline=None)

@@ -114,6 +114,7 @@ def test_a_stopped_run_goes_on(sealed):
     assert json.loads((kept / "step0000.json").read_text())["exit"] == 0
 
 
+@pytest.mark.slow
 def test_a_tool_that_hangs_on_a_case_is_ended_and_has_no_answer_to_it(
     sealed, tmp_path, monkeypatch
 ):

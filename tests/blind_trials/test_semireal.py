@@ -155,6 +155,7 @@ def variant(recordings):
     return bases.Variant(_CIRCLES, 1, 77)
 
 
+@pytest.mark.slow
 def test_injections_on_real_recordings_are_exact(variant):
     plain, spec, truth = semireal.make_semireal(RECORDINGS, variant, (), [1])
     assert (truth["kind"], truth["effects"]) == ("control", [])

@@ -52,6 +52,7 @@ def replace_by_fifo(path: Path) -> None:
 # -- files that never answer -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_fifo_as_interlock_does_not_stop_the_run(program):
     with program() as running:
         running.word = None
@@ -210,6 +211,7 @@ def test_command_folder_writable_by_others_is_refused(program, owner, mode):
         running.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "umask", [0o777, *(pytest.param(one, marks=pytest.mark.slow) for one in (0o077, 0o022))]
 )
@@ -243,6 +245,7 @@ def test_operator_text_cannot_forge_log_lines(program):
         assert "\x1b" not in running.said
 
 
+@pytest.mark.slow
 def test_folder_in_place_of_a_command_is_reported_once(program):
     with program() as running:
         running.start()
@@ -269,6 +272,7 @@ def stamped(running: Program, ahead_s: float) -> None:
     draft.rename(running.interlock)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ahead_s", [0.8, *(pytest.param(s, marks=pytest.mark.slow) for s in (8.0, 30.0))]
 )

@@ -101,6 +101,7 @@ def test_killed_run_decides_as_an_uninterrupted_one(runs):
     assert killed.core.writeback.state == whole.core.writeback.state == "QUALIFIED"
 
 
+@pytest.mark.slow
 def test_replay_of_a_warm_started_run_decides_the_same(runs):
     _, killed, _ = runs
     done = replay(killed.path, killed.config)

@@ -90,6 +90,7 @@ def test_rotations_are_composed_and_time_adds_up():
     np.testing.assert_allclose(so3.exp(thin[1:, 5:8] * 0.1), step, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_rows_do_not_depend_on_the_block_size():
     rows = recorded(100.0, 10, seconds=30.0)
     whole = HeldReadings(10).merge_rows(rows)

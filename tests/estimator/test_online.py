@@ -284,6 +284,7 @@ def test_waiting_epochs_are_included_when_an_estimate_is_requested():
     assert same(estimator.finish(), finished(Estimator(SMALL, at_once=8), run.block))
 
 
+@pytest.mark.slow
 def test_averaged_streams_are_bit_identical_for_any_block_size():
     run = bench.simulate("mam", "rov", 1, samples=9000, rate_hz=100.0)
     estimates = [calibrated(run, Estimator(SMALL), size=size)[0] for size in (9000, 61)]

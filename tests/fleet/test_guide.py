@@ -34,6 +34,7 @@ def commands(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_example_of_a_cluster_runs(tmp_path, commands):
     port = str(free_port())
     write_archive(tmp_path / "ARCHIVE", 4)

@@ -102,6 +102,7 @@ def test_run_recovers_from_a_killed_scheduler_and_worker(tmp_path):
         cluster.stop()
 
 
+@pytest.mark.slow
 def test_missing_cluster_is_a_one_line_error_after_five_seconds(tmp_path):
     pytest.importorskip("distributed", reason="distributed (the extra cluster) is not installed")
     write_quick_archive(tmp_path / "archive", 1, milliseconds=10)

@@ -29,7 +29,10 @@ FACTS = tomllib.loads(
 
 MIXED = "F00379.logger_mixed_stream.gz"
 #: long ones, in the slow form
-LONG = ("drive_2022_rahul.vnraw.gz", "hand_2023_thumatti.vnraw.gz", MIXED)
+LONG = (
+    "drive_2022_rahul.vnraw.gz", "hand_2023_thumatti.vnraw.gz", "static_2025_kiran_5min.vnraw.gz",
+    "F00379.vnbin.gz", MIXED,
+)  # fmt: skip
 EACH = [pytest.param(one, marks=pytest.mark.slow if one in LONG else ()) for one in FACTS]
 
 

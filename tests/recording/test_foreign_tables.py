@@ -647,6 +647,7 @@ def test_parquet_bomb_is_refused_in_one_line(tmp_path):
     refused(limited("calibrate", path, gigabytes=1.5), "the limit is", "cut it in parts")
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_columns_end_in_one_line(tmp_path):
     header = ",".join([*REQUIRED, *(f"c{k}" for k in range(100_000))])
     row = ",".join(["0"] * 100_007)

@@ -437,6 +437,7 @@ def test_a_replay_that_is_faster_than_rerun_loses_nothing(tmp_path, monkeypatch)
     assert sorted(gyro.column("sample").drop_null().to_pylist()) == list(range(20_000))
 
 
+@pytest.mark.slow
 def test_a_replay_waits_for_a_stopped_process_only_once(tmp_path, monkeypatch):
     monkeypatch.setattr("ahrsd.viewer.sink.WAIT_S", 0.3)
     with opened(tmp_path / "run.rrd", queue_batches=4, wait=True) as sink:
@@ -481,6 +482,7 @@ def test_stopped_process_loses_events_and_does_not_block(tmp_path):
     assert "killed" in sink.counters.last_fault
 
 
+@pytest.mark.slow
 def test_a_process_that_reads_nothing_is_replaced(tmp_path):
     with opened(tmp_path / "run.rrd", stall_s=0.5) as sink:
         wait_for((tmp_path / "run.rrd").exists)
@@ -527,6 +529,7 @@ def test_unwritable_path_is_counted_without_further_effect(tmp_path):
     assert sink.counters.respawns == 0
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_is_counted_and_tried_again(small_disk):
     with opened(small_disk / "run.rrd") as sink:
         wait_for((small_disk / "run.rrd").exists)

@@ -160,6 +160,7 @@ def test_columns_named_after_an_axis_or_a_sensor_are_kept(name):
     assert notes == ()
 
 
+@pytest.mark.slow
 @given(
     st.text(max_size=12),
     st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=5, max_size=5),

@@ -56,6 +56,7 @@ def reported(recording, tmp_path_factory):
     return Reported(ended.value.code, said.getvalue(), folder)
 
 
+@pytest.mark.slow
 def test_step_is_found_with_its_onset_and_size(reported):
     assert reported.code == 0
     body = reported.body

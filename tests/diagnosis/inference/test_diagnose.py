@@ -89,6 +89,7 @@ print(diagnose(track, library=steps).to_json())
 """
 
 
+@pytest.mark.slow
 def test_answer_is_the_same_in_another_process(tmp_path):
     """The order of a set of strings differs from process to process."""
     track = track_of(experiment("wam", seed=6, samples=900))
