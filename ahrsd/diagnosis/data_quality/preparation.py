@@ -27,7 +27,13 @@ from ahrsd.diagnosis.data_quality.axes_and_units import (
     rank_frames,
     window_equations,
 )
-from ahrsd.diagnosis.data_quality.facts import Fact, as_finding, is_finding, stopped_diagnosis
+from ahrsd.diagnosis.data_quality.facts import (
+    Fact,
+    as_finding,
+    is_finding,
+    rounding,
+    stopped_diagnosis,
+)
 from ahrsd.diagnosis.data_quality.range_and_resolution import find_clipping, find_quantisation
 from ahrsd.diagnosis.data_quality.stuck import (
     dead_sensor_reason,
@@ -41,6 +47,7 @@ from ahrsd.diagnosis.data_quality.timestamps import (
     without_clock_jumps,
 )
 from ahrsd.diagnosis.effects.effect import Effect
+from ahrsd.diagnosis.model import Term
 from ahrsd.diagnosis.track import NothingToFit, Spec, Track
 
 #: diagnoses a track, given what is known of the sensor
@@ -75,6 +82,11 @@ class PreparedRecording:
     def findings(self, library: Mapping[str, Effect]) -> tuple[Finding, ...]:
         """The facts that are findings."""
         return tuple(as_finding(fact, library) for fact in self.facts if is_finding(fact))
+
+    @property
+    def rounding(self) -> tuple[Term, ...]:
+        """The quantisation steps of the readings as a term of the model, where they are coarse."""
+        return rounding(self.facts)
 
     @property
     def minor_notes(self) -> tuple[str, ...]:

@@ -25,7 +25,6 @@ from ahrsd.diagnosis.data_quality.dropped_samples import (
     corrections_differ,
     find_lost_turns_at_start,
 )
-from ahrsd.diagnosis.data_quality.facts import rounding
 from ahrsd.diagnosis.data_quality.preparation import diagnose_with_gaps, prepare
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.effects.library import EFFECTS
@@ -130,4 +129,4 @@ def _diagnose_once(
         spec_given=spec.sigma_mag_gauss is not None,
         simulated=simulated,
     )
-    return FittedDiagnosis(diagnosis, problem, start, rounding(prepared.facts))
+    return FittedDiagnosis(diagnosis, problem, start, prepared.rounding)

@@ -29,21 +29,20 @@ from ahrsd.diagnosis.calibration_fit.problem import build_problem
 from ahrsd.diagnosis.effects.library import EFFECTS
 from ahrsd.diagnosis.inference.answer.held_out import HeldOut, assign_folds
 from ahrsd.diagnosis.inference.answer.left_sizes import remainder_sizes
+from ahrsd.diagnosis.inference.answer.prior_sensitivity import (
+    COURSE,
+    EFFECT,
+    NOISE,
+    ORDINARY,
+    prior_sensitivity,
+)
 from ahrsd.diagnosis.inference.answer.residual_checks import (
     checks,
     fit_residuals,
     regime_maps,
     whiteness,
 )
-from ahrsd.diagnosis.inference.answer.support import (
-    COURSE,
-    EFFECT,
-    NOISE,
-    ORDINARY,
-    doubts,
-    nearest_effect,
-    prior_sensitivity,
-)
+from ahrsd.diagnosis.inference.answer.support import doubts, nearest_effect
 from ahrsd.diagnosis.inference.answer.visibility import effect_evidence, limits
 from ahrsd.diagnosis.inference.decision.decision import Answer
 from ahrsd.diagnosis.inference.likelihood import richest_model

@@ -19,7 +19,7 @@ from ahrsd.diagnosis.answer.diagnosis import (
     RegimeMap,
 )
 from ahrsd.diagnosis.calibration_fit.null_fit import NullFit, baseline_of
-from ahrsd.diagnosis.data_quality.facts import Fact, as_finding, rounding
+from ahrsd.diagnosis.data_quality.facts import Fact, as_finding
 from ahrsd.diagnosis.data_quality.preparation import PreparedRecording
 from ahrsd.diagnosis.effects.effect import Effect
 from ahrsd.diagnosis.inference.answer import pictures, residual_checks, support, visibility
@@ -81,7 +81,7 @@ def build_diagnosis(
     odds = answer.log_odds, fast.answer.log_odds, remainder_nats, unknown.evidence_nats, 0.0
     any_counted = len(all_findings) > len(findings)
     answer_notes = support.doubts(findings) if differs else support.nearest_effect(answer, all_sets)
-    terms = (*_as_recorded((*answer.terms, *fast.answer.terms), found), *rounding(prepared.facts))
+    terms = (*_as_recorded((*answer.terms, *fast.answer.terms), found), *prepared.rounding)
     return Diagnosis(
         recording="",
         baseline=baseline_of(start),
