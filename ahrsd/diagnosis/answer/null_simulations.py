@@ -68,10 +68,23 @@ from ahrsd.diagnosis.repaired_model import forward
 from ahrsd.diagnosis.track import Track
 from ahrsd.samples import Array
 
-LOUD = "the gyro is noisier than the magnetometer"
-ROUNDED = "the readings come in steps that are coarser than their noise"
 NOT_DIAGNOSED = "a simulation of the calibration model alone, with this noise, cannot be diagnosed"
-BENT = "the gyro's noise biases the calibration, which this motion hardly determines"
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """Why an answer may rest on noise.
+
+    of_findings: whether noise may produce a library effect as well; else only what is unknown
+    """
+
+    words: str
+    of_findings: bool
+
+
+LOUD = Doubt("the gyro is noisier than the magnetometer", True)
+BENT = Doubt("the gyro's noise biases the calibration, which this motion hardly determines", True)
+ROUNDED = Doubt("the readings come in steps that are coarser than their noise", False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,56 +154,51 @@ def diagnose_beyond_chance(track: Track, diagnose: Callable[[Track], FittedDiagn
     recorded = problem.recorded
     models = [model_of_samples(start.model, problem), *([found.model] if found.model else [])]
     model = max(models, key=lambda one: gyro_to_mag_noise(recorded, one))
-    if (why := _reason_to_simulate(first, problem, start, model)) is None:
+    if (doubt := _doubt(first, problem, start, model)) is None:
         return found
     truth = noise_free_motion(recorded, model)
-    comparison = None
-    for noise in _candidate_noises(model, first):
-        copies = [
-            simulated_copy(recorded, truth, noise, seed, first.rounding)
-            for seed in range(priors.CHANCE_FITS)
-        ]
-        if why == ROUNDED and any(map(_is_fitted, found.findings)):
-            break  # the calibration alone is not what these copies would have to look like
+
+    def copies_with(noise: Noise) -> list[Track]:
+        seeds = range(priors.CHANCE_FITS)
+        return [simulated_copy(recorded, truth, noise, seed, first.rounding) for seed in seeds]
+
+    noises = _candidate_noises(model, first)
+    if not doubt.of_findings and any(map(_is_fitted, found.findings)):
+        note, bound = _compare_in_copies(doubt, found, copies_with(noises[0]), diagnose)
+        unknown = (
+            found.unexplained if found.unexplained.evidence_nats > bound else Unexplained(False)
+        )
+        return replace(found, unexplained=unknown, notes=(*found.notes, note))
+    for noise in noises:
+        copies = copies_with(noise)
         comparison = RefitComparison.of(problem, start, copies)
         if not comparison.differs:
-            note = _agreement_note(why, found, comparison)
+            note = _agreement_note(doubt, found, comparison)
             return _null_answer(first, problem, start, comparison, note, comparison.undecided)
-    evidence = _evidence_by_chance(found, why)
-    if not evidence:
-        return replace(found, posterior_predictive=comparison.checks) if comparison else found
-    shown, bound = _evidence_in_copies(copies[: priors.CHANCE_COPIES], diagnose, evidence, why)
-    note = _comparison_note(why, found, shown, bound)
+    if not (evidence := _evidence_by_chance(found, doubt)):
+        return replace(found, posterior_predictive=comparison.checks)
+    note, bound = _compare_in_copies(doubt, found, copies, diagnose)
     if max(evidence) <= bound:
-        if comparison is None:
-            return replace(found, unexplained=Unexplained(False), notes=(*found.notes, note))
         undecided = None if np.isfinite(bound) else NOT_DIAGNOSED
         return _null_answer(first, problem, start, comparison, note, undecided)
-    weak = [
-        one.effect for one in found.findings
-        if why != ROUNDED and _is_fitted(one) and one.evidence_nats <= bound
-    ]  # fmt: skip
+    weak = [one.effect for one in found.findings if _is_fitted(one) and one.evidence_nats <= bound]
     note = f"{note}; doubtful for this reason: {', '.join(weak)}" if weak else note
     return replace(found, notes=(*found.notes, note))
 
 
-def _reason_to_simulate(
+def _doubt(
     answered: FittedDiagnosis, problem: Problem, start: NullFit, model: NullModel
-) -> str | None:
-    """Why the answer may rest on noise; None where it does not, or where nothing was found.
-
-    Rounding errors resemble an unknown process in time, and no effect's own form.
-    """
+) -> Doubt | None:
+    """Why the answer may rest on noise; None where it does not, or where nothing was found."""
     found = answered.found
     fitted = any(map(_is_fitted, found.findings))
-    if answered.rounding and (found.unexplained.detected or (found.failed_checks and not fitted)):
-        return ROUNDED
-    seen = fitted or found.unexplained.detected or found.failed_checks
-    if not seen and found.p_value >= priors.FAMILY_P:
-        return None
-    if gyro_to_mag_noise(problem.recorded, model) >= priors.CHANCE_LOUD:
-        return LOUD
-    return BENT if calibration_bend(start) >= priors.CHANCE_BENT else None
+    unknown, failed = found.unexplained.detected, bool(found.failed_checks)
+    if fitted or unknown or failed or found.p_value < priors.FAMILY_P:
+        if gyro_to_mag_noise(problem.recorded, model) >= priors.CHANCE_LOUD:
+            return LOUD
+        if calibration_bend(start) >= priors.CHANCE_BENT:
+            return BENT
+    return ROUNDED if answered.rounding and (unknown or (failed and not fitted)) else None
 
 
 def gyro_to_mag_noise(track: Track, model: NullModel) -> float:
@@ -281,9 +289,9 @@ def _fit_copy(copy: Track, problem: Problem) -> NullFit | None:
         return None
 
 
-def _agreement_note(why: str, found: Diagnosis, comparison: RefitComparison) -> str:
+def _agreement_note(doubt: Doubt, found: Diagnosis, comparison: RefitComparison) -> str:
     """The note on what was found, and why it is not reported."""
-    seen = _evidence_text(why, found) if _evidence_by_chance(found, why) else why
+    seen = _evidence_text(doubt, found) if _evidence_by_chance(found, doubt) else doubt.words
     if (undecided := comparison.undecided) is not None:
         return f"{seen}; {undecided}"
     return (
@@ -293,18 +301,18 @@ def _agreement_note(why: str, found: Diagnosis, comparison: RefitComparison) -> 
     )
 
 
-def _evidence_text(why: str, found: Diagnosis) -> str:
+def _evidence_text(doubt: Doubt, found: Diagnosis) -> str:
     """What noise may have produced, and its evidence."""
-    effects = [one.effect for one in found.findings if why != ROUNDED and _is_fitted(one)]
+    effects = [one.effect for one in found.findings if doubt.of_findings and _is_fitted(one)]
     seen = ", ".join([*effects, *(["something unknown"] if found.unexplained.detected else [])])
-    return f"{why}: {seen} is worth {max(_evidence_by_chance(found, why)):.0f} nats here"
+    nats = max(_evidence_by_chance(found, doubt))
+    return f"{doubt.words}: {seen} is worth {nats:.0f} nats here"
 
 
-def _evidence_by_chance(found: Diagnosis, why: str) -> list[float]:
+def _evidence_by_chance(found: Diagnosis, doubt: Doubt) -> list[float]:
     """The evidence of each reported mismatch that noise may have produced, nats."""
-    nats = [one.evidence_nats for one in found.findings if why != ROUNDED and _is_fitted(one)]
-    left = found.unexplained
-    return [*nats, *([left.evidence_nats] if left.detected else [])]
+    nats = [one.evidence_nats for one in found.findings if doubt.of_findings and _is_fitted(one)]
+    return nats + ([found.unexplained.evidence_nats] if found.unexplained.detected else [])
 
 
 def required_ratio(copies: int, chance: float) -> float:
@@ -319,53 +327,65 @@ def required_ratio(copies: int, chance: float) -> float:
     return float(np.exp(brentq(too_likely, -20.0, -np.log(chance) + 1.0)))
 
 
-def _evidence_in_copies(
+def _compare_in_copies(
+    doubt: Doubt,
+    found: Diagnosis,
     copies: Sequence[Track],
     diagnose: Callable[[Track], FittedDiagnosis],
-    evidence: Sequence[float],
-    why: str,
+) -> tuple[str, float]:
+    """The note on what was found and what copies show, and the bound of chance evidence, nats."""
+    evidence = _evidence_by_chance(found, doubt)
+    shown, bound = _evidence_in_copies(
+        copies[: priors.CHANCE_COPIES],
+        lambda copy: _evidence_in_copy(copy, diagnose, doubt),
+        evidence,
+    )
+    stays = not doubt.of_findings and any(map(_is_fitted, found.findings))
+    unreported = ", so that is not reported" if stays else ", so nothing is reported"
+    ending = unreported if max(evidence) <= bound else ""
+    return f"{_evidence_text(doubt, found)}; {_shown_text(shown, bound, ending)}", bound
+
+
+def _evidence_in_copies(
+    copies: Sequence[Track], evidence_of: Callable[[Track], float], evidence: Sequence[float]
 ) -> tuple[list[float], float]:
     """Evidence found in copies, nats, until that decides; and the bound of chance evidence."""
     last = required_ratio(len(copies), priors.CHANCE_P)
     largest, shown = priors.ALONE_NATS, list[float]()
     for count, copy in enumerate(copies[:-1], 1):
-        shown.append(_evidence_in_copy(copy, diagnose, why))
+        shown.append(evidence_of(copy))
         largest = max(largest, shown[-1])
         early = largest * required_ratio(count, priors.CHANCE_EARLY_P)
         if min(evidence) > early:
             return shown, early
         if max(evidence) <= last * largest:
             return shown, last * largest
-    shown.append(_evidence_in_copy(copies[-1], diagnose, why))
+    shown.append(evidence_of(copies[-1]))
     return shown, last * max(largest, shown[-1])
 
 
-def _evidence_in_copy(copy: Track, diagnose: Callable[[Track], FittedDiagnosis], why: str) -> float:
+def _evidence_in_copy(
+    copy: Track, diagnose: Callable[[Track], FittedDiagnosis], doubt: Doubt
+) -> float:
     """The largest evidence reported of a copy, nats; infinite if the copy cannot be fitted."""
     try:
-        return max(_evidence_by_chance(diagnose(copy).found, why), default=0.0)
+        return max(_evidence_by_chance(diagnose(copy).found, doubt), default=0.0)
     except (np.linalg.LinAlgError, ValueError):
         return float("inf")
 
 
-def _comparison_note(why: str, found: Diagnosis, shown: Sequence[float], bound: float) -> str:
-    """The note on what was found, what simulations show, and what is reported given that."""
+def _shown_text(shown: Sequence[float], bound: float, ending: str) -> str:
+    """What simulations show, and what may be chance given that."""
     count, largest = len(shown), max(shown)
     seeds = "seed 0" if count == 1 else f"seeds 0 to {count - 1}"
     made = "a simulation" if count == 1 else f"{count} simulations"
-    shows = "shows" if count == 1 else "show"
-    by_chance = f"an effect of up to {largest:.0f} nats" if largest > 0.0 else "no effect"
-    seen = (
-        f"{_evidence_text(why, found)}; {made} of the calibration model alone, with this noise "
-        f"({seeds}), "
-    )
+    simulated = f"{made} of the calibration model alone, with this noise ({seeds}), "
     if not np.isfinite(largest):
         failed = "cannot be diagnosed" if count == 1 else "were tried, the last without a diagnosis"
-        return f"{seen}{failed}"
-    rest_stays = why == ROUNDED and any(map(_is_fitted, found.findings))
-    unreported = ", so that is not reported" if rest_stays else ", so nothing is reported"
-    untold = unreported if max(_evidence_by_chance(found, why)) <= bound else ""
-    return f"{seen}{shows} {by_chance}; up to {bound:.0f} nats may be chance{untold}"
+        return f"{simulated}{failed}"
+    shows = "shows" if count == 1 else "show"
+    by_chance = f"an effect of up to {largest:.0f} nats" if largest > 0.0 else "no effect"
+    return f"{simulated}{shows} {by_chance}; up to {bound:.0f} nats may be chance{ending}"
 
 
 def _null_answer(

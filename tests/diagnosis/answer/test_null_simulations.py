@@ -10,7 +10,7 @@ import pytest
 from tracks import experiment, track_of, true_model
 
 from ahrsd.diagnosis import priors
-from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Unexplained, Where
+from ahrsd.diagnosis.answer.diagnosis import Diagnosis, Finding, Unexplained, Where
 from ahrsd.diagnosis.answer.null_simulations import (
     FittedDiagnosis,
     calibration_bend,
@@ -153,6 +153,52 @@ def test_source_in_rounded_readings_is_compared_with_rounded_simulations(
     )
     assert found.unexplained.detected == is_reported
     assert found.notes[0].startswith("the readings come in steps that are coarser than their noise")
+
+
+def _step_finding(nats: float) -> Finding:
+    """A step that rests on a fit."""
+    where = Where(((60.0, 120.0),), ("x", "y"), "sensor")
+    return Finding(
+        "hard_iron_step", 1.0, (), where, (), heldout=None, cost_if_left_out=None,
+        separate_from=None, evidence_nats=nats, term=0,
+    )  # fmt: skip
+
+
+@pytest.mark.usefixtures("few_fits")
+@pytest.mark.parametrize(("in_copies", "is_reported"), [(20.0, False), (0.0, True)])
+def test_finding_stays_when_an_unknown_cause_may_be_rounding(
+    in_copies: float, is_reported: bool
+) -> None:
+    """60 nats are less than 4 times 20, and more than 4 times the 9 that are assumed at least."""
+    track, answered = _rounded(30e-3)
+    found = replace(answered.found, findings=(_step_finding(10.0),))
+    in_copy = replace(answered.found.unexplained, evidence_nats=in_copies)
+    copy = replace(answered.found, unexplained=in_copy if in_copies else Unexplained(False))
+    reported = diagnose_beyond_chance(
+        track, lambda one: replace(answered, found=found if one is track else copy)
+    )
+    assert [one.effect for one in reported.findings] == ["hard_iron_step"]
+    assert reported.unexplained.detected == is_reported
+    assert ("so that is not reported" in reported.notes[0]) != is_reported
+    assert "hard_iron_step" not in reported.notes[0]
+
+
+@pytest.mark.usefixtures("few_fits")
+def test_finding_with_a_noisy_gyro_is_compared_in_rounded_readings_too() -> None:
+    track, answer_of = _stepped()
+    step = np.array([1e-3])
+    rounding = (Term("mag_quantisation", step, np.zeros(1)),)
+    answered = replace(answer_of(30.0), rounding=rounding)
+    noise = Noise(1e-4, 5e-2)
+    found = replace(answered.found, findings=(_step_finding(30.0),), noise=noise)
+    reported = diagnose_beyond_chance(
+        track,
+        lambda one: replace(answered, found=found) if one is track else answer_of(12.0),
+    )
+    assert reported.findings == ()
+    assert reported.notes[0].startswith(
+        "the gyro is noisier than the magnetometer: hard_iron_step, "
+    )
 
 
 @pytest.mark.parametrize(
