@@ -63,7 +63,7 @@ from ahrsd.recording.limits import (
     refuse_beyond,
 )
 from ahrsd.samples import Array, SampleBlock, in_periods, known_force
-from ahrsd.stream.in_turn import sensors_in_turn
+from ahrsd.stream.alternating_sensors import describe_alternation
 
 PARQUET = b"PAR1"  # how such a file begins
 NOTES_KEY = "ahrsd.notes"  # in the metadata of a converted table
@@ -209,7 +209,7 @@ def _checked(columns: _TableRows, check_units: bool) -> Table:
     columns.undo_repeats()
     columns.refuse_several_sensors()
     columns.drop_impossible()
-    columns.tell_turns()
+    columns.note_alternating_sensors()
     columns.set_clock()
     if check_units:
         for limits in RANGES:
@@ -218,7 +218,7 @@ def _checked(columns: _TableRows, check_units: bool) -> Table:
                 raise RecordingError(path, *wrong)
     accel = columns.acceleration()
     _check_length(path, len(accel))
-    columns.tell_upward(accel)
+    columns.note_upward_axes(accel)
     return columns.table(accel)
 
 
@@ -428,7 +428,7 @@ class _TableRows:
                     "keep the rows of one of them",
                 )
 
-    def tell_turns(self) -> None:
+    def note_alternating_sensors(self) -> None:
         """A note on a field that is the same again after a few rows, and another one in between.
 
         Without a column that tells the sensors apart it may be one sensor near a current, too.
@@ -436,7 +436,7 @@ class _TableRows:
         rows = self.vectors(MAG)
         if len(rows) < MINIMUM_ROWS:
             return
-        if words := sensors_in_turn(rows):
+        if words := describe_alternation(rows):
             self.notes.append(words)
 
     def drop_impossible(self) -> None:
@@ -564,7 +564,7 @@ class _TableRows:
                 return accel * factor
         return accel
 
-    def tell_upward(self, accel: Array) -> None:
+    def note_upward_axes(self, accel: Array) -> None:
         """A note on axes that are not those of the device, whose registers are for its own."""
         found = upward(dict(zip(ACCEL, accel.T, strict=True))) or ""
         if found.endswith("z points up"):

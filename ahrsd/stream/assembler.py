@@ -5,7 +5,7 @@ so that the blocks do not depend on how the bytes were cut), then turned into ar
 
 Time of a sample: the device's own TimeStartup where the message carries it; else steps of one over
 the rate. Damaged messages, steps over which the device turned further than its rate can explain
-(`TurnWatch`), and those whose absence shows in the arrivals of the others (`LostLines`) count as
+(`TurnWatch`), and those whose absence shows in the arrivals of the others (`LostMessages`) count as
 lost messages then, so that nothing is bridged.
 The rate of such a stream is what the caller says, else what the register of this very output says
 (`streams_without_time`), else what the arrival times say, else the factory's 40 Hz. Where messages
@@ -25,6 +25,7 @@ import numpy as np
 from ahrsd.evidence.values import HealthFacts
 from ahrsd.printable import counted
 from ahrsd.samples import Array, SampleBlock
+from ahrsd.stream.alternating_sensors import describe_alternation
 from ahrsd.stream.decompensation import (
     Extracted,
     Extractor,
@@ -34,8 +35,7 @@ from ahrsd.stream.decompensation import (
     sample_blocks,
 )
 from ahrsd.stream.device_clock import DeviceClock, Gap, StepClock, StreamTimeline, TimelineSteps
-from ahrsd.stream.in_turn import sensors_in_turn
-from ahrsd.stream.lost_lines import LostLines
+from ahrsd.stream.lost_messages import LostMessages
 from ahrsd.stream.streams_without_time import (
     RateWatch,
     TurnWatch,
@@ -223,7 +223,7 @@ class Stream:
         self._turns = TurnWatch()
         self._turns_said = self._rate_warned = ""
         self._watch = RateWatch()
-        self._lines, self._lines_said = LostLines(), ""
+        self._lost_messages, self._lost_messages_warning = LostMessages(), ""
         self._waiting: tuple[list[tuple[float, ...]], list[float], list[int]] = ([], [], [])
         self._parts = Parts()
         self._first: list[Array] = []
@@ -306,7 +306,7 @@ class Stream:
         self._parts.forget()
         self._turns.forget()
         self._watch.forget()
-        self._lines.forget()
+        self._lost_messages.forget()
         self._arrived_s = 0.0
         if self._steps is not None:  # counted time stood still meanwhile and the host's did not
             self.clock = DeviceClock()
@@ -357,7 +357,7 @@ class Stream:
                 self._clear()  # these arrivals and those to come are not on one line
             elif pause_s > _LONGEST_PAUSE_S:
                 blocks = self._turn(ends=True)
-                self._lines.forget()
+                self._lost_messages.forget()
                 self.lost(1)
                 return blocks
         elif self._steps is not None and self._said_rate_hz is None:
@@ -386,9 +386,9 @@ class Stream:
         self._steps = StepClock(rate_hz, since_s)
         self._cut()
         facts, self._turns, self.all_gaps = self.facts, TurnWatch(), Gaps(self.all_gaps.keep)
-        self._lines = LostLines()
+        self._lost_messages = LostMessages()
         self.warnings.pop(self._turns_said, None)
-        self.warnings.pop(self._lines_said, None)
+        self.warnings.pop(self._lost_messages_warning, None)
         facts.expected, facts.duration_s = float(facts.samples), facts.samples / rate_hz
         self._replaced = facts.samples > 0
 
@@ -547,7 +547,7 @@ class Stream:
             self._first_count += len(block)
         if self._first_count < _FIRST:
             return
-        if words := sensors_in_turn(np.concatenate(self._first)):
+        if words := describe_alternation(np.concatenate(self._first)):
             self.warnings[words] = None
         self._first.clear()
 
@@ -558,32 +558,32 @@ class Stream:
         """
         if extractor.has_time or self._steps is None or self._arrivals[-1] == 0.0:
             return True
-        seen = self._lines.look(self._arrivals, self._lost, self._steps.step_s, ends)
+        seen = self._lost_messages.look(self._arrivals, self._lost, self._steps.step_s, ends)
         count = seen.settled
         self._waiting = self._rows[count:], self._arrivals[count:], self._lost[count:]
         missing = np.cumsum(seen.lost + ~seen.used)[seen.used]  # those without a time are as lost
         self._lost = np.diff(missing, prepend=0).tolist()
         self._rows = [row for row, used in zip(self._rows, seen.used, strict=False) if used]
         self._arrivals = [at for at, used in zip(self._arrivals, seen.used, strict=False) if used]
-        self._say_lines()
+        self._warn_of_lost_messages()
         if self._rows:
             return True
         self._rows, self._arrivals, self._lost = self._waiting
         self._waiting = [], [], []
         return False
 
-    def _say_lines(self) -> None:
-        lines = self._lines
+    def _warn_of_lost_messages(self) -> None:
+        lines = self._lost_messages
         total = lines.missing + self.by_layout[self.facts.layout]
-        self.warnings.pop(self._lines_said, None)
+        self.warnings.pop(self._lost_messages_warning, None)
         if lines.places < _FEW_PLACES or lines.missing < _SAID_SHARE * total:
             return
-        self._lines_said = (
+        self._lost_messages_warning = (
             "messages are missing although the bytes show no gap: by the times at which the others "
             f"arrived, at {counted(lines.places, 'place')} ({100.0 * lines.missing / total:.2g} % "
             "of all are missing); these steps are not used; was the recording computer too slow?"
         )
-        self.warnings[self._lines_said] = None
+        self.warnings[self._lost_messages_warning] = None
 
     def peek(self) -> list[SampleBlock]:
         """What waits for its block to be full, as far as it carries its time; changes nothing."""

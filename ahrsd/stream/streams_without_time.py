@@ -7,7 +7,7 @@ divisor (vn100-protocol 4.4). Two outputs with the same fields and different rat
 Arrivals say a rate over some seconds only: a USB adapter delivers several messages at once. They
 are asked where no register says it, and whether what a register says is what comes (`RateWatch`):
 registers may have been changed since they were read, and other models divide another rate. Lost
-messages make the mean rate too low; the step between those that came tells (`lost_lines`).
+messages make the mean rate too low; the step between those that came tells (`lost_messages`).
 
 **The device's own attitude.** Between two messages the attitude turns by the vector v = log(R_k^T
 R_(k+1)), and the gyro says the mean rate w over the same step; v = w dt. Two things follow:
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from ahrsd import so3
 from ahrsd.samples import Array
-from ahrsd.stream.lost_lines import FASTEST, step_of
+from ahrsd.stream.lost_messages import FASTEST, step_of
 from drivers.vn100.decode import Measurement, decode
 from drivers.vn100.deframer import Deframer
 from drivers.vn100.messages import MESSAGES, BinaryLayout, Layout, binary_layout

@@ -1,4 +1,4 @@
-"""What a logger does to a column: it holds values in between (`interpolate_held_columns`), or adds
+"""What a logger does to a column: it holds values in between (`interpolate_held_column`), or adds
 noise.
 
 A battery's current is logged five times a second, a position once, and the logger repeats the last
@@ -53,12 +53,6 @@ class HeldColumn:
         return f"every {self.period_s:.2g} s"
 
 
-def find_held_columns(track: Track) -> tuple[HeldColumn, ...]:
-    """The columns that were sampled less often than the sensor and held."""
-    found = (find_held_column(track, name) for name in track.covariates)
-    return tuple(one for one in found if one is not None)
-
-
 def find_held_column(track: Track, name: str) -> HeldColumn | None:
     """The column as one that was sampled less often than the sensor and held; None if it is not."""
     values = track.covariates[name]
@@ -82,10 +76,10 @@ def find_held_column(track: Track, name: str) -> HeldColumn | None:
     return HeldColumn(name, np.union1d(rows, again), period * track.step_s)
 
 
-def interpolate_held_columns(track: Track, columns: tuple[HeldColumn, ...]) -> Track:
-    """The track with these columns interpolated linearly between their values."""
-    interpolated = {one.name: one.interpolate(track.covariates[one.name]) for one in columns}
-    return track.with_columns({**track.covariates, **interpolated})
+def interpolate_held_column(track: Track, column: HeldColumn) -> Track:
+    """The track with this column interpolated linearly between its values."""
+    interpolated = column.interpolate(track.covariates[column.name])
+    return track.with_columns({**track.covariates, column.name: interpolated})
 
 
 @dataclass(frozen=True, slots=True)

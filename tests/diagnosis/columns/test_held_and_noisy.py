@@ -12,9 +12,9 @@ from tracks import experiment, track_of
 from ahrsd.diagnosis.columns.held_and_noisy import (
     denoise_columns,
     denoised_column,
-    find_held_columns,
+    find_held_column,
     find_logging_pattern,
-    interpolate_held_columns,
+    interpolate_held_column,
 )
 
 ROWS = 12_000
@@ -26,7 +26,10 @@ def plain():
     return track_of(experiment("wam", motion="rov", seed=4, samples=3750, rate_hz=12.5))
 
 
-def with_column(track, values, name="motor_current_a"):
+CURRENT = "motor_current_a"
+
+
+def with_column(track, values, name=CURRENT):
     return track.with_columns({name: np.asarray(values, float)})
 
 
@@ -42,9 +45,9 @@ def wandering(count, seed=1):
 def test_held_column_is_interpolated_linearly_between_its_values(plain, rows):
     values = wandering(len(plain))
     track = with_column(plain, held(values, rows))
-    (one,) = find_held_columns(track)
+    one = find_held_column(track, CURRENT)
     assert one.period_s == pytest.approx(rows / 12.5)
-    logged_values = interpolate_held_columns(track, (one,)).covariates["motor_current_a"]
+    logged_values = interpolate_held_column(track, one).covariates[CURRENT]
     known = np.arange(0, len(values), rows)
     np.testing.assert_allclose(
         logged_values, np.interp(np.arange(len(values)), known, values[known])
@@ -55,9 +58,8 @@ def test_repeated_value_is_kept_until_one_period_before_the_next(plain):
     values = wandering(len(plain))
     values[1000:1200] = 7.0
     track = with_column(plain, held(values, 5))
-    logged_values = interpolate_held_columns(track, find_held_columns(track)).covariates[
-        "motor_current_a"
-    ]
+    found = find_held_column(track, CURRENT)
+    logged_values = interpolate_held_column(track, found).covariates[CURRENT]
     np.testing.assert_array_equal(logged_values[1000:1196], 7.0)
     assert logged_values[1198] != 7.0  # on the way to the next value
 
@@ -65,19 +67,17 @@ def test_repeated_value_is_kept_until_one_period_before_the_next(plain):
 @pytest.mark.parametrize("name", ["pump_on", "vn_yaw_deg", "nobody_knows"])
 def test_switches_and_columns_without_a_role_are_not_interpolated(plain, name):
     values = held(np.sign(wandering(len(plain))) > 0, 5)
-    assert find_held_columns(with_column(plain, values, name)) == ()
+    assert find_held_column(with_column(plain, values, name), name) is None
 
 
 def test_levels_of_irregular_length_and_fast_columns_are_not_interpolated(plain):
     rng = np.random.default_rng(2)
     edges = np.cumsum(rng.exponential(3.0, 200))
     t = plain.time_s - plain.time_s[0]
-    assert (
-        find_held_columns(with_column(plain, rng.uniform(0, 9, 201)[np.searchsorted(edges, t)]))
-        == ()
-    )
-    assert find_held_columns(with_column(plain, wandering(len(plain)))) == ()
-    assert find_held_columns(with_column(plain, held(wandering(len(plain)), 80))) == ()  # 6.4 s
+    irregular = rng.uniform(0, 9, 201)[np.searchsorted(edges, t)]
+    too_long = held(wandering(len(plain)), 80)  # 6.4 s
+    for values in (irregular, wandering(len(plain)), too_long):
+        assert find_held_column(with_column(plain, values), CURRENT) is None
 
 
 def smooth_values(seed: int, rows: int = ROWS, width: float = 120.0) -> np.ndarray:

@@ -21,7 +21,7 @@ from ahrsd.diagnosis.calibration_fit.problem import Problem
 from ahrsd.diagnosis.columns.held_and_noisy import (
     denoise_columns,
     find_held_column,
-    interpolate_held_columns,
+    interpolate_held_column,
 )
 from ahrsd.diagnosis.columns.roles import label
 from ahrsd.diagnosis.effects.effect import Effect, Setting
@@ -106,7 +106,7 @@ def _interpolate_held(problem: Problem, name: str) -> Problem | None:
     if held is None:
         return None
     note = f"column {label(name)} has a new value {held.interval_words}: interpolated linearly"
-    return _replace_recorded(problem, interpolate_held_columns(problem.recorded, (held,)), note)
+    return _replace_recorded(problem, interpolate_held_column(problem.recorded, held), note)
 
 
 def _remove_noise(problem: Problem, name: str) -> Problem | None:

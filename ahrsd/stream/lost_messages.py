@@ -55,7 +55,7 @@ class Arrived:
     delay_s: Array
 
 
-class LostLines:
+class LostMessages:
     """Sees where messages are missing; see the module. What it says does not depend on chunks."""
 
     def __init__(self) -> None:
@@ -187,14 +187,14 @@ class _Fit:
     @classmethod
     def counted(cls, arrived: Array, known: NDArray[np.int64], step_s: float) -> _Fit:
         """With what is lost by this step."""
-        lost = LostLines().look(arrived.tolist(), known.tolist(), step_s, ends=True).lost
+        lost = LostMessages().look(arrived.tolist(), known.tolist(), step_s, ends=True).lost
         return cls.of(arrived, lost, step_s)
 
     @classmethod
     def refined(cls, arrived: Array, known: NDArray[np.int64], step_s: float) -> _Fit:
         """With a step near this one, by a line through the arrivals so counted."""
         for _ in range(_FITS):
-            seen = LostLines().look(arrived.tolist(), known.tolist(), step_s, ends=True)
+            seen = LostMessages().look(arrived.tolist(), known.tolist(), step_s, ends=True)
             step_s = _slope(arrived, seen.lost)
             if not step_s > 0.0:
                 return cls(0.0, 0, float("inf"), False)

@@ -11,7 +11,7 @@ _MOST_SENSORS = 8
 _APART = 5.0  # times the step between readings of one sensor
 
 
-def sensors_in_turn(field_gauss: Array) -> str:
+def describe_alternation(field_gauss: Array) -> str:
     """In words, where the field (N, 3) is the same again after a few rows, and not in between.
 
     Without anything that tells the sensors apart it may be one sensor near a current, too. Empty

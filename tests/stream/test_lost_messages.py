@@ -7,7 +7,7 @@ import pytest
 
 from ahrsd.stream.assembler import Stream
 from ahrsd.stream.decompensation import Compensation, RegisterEpochs
-from ahrsd.stream.lost_lines import LostLines
+from ahrsd.stream.lost_messages import LostMessages
 from ahrsd.stream.streams_without_time import UNSURE, RateWatch, rate_of_arrivals
 from drivers.vn100.decode import Measurement
 from drivers.vn100.messages import MESSAGES, binary_layout
@@ -37,7 +37,7 @@ def arrivals(rate_hz: float, share: float, late: str, sent: int = 1500, seed: in
 @pytest.mark.parametrize("late", ["exact", "a fifth of a step"])
 def test_each_missing_message_is_found_where_it_is_missing(rate_hz, share, late):
     at, numbers = arrivals(rate_hz, share, late)
-    seen = LostLines().look(at, [0] * len(at), 1.0 / rate_hz, ends=True)
+    seen = LostMessages().look(at, [0] * len(at), 1.0 / rate_hz, ends=True)
     found = seen.lost[1:][seen.used[1:]]
     missing = np.diff(numbers[seen.used]) - 1 - np.diff(np.flatnonzero(seen.used)) + 1
     assert np.mean(seen.used) > 0.999
@@ -48,7 +48,7 @@ def test_each_missing_message_is_found_where_it_is_missing(rate_hz, share, late)
 @pytest.mark.parametrize("late", ["a step", "bunches of 16 ms"])
 def test_few_lost_messages_are_bridged_where_arrivals_are_irregular(rate_hz, late):
     at, numbers = arrivals(rate_hz, 0.03, late)
-    seen = LostLines().look(at, [0] * len(at), 1.0 / rate_hz, ends=True)
+    seen = LostMessages().look(at, [0] * len(at), 1.0 / rate_hz, ends=True)
     step = (seen.lost[1:] == 0) & seen.used[1:] & seen.used[:-1]
     lost = np.diff(numbers) > 1
     assert np.mean(step[lost]) < 0.16  # inside bunches some cannot be told
@@ -59,7 +59,7 @@ def test_few_lost_messages_are_bridged_where_arrivals_are_irregular(rate_hz, lat
 @pytest.mark.parametrize("late", LATE)
 def test_nothing_is_missing_where_nothing_was_lost(rate_hz, late):
     at, _ = arrivals(rate_hz, 0.0, late)
-    lines = LostLines()
+    lines = LostMessages()
     seen = lines.look(at, [0] * len(at), 1.0 / rate_hz, ends=True)
     assert np.mean(seen.lost) < 0.003
     assert np.mean(seen.used) > 0.99
@@ -68,14 +68,14 @@ def test_nothing_is_missing_where_nothing_was_lost(rate_hz, late):
 def test_a_host_that_stood_and_delivered_all_later_lost_nothing():
     at = 100.0 + np.arange(800) / 40.0
     at[400:440] = at[440]
-    assert not LostLines().look(at, [0] * 800, 0.025, ends=True).lost.any()
+    assert not LostMessages().look(at, [0] * 800, 0.025, ends=True).lost.any()
 
 
 @pytest.mark.parametrize("late", LATE)
 def test_the_same_is_found_however_the_messages_are_cut(late):
     at, _ = arrivals(100.0, 0.05, late, 600)
-    whole = LostLines().look(at, [0] * len(at), 0.01, ends=True)
-    lines, waiting, lost = LostLines(), [], []
+    whole = LostMessages().look(at, [0] * len(at), 0.01, ends=True)
+    lines, waiting, lost = LostMessages(), [], []
     for k, one in enumerate(at.tolist()):
         waiting.append(one)
         if len(waiting) > 20 or k == len(at) - 1:
