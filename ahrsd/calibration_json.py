@@ -68,13 +68,13 @@ def calibration_json(
     most = "" if wrong else estimate.widened_by
     widened = [f"most of the heading's sigma: {most}"] * bool(most)
     not_yet = why_not_converged(estimate, wrong)
-    said = [*warnings, *estimate.warnings, *refusal, *not_yet, *widened]
+    all_warnings = [*warnings, *estimate.warnings, *refusal, *not_yet, *widened]
     return (
         base
         | _found(estimate, heading or HeadingErrors(), most)
         | {
             "registers": written,
-            "warnings": list(dict.fromkeys(said)),
+            "warnings": list(dict.fromkeys(all_warnings)),
         }
     )
 

@@ -186,8 +186,8 @@ STREAM = (
         "",
         0.0,
         Level.CANDIDATE,
-        meaning="times at which the device's clock went backwards, but by a reset that a program "
-        "on a share asked for",
+        meaning="times at which the device's clock went backwards, except by a reset that a "
+        "program on a share requested",
         advice="the device's clock went back ({v:.0f} x): it was reset; check its supply, then "
         "restart ahrsd",
     ),

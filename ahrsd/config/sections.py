@@ -121,7 +121,7 @@ def _path(text: str) -> Path:
     try:
         return Path(text).expanduser()
     except RuntimeError as error:
-        raise ValueError(f"{text!r}: nobody of that name has a home folder here") from error
+        raise ValueError(f"{text!r}: no user of that name has a home folder here") from error
 
 
 class DeviceSection(Section):

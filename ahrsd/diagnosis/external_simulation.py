@@ -134,11 +134,11 @@ def _differ(axes: dict[int, tuple[int, float]]) -> bool:
 
 def _axes_words(axes: dict[int, tuple[int, float]]) -> str:
     """The axes of the simulation that are x, y and z of the recording."""
-    told = [
+    pairs = [
         f"{'+' if sign > 0.0 else '-'}{'xyz'[nearest]} is the recording's {'xyz'[axis]}"
         for axis, (nearest, sign) in axes.items()
     ]
-    return f"its {', its '.join(told)}" if told else "no axis of it is one of the recording's"
+    return f"its {', its '.join(pairs)}" if pairs else "no axis of it is one of the recording's"
 
 
 def _best_lag(a: Array, b: Array, reach: int) -> tuple[int, float]:

@@ -545,7 +545,7 @@ def has_motion(data: chain.EpochData, bias_rad_s: Array) -> bool:
         .mean(axis=1)
     )
     size_gauss = float(np.median(np.linalg.norm(data.field_b_gauss, axis=1)))
-    if not size_gauss > 0.0:  # a magnetometer that fell silent tells nothing
+    if not size_gauss > 0.0:  # a silent magnetometer shows no motion
         return False
     relative = principal_deviation(field) / size_gauss
     angle = data.angle_b_rad[1:]

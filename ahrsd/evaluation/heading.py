@@ -220,17 +220,17 @@ _ATTITUDE_CONVENTION = "ref_q{w,x,y,z} turns the sensor's own axes into the worl
 def turning_fault(track: EvaluationTrack, reference: HeadingReference, up_b: Array) -> str | None:
     """What a reference is not, by its turns within a second against the gyro's; None: nothing.
 
-    up_b (N, 3): the vertical that its headings are compared with. Without turns nothing is told.
+    up_b (N, 3): the vertical that its headings are compared with. None too where it hardly turns.
     """
     starts, ends = _windows(track, reference)
     at = np.clip(np.searchsorted(track.time_s, reference.time_s), 0, len(track) - 1)
     gyro_rad = _gyro_turns(track, up_b, at[starts], at[ends])
     own_rad = wrapped(reference.heading_rad[ends] - reference.heading_rad[starts])
     size = np.abs(gyro_rad)
-    told = (size > _LEAST_TURN_RAD) & (size < _MOST_TURN_RAD) & np.isfinite(own_rad)
-    if np.count_nonzero(told) < _FEWEST_TURNS:
+    usable = (size > _LEAST_TURN_RAD) & (size < _MOST_TURN_RAD) & np.isfinite(own_rad)
+    if np.count_nonzero(usable) < _FEWEST_TURNS:
         return None
-    a, b = gyro_rad[told], own_rad[told]
+    a, b = gyro_rad[usable], own_rad[usable]
     both, gyro, own = float(a @ b), float(a @ a), float(b @ b)
     alike, ratio = both / np.sqrt(gyro * own) if own > 0.0 else 0.0, both / gyro
     convention = _CONVENTION if reference.up_b is None else _ATTITUDE_CONVENTION

@@ -26,7 +26,7 @@ CIRCLES = "drive at least two full circles in calm surroundings"
 class HealthFacts:
     """Health of the stream: shares of messages and samples, counts, rate.
 
-    negative_dt: how often the device's time fell without a program that asked for a reset
+    negative_dt: how often the device's time fell without a reset that a program requested
     """
 
     crc_error_rate: float

@@ -197,7 +197,7 @@ def _labels(entry: ArchiveEntry, orders: Orders) -> Row:
 
 
 def _whose(entry: ArchiveEntry, orders: Orders) -> Row:
-    """Whose recording it is: by its folders, or by what was said of all."""
+    """Whose recording it is: by its folders, or by what was given for all."""
     named = dict(zip(orders.levels, entry.folders))
     serial = named.get("serial", "")
     digits = max(_DIGITS.findall(serial), key=len, default="")  # of vn100-100130608 the number

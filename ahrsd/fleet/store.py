@@ -321,9 +321,9 @@ def _relabelled(table: pyarrow.Table, labels: Mapping[str, Row]) -> tuple[pyarro
     before = list(zip(*(table[name].to_pylist() for name in names), strict=True))
     after = []
     for stamp, (vehicle, place, serial) in zip(table["stamp"].to_pylist(), before, strict=True):
-        said = labels.get(stamp, {})
-        number = said.get("serial_number") if serial is None else serial
-        after.append((said.get("vehicle") or vehicle, said.get("place") or place, number))
+        given = labels.get(stamp, {})
+        number = given.get("serial_number") if serial is None else serial
+        after.append((given.get("vehicle") or vehicle, given.get("place") or place, number))
     for name, values in zip(names, zip(*after, strict=True), strict=False):
         column = pyarrow.array(values, SCHEMA.field(name).type)
         table = table.set_column(table.schema.get_field_index(name), name, column)

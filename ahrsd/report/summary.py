@@ -218,14 +218,14 @@ class BatchResult:
     def all_warnings(self) -> list[str]:
         """Warnings of recording and stream."""
         turned = None if self.wrong else self.misalignment  # of axes, units or times that are wrong
-        said = [
+        found = [
             *(f"{words}: put this right and calibrate again" for words in self._wrong_besides),
             *(_not_of_the_earth(self.estimate) if self.estimate is not None else ()),
             *warnings_of(self.core, self.warnings),
             *(self.estimate.warnings if self.estimate is not None else ()),
             *([] if turned is None or not turned.significant else [_misalignment_text(turned)]),
         ]
-        return list(dict.fromkeys(said))
+        return list(dict.fromkeys(found))
 
     @property
     def _wrong_besides(self) -> tuple[str, ...]:

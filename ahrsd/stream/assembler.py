@@ -169,8 +169,10 @@ _PAUSE_S, _PAUSE_STEPS = 0.5, 4.0  # arrivals apart by both: something was not s
 _LONGEST_PAUSE_S = (
     60.0  # a longer one may be the host's clock that was set: its length says nothing
 )
-_FIRST = 200  # samples that are asked whether they are of one device
-_SAID_SHARE = 1e-3  # of the messages; when fewer are missing by their arrivals nothing is said
+_FIRST = 200  # samples that are checked for two devices in turn
+_WARNED_SHARE = (
+    1e-3  # of the messages; when fewer are missing by their arrivals there is no warning
+)
 _MESSAGE_BYTES = 120  # of $VNYMR: how many messages a longer piece of damage was
 _GARBAGE_BYTES = 60  # of no text; less may have come between two whole messages
 _MOST_NAMES = 64  # of messages; no VN-100 sends so many, but a damaged wire may now and then
@@ -242,7 +244,7 @@ class Stream:
         return self._timeline.restarts
 
     def excuse_restart(self) -> None:
-        """A program asked for the newest restart: it is no sign of a device in trouble."""
+        """A program requested the newest restart: it is no sign of a device in trouble."""
         self._excused += 1
 
     @property
@@ -576,7 +578,7 @@ class Stream:
         lines = self._lost_messages
         total = lines.missing + self.by_layout[self.facts.layout]
         self.warnings.pop(self._lost_messages_warning, None)
-        if lines.places < _FEW_PLACES or lines.missing < _SAID_SHARE * total:
+        if lines.places < _FEW_PLACES or lines.missing < _WARNED_SHARE * total:
             return
         self._lost_messages_warning = (
             "messages are missing although the bytes show no gap: by the times at which the others "
@@ -613,8 +615,8 @@ class Stream:
         lost = np.array(self._lost)
         if self._attitude is not None:
             ypr, rate = np.hsplit(table[:, self._attitude], 2)
-            told = lost > 0 if self._arrivals[-1] != 0.0 else None  # by arrivals: how many, too
-            lost = np.maximum(lost, self._turns.look(ypr, rate, self._steps.step_s, told))
+            known = lost > 0 if self._arrivals[-1] != 0.0 else None  # by arrivals: how many, too
+            lost = np.maximum(lost, self._turns.look(ypr, rate, self._steps.step_s, known))
             self._say_turns()
         if not self.facts.expected:
             lost[0] = 0  # nothing came before the first one

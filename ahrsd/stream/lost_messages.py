@@ -7,7 +7,7 @@ so the least delay rises by a step and stays there.
 
 Messages come in bunches (all that an adapter gathered in 16 ms). The last one of a bunch waited
 least, so only the ends of bunches are compared: the least delay of `_ENDS` ends before a place with
-that of `_ENDS` ends from there on. Where in a bunch a message is lost nobody can say: of such a
+that of `_ENDS` ends from there on. Where in a bunch a message is lost cannot be known: of such a
 bunch only the last message is used, whose time the messages behind it tell.
 
 The same decides the rate (`step_of`). Losses make the mean rate too low; counted by the true step

@@ -85,7 +85,7 @@ def _number(value: float | str) -> float:
 
 
 def long_enough(arrivals_s: Sequence[float]) -> bool:
-    """Whether so many messages arrived over such a time that their rate may be asked."""
+    """Whether so many messages arrived over such a time that their rate can be estimated."""
     count = len(arrivals_s)
     span_s = arrivals_s[-1] - arrivals_s[0] if count else 0.0
     if count < _LEAST_ARRIVALS or span_s <= 0.0:
@@ -321,11 +321,11 @@ class TurnWatch:
         ypr_rad: Array,
         gyro_rad_s: Array,
         step_s: float,
-        told: NDArray[np.bool_] | None = None,
+        known: NDArray[np.bool_] | None = None,
     ) -> NDArray[np.int64]:
         """Estimated numbers of messages (N,) that are missing before each of N messages.
 
-        told: (N,) true where it is known how many are missing; nothing is estimated there
+        known: (N,) true where it is known how many are missing; nothing is estimated there
         """
         table = np.hstack([ypr_rad, gyro_rad_s])
         if self._last is None:
@@ -339,8 +339,8 @@ class TurnWatch:
             turned = _turned(table[:, :3])
         found = np.zeros(len(said), dtype=np.int64)
         jumps = _jumps(turned, said)
-        if told is not None:
-            jumps &= ~told
+        if known is not None:
+            jumps &= ~known
         weight = min(step_s / _SPEED_S, 1.0)
         for k, (now, jumped) in enumerate(zip(speed[1:].tolist(), jumps.tolist(), strict=True)):
             if math.isfinite(now):

@@ -96,7 +96,7 @@ def test_values_are_frozen():
         ('state_directory = ""', "state_directory: is empty: write a path, or leave the key out"),
         ('[[share]]\npty = ""', "share.0.pty: is empty: write a path, or leave the key out"),
         ('[device]\nport = "a\\u0000"', r"'a\x00' has a character that no path can have"),
-        ('[interlock]\nfile = "~no body/x"', "nobody of that name has a home folder here"),
+        ('[interlock]\nfile = "~no body/x"', "no user of that name has a home folder here"),
         ("[device]\nbaud = 9601", "device.baud = 9601: must be 'auto', 9600, 19200"),
         ("[device]\nrate_hz = 0.1", "device.rate_hz = 0.1: must be greater than or equal to 1"),
         ("[device]\nrate_hz = nan", "device.rate_hz = nan: must be less than or equal to 800"),

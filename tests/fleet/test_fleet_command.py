@@ -73,7 +73,7 @@ def test_names_that_are_given_later_change_the_rows_and_examine_nothing_again(sa
         assert "0 recordings: nothing to do\n  2 recordings had a row already" in text
         query = "select vehicle, place, serial_number from results order by recording"
         found = json.loads(said("ask", out, query, "--json", "-")[1])
-        changed = [int(line.split()[0]) for line in text.splitlines() if "as said now" in line]
+        changed = [int(line.split()[0]) for line in text.splitlines() if "as given now" in line]
         return [tuple(row.values()) for row in found], changed
 
     assert labels() == ([("vn7", None, None), ("vn8", None, None)], [])

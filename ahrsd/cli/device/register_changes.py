@@ -204,7 +204,7 @@ def _append(journal: Journal, kind: str, **facts: object) -> Record:
 
 
 def _append_behind(journal: Journal, kind: str, so_far: str, **facts: object) -> None:
-    """The same behind something done; what is `so_far` is told even where it cannot be recorded."""
+    """The same after something was done; if it cannot be recorded, the error says so (`so_far`)."""
     try:
         _append(journal, kind, **facts)
     except JournalError as error:
@@ -237,7 +237,7 @@ def _restore(identity: Identity, old: Changes) -> Procedure[None]:
 
 
 def _refuse_other_device(identity: Identity) -> Procedure[None]:
-    """Raises WrongDevice; asked twice, for a reply may be altered on its way."""
+    """Raises WrongDevice; the number is read twice, for a reply may be altered on its way."""
     for _ in range(2):
         answered = int((yield from read(3))[0])
         if answered == identity.serial:

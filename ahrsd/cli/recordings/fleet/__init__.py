@@ -109,8 +109,8 @@ def run(
     if folder is not None:
         make_folder(folder, ("report.html",))
     levels = _levels(folders or "vehicle")
-    said = {name for name in levels if folders and name in ROLES}
-    said |= {name for name, value in (("vehicle", vehicle), ("place", place)) if value}
+    given = {name for name in levels if folders and name in ROLES}
+    given |= {name for name, value in (("vehicle", vehicle), ("place", place)) if value}
     orders = Orders(
         out=str(output.resolve()),
         columns=columns,
@@ -121,7 +121,7 @@ def run(
         limit_s=limit_s,
         memory_bytes=memory_bytes,
         again=again,
-        relabel=tuple(said),
+        relabel=tuple(given),
     )
     where = Place(jobs or os.cpu_count() or 1, LOADS, cluster)
     source = Archive(archive if "://" in archive else str(Path(archive).resolve()), patterns)
@@ -144,7 +144,7 @@ def _end_lines(done: Progress, output: Path) -> list[str]:
     if done.relabelled:
         lines.append(
             f"  {counted(done.relabelled, 'row', ',')} of these: another vehicle, place or serial "
-            "number, as said now"
+            "number, as given now"
         )
     if done.left_out:
         names = ", ".join(f"{number} {suffix}" for suffix, number in done.left_out.most_common(5))
